@@ -42,7 +42,7 @@ from sorvolo.lab.simulation.settings import (
 from sorvolo.missions.watch.flights import watch
 from sorvolo.missions.watch.run import WatchUpdate
 from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
-from sorvolo.tracking.picture_steps import SMALL_WIDTH_PX, PictureStep, PictureSteps
+from sorvolo.tracking.image_motion import SMALL_WIDTH_PX, PictureStep, PictureSteps
 
 RESULTS = Path(__file__).parent / "results" / "carried_boxes.json"
 PAGE = Path(__file__).parents[1] / "src" / "sorvolo" / "station" / "page" / "picture_motion.js"

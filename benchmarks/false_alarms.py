@@ -25,9 +25,9 @@ from mosaic_methods import commit, machine
 from provenance import note_scoring
 from sorvolo.detection.detector import Detector
 from sorvolo.survey.objects import Detections
-from sorvolo.tracking.cut_boxes import cut_edges
-from sorvolo.tracking.plausible import (
+from sorvolo.tracking.sizes import (
     TOO_SHORT_CUT_PX,
+    cut_edges,
     impossible_size,
     length_log_odds,
     with_log_odds,

@@ -19,7 +19,7 @@ from provenance import commit, machine, seeds_or_drawn
 from search_pod import CLASSES, flown, placed, seen_by_map
 from sorvolo.detection.detector import Detector
 from sorvolo.lab.simulation.flight import SimulatedFlight
-from sorvolo.tracking.planted import shown_plant
+from sorvolo.tracking.map_objects import shown_plant
 from sorvolo.tracking.standing import fuse
 
 RESULTS = Path(__file__).parent / "results" / "map_objects.json"

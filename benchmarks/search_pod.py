@@ -55,7 +55,7 @@ from sorvolo.store.pages.plots import stated_and_found
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import PlacedFrame, Status
 from sorvolo.tracking.laying import LaidSighting, lay_on_ground
-from sorvolo.tracking.planted import reported_plants
+from sorvolo.tracking.map_objects import reported_plants
 from sorvolo.tracking.view_evidence import least_seen
 
 RESULTS = Path(__file__).parent / "results" / "search_pod.json"

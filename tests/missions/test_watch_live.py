@@ -20,7 +20,7 @@ from sorvolo.missions.watch.flights import watch
 from sorvolo.missions.watch.run import EarlyFound, WatchUpdate
 from sorvolo.missions.watch.settings import WatchOutputs
 from sorvolo.survey.objects import Detections
-from sorvolo.tracking.picture_steps import PictureStep
+from sorvolo.tracking.image_motion import PictureStep
 
 _LIVE = LiveSettings(silent_s=1.0, give_up_s=1.5, first_s=15.0)
 _M_PER_PX = 2 * 60.0 * np.tan(np.radians(31.0)) / 160  # of the drone that live_sender flies

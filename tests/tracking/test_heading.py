@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sorvolo.tracking.heading import CompassError, Heading, HeadingFromMotion
+from sorvolo.tracking.headings import CompassError, Heading, HeadingFromMotion
 
 _M_PER_PX = 0.05
 

@@ -19,7 +19,7 @@ from sorvolo.lab.simulation.settings import (
 from sorvolo.lab.simulation.truth import coco_boxes
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.objects import CLASSES, TYPICAL_SIZE_M, Detections, no_detections
-from sorvolo.tracking.locate import IMPOSSIBLE_SIZE, LocateSettings, locate
+from sorvolo.tracking.laying import IMPOSSIBLE_SIZE, LocateSettings, locate
 from sorvolo.tracking.tracker import Tracker
 
 CAMERA = Camera.from_angle_of_view(960, 540, 62.0)

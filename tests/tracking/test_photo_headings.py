@@ -7,7 +7,7 @@ import pytest
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.pose import site_from_gimbal_rotation
 from sorvolo.survey.flight import CameraPrior
-from sorvolo.tracking.photo_headings import PhotoHeadings
+from sorvolo.tracking.headings import PhotoHeadings
 
 CAMERA = Camera(480, 360, 400.0, 400.0, 239.5, 179.5)
 HEIGHT_M, M_PER_PX = 40.0, 0.1  # the ground's picture is as fine as a photo

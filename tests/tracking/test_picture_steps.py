@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from test_image_motion import HEIGHT, WIDTH, cut, ground
 
-from sorvolo.tracking.picture_steps import PictureSteps
+from sorvolo.tracking.image_motion import PictureSteps
 
 FULL_WIDTH = 2 * WIDTH  # of the picture of which these are small copies
 

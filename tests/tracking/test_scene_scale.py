@@ -12,7 +12,7 @@ from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.survey.flight import Frame
 from sorvolo.survey.objects import CLASSES, Detections
 from sorvolo.tracking.following import PictureFollower
-from sorvolo.tracking.scene_scale import SceneScale, impossible_beside_cars
+from sorvolo.tracking.sizes import SceneScale, impossible_beside_cars
 from sorvolo.tracking.tracker import TrackerSettings
 
 SIZE_PX = (480, 640)

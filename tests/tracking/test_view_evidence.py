@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from sorvolo.tracking.view_evidence import EvidenceSettings, least_seen, score_from_views
+from sorvolo.tracking.view_evidence import (
+    LEAST_SEEN,
+    SHARED,
+    USUAL_LOG_ODDS,
+    least_seen,
+    score_from_views,
+)
 
 
 def test_views_without_it_count_against_it() -> None:
@@ -23,15 +29,14 @@ def test_many_views_are_worth_a_few_that_err_apart() -> None:
     """What every view scores 0.7 becomes surer with each, but never surer than 1 / shared views that err apart."""
     scores = [score_from_views([0.7] * views, views) for views in (1, 2, 5, 20, 2000)]
     assert all(np.diff(scores) > 0)
-    settings = EvidenceSettings()
-    bound = settings.usual + (np.log(0.7 / 0.3) - settings.usual) / settings.shared
+    bound = USUAL_LOG_ODDS + (np.log(0.7 / 0.3) - USUAL_LOG_ODDS) / SHARED
     assert scores[-1] == pytest.approx(1 / (1 + np.exp(-bound)), abs=0.001)
     assert scores[-1] < 0.92
 
 
 def test_what_is_as_weak_as_usual_says_nothing() -> None:
     """Views of the share of all that is shown leave it where it is; surer ones raise it, weaker ones lower it."""
-    usual = 1 / (1 + np.exp(-EvidenceSettings().usual))
+    usual = 1 / (1 + np.exp(-USUAL_LOG_ODDS))
     assert score_from_views([usual] * 9, 9) == pytest.approx(usual)
     assert score_from_views([0.4, 0.4], 2) > 0.4
     assert score_from_views([0.4, usual - 0.05], 2) < score_from_views([0.4, usual], 2)
@@ -53,5 +58,5 @@ def test_scores_at_the_ends_are_numbers(score: float) -> None:
 
 def test_sightings_count_from_the_least_that_is_reported() -> None:
     """A model that reports from lower on than others' weak sightings is searched from there."""
-    assert least_seen({"person": 0.78, "car": 0.72}) == EvidenceSettings().least_seen
+    assert least_seen({"person": 0.78, "car": 0.72}) == LEAST_SEEN
     assert least_seen({"person": 0.05, "car": 0.72}) == 0.05

@@ -13,7 +13,6 @@ from sorvolo.change.patches import PatchWindow, cut, patch_of
 from sorvolo.geometry.arrays import Floats, Labels, Mask, PointsM
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView
 from sorvolo.survey.objects import Sighting
-from sorvolo.tracking.association import PairSettings
 from sorvolo.tracking.tracker import Tracker, TrackerSettings
 
 # What a thing's height may explain of a blob's motion, and when nothing does. Shares are of the
@@ -165,7 +164,7 @@ _CAR_M = 2.5  # what is longer may move as cars do, the rest as people do
 # grey levels that turn a blob's looks by a radian: 19 in 20 keep theirs within 20
 _COLOUR_LEVELS = 40.0
 _TRACKER = TrackerSettings(
-    sure_score=0.0, new_per_m2=0.001, pairs=PairSettings(size_sigma=0.25, least_size=-4.0)
+    sure_score=0.0, new_per_m2=0.001, size_sigma=0.25, least_size=-4.0
 )
 
 

@@ -15,9 +15,8 @@ METADATA_KEY = "sorvolo"
 FORMAT = 2
 """The newest contract that this version reads; docs/detector.md lists its fields. 2 brought `calibration`."""
 
-_FALLBACK_STRIDE = (
-    32  # px: what a picture's sides are multiples of, in a model whose file does not state it
-)
+# px: what a picture's sides are multiples of, in a model whose file does not state it
+_FALLBACK_STRIDE = 32
 _NEEDED = ("name", "classes", "thresholds", "best_px")
 _TEXTS = ("thermal_by", "preset", "version", "precision", "licence", "trained_on", "created")
 

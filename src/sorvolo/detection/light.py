@@ -17,9 +17,8 @@ _STRETCH_PERCENT = (
     99.5,
 )  # percentiles that become black and white: single hot pixels take no range; by choice
 _COLOUR_LEVELS = 10  # grey through a video's coding strays by up to five; daylight pictures of ours reach 17 and more
-_COLOUR_SHARE = (
-    0.01  # of a picture may have colour and the picture still be grey: a logo, a cross-hair
-)
+# of a picture may have colour and the picture still be grey: a logo, a cross-hair
+_COLOUR_SHARE = 0.01
 _GLIMPSE_STEP = 4  # px between the pixels that are asked whether there is colour
 
 

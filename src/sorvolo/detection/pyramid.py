@@ -23,17 +23,14 @@ class PyramidSettings:
     """Up to which size a picture is magnified, and how what looks of several sizes saw is put together."""
 
     most_px: int = 20_000_000  # of a magnified picture: what a photo of that size costs; by choice
-    same_iou: float = (
-        0.5  # boxes of one class that overlap more are one object, as COCO counts them
-    )
+    # boxes of one class that overlap more are one object, as COCO counts them
+    same_iou: float = 0.5
     unseen_odds: float = -4.5  # log-odds of what a look does not show: models report from -3.9 on
     least_sure: float = 1e-4  # no score counts for less, nor for more than 1 less this
-    least_trust: float = (
-        1e-6  # of a look, beside the best one: it stays above zero, and its logarithm finite
-    )
-    least_small: float = (
-        0.3  # a score from which on something small is worth a closer look: as of the second look
-    )
+    # of a look, beside the best one: it stays above zero, and its logarithm finite
+    least_trust: float = 1e-6
+    # a score from which on something small is worth a closer look: as of the second look
+    least_small: float = 0.3
 
 
 def sizes_for(

@@ -10,7 +10,7 @@ from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.tiling import scale_for
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.survey.objects import Detections
-from sorvolo.tracking.scene_scale import SceneScale
+from sorvolo.tracking.sizes import SceneScale
 
 Look = Callable[[ImageRGB], Detections]
 """Something that searches a picture (H, W, 3) as it is."""
@@ -25,9 +25,8 @@ class ProbeSettings:
         640,
     )  # of the middle, height and width: it costs as much as nine times its pixels
     times: tuple[float, ...] = (1.0, 2.0, 3.0)  # as large as it is
-    first_again: int = (
-        30  # frames until it is done again, then three times as many, and so on: drones climb
-    )
+    # frames until it is done again, then three times as many, and so on: drones climb
+    first_again: int = 30
     growth: int = 3  # times as many frames until the next
 
 

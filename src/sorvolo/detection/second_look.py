@@ -27,9 +27,8 @@ Sees = Callable[[ImageRGB], Seen]
 class SheetSettings:
     """How cut-outs are laid side by side on one picture. Weights hold for the values that they were fitted with."""
 
-    cell_px: int = (
-        128  # a cut-out's side: surroundings count, and a network's last level has 4 cells of it
-    )
+    # a cut-out's side: surroundings count, and a network's last level has 4 cells of it
+    cell_px: int = 128
     columns: int = 8  # cut-outs in a row of a sheet
     share: float = 0.25  # of the picture's pixels that a position has at most; in a crowd the others keep their score
     cuts: tuple[int, int] = (
@@ -38,9 +37,8 @@ class SheetSettings:
     )  # cut-outs of one picture in one position, best first: at least, and at most
     same_iou: float = 0.3  # a box that overlaps the first one so much is the same object
     surest: float = 0.98  # no first score counts for more, so that the second look can overrule it
-    least_sure: float = (
-        1e-3  # no score counts for less, nor for more than 1 less this: log-odds stay within 7
-    )
+    # no score counts for less, nor for more than 1 less this: log-odds stay within 7
+    least_sure: float = 1e-3
     unseen: float = 0.02  # the score of what a look does not show: models report nothing below it
     filling: int = 114  # beyond the picture's edge, as in training
 

@@ -28,9 +28,8 @@ COARSEST_M = 1 / required_px_per_m(TASK, BOTTOM_CRITICAL_M)
 """The ground that a pixel may cover for a person from straight above to be recognised (eq. 3.9): 10 cm."""
 
 _THERMAL_PX = 2.0  # times as many pixels as by day must a person have: thermal optics blur, and clothes hide limbs
-_THERMAL_LARGER = (
-    1.5  # where the ground's sampling distance is not known: thermal sensors have few pixels
-)
+# where the ground's sampling distance is not known: thermal sensors have few pixels
+_THERMAL_LARGER = 1.5
 _MUCH_LONGER = 1.4  # times what the model knows: from there on a class gets a look of its own, which costs half or less
 _LEAST_OVERLAP_PX, _SPARE = 64, 1.15
 _LEAST_SIDE_PX = 64  # of a tile: less is a typing error

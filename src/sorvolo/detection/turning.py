@@ -19,12 +19,10 @@ class LookSettings:
     """
 
     quarters: tuple[int, ...] = (0, 1)  # quarter turns, one for each look
-    least_down: float = (
-        0.8  # of the optical axis: 37 degrees off straight down or less is from above
-    )
-    same_iou: float = (
-        0.5  # boxes of one class that overlap more are one object, as COCO counts them
-    )
+    # of the optical axis: 37 degrees off straight down or less is from above
+    least_down: float = 0.8
+    # boxes of one class that overlap more are one object, as COCO counts them
+    same_iou: float = 0.5
     unseen: float = 0.02  # the score of what a look does not show: models report nothing below it
 
 

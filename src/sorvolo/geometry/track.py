@@ -10,9 +10,8 @@ from sorvolo.geometry.arrays import Floats, PointsM
 _WINDOW_S = 2.0  # shorter steps measure the receiver's noise instead of the speed
 _STEPS_ACROSS = 25  # the steps must be long against the receiver's noise
 _ALONG_DEG = 25.0  # from the strips' bearing: beyond is a turn; by choice
-_LEAST_CONCENTRATION = (
-    0.3  # length of the mean direction, 0 to 1: less is no survey of strips; by choice
-)
+# length of the mean direction, 0 to 1: less is no survey of strips; by choice
+_LEAST_CONCENTRATION = 0.3
 
 
 @dataclass(frozen=True)

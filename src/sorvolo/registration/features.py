@@ -18,9 +18,8 @@ _TEXTURE_SIDE_PX = 960  # longer side at which sharpness is measured, whatever t
 class FeatureSettings:
     """How many points are looked for, and on what."""
 
-    detection_side_px: int = (
-        640  # longest side for ORB: pairs are refined at full size, so coarse is enough
-    )
+    # longest side for ORB: pairs are refined at full size, so coarse is enough
+    detection_side_px: int = 640
     orb_count: int = 700  # points of a picture, the strongest
     sift_count: int = 2500  # points where ORB fails: SIFT is slower and surer
     corner_count: int = 150  # points that a link is refined on

@@ -10,10 +10,8 @@ from sorvolo.geometry.camera import Camera
 _VISIBLE_PX = 0.5  # at a corner: what moves no pixel by more is left as it is
 _RADII = 4096  # of the table of distortion, from the middle to the corner
 
-
-_AVERAGED = (
-    2.0  # times as large at most: a mean of 2 x 2 pixels is enough for what is left out between
-)
+# times as large at most: a mean of 2 x 2 pixels is enough for what is left out between
+_AVERAGED = 2.0
 
 
 class Undistorter:

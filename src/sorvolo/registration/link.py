@@ -32,9 +32,8 @@ class LinkSettings:
     max_pairs: int = 40  # pairs kept per link, spread over the overlap
     min_correlation: float = 0.35  # of the overlaid images: the last check against a false fit
     least_learned: float = 0.35  # share of learned pairs that agree, for them to link by themselves
-    most_shared: float = (
-        0.4  # of a picture: what is known to share less is searched with SIFT there alone
-    )
+    # of a picture: what is known to share less is searched with SIFT there alone
+    most_shared: float = 0.4
 
 
 @dataclass(frozen=True, eq=False)

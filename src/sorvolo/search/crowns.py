@@ -23,9 +23,8 @@ class CrownLengths:
     leaf_m: float = 0.1  # along a pixel on which leaves show ...
     leaves_m: float = 0.5  # ... and over which their roughness is taken
     around_m: float = 1.25  # over which a wood's roughness is taken
-    even_m: float = (
-        0.75  # over which lightness is taken for shadows: grass in one has lighter spots
-    )
+    # over which lightness is taken for shadows: grass in one has lighter spots
+    even_m: float = 0.75
     shadows_m: tuple[float, ...] = (
         1.0,
         2.0,
@@ -46,9 +45,8 @@ class CrownSettings:
     leaves: float = 0.14  # rms of lightness within `leaves_m` over its mean, or the frame's where lighter: lit crowns
     rough: float = 0.2  # rms of lightness over its mean within `around_m`: woods, shadows too
     dark: float = 0.6  # of the frame's lightness: shadows
-    thrown: float = (
-        2.5  # of a shadow's width: how far from within it, towards the sun, what throws it reaches
-    )
+    # of a shadow's width: how far from within it, towards the sun, what throws it reaches
+    thrown: float = 2.5
     least_grey: float = 8.0  # grey levels: below, a mean is noise; by choice
     lengths: CrownLengths = field(default_factory=CrownLengths)
 

@@ -20,9 +20,8 @@ class RecallSettings:
 
     slope_sigma: float = 0.5  # of a weight, for one standard deviation of its condition
     chance_sigma: float = 2.5  # of the log odds
-    farthest: float = (
-        2.5  # standard deviations: beyond what plants covered, nothing is extrapolated
-    )
+    # standard deviations: beyond what plants covered, nothing is extrapolated
+    farthest: float = 2.5
     least_spread: float = 0.05  # of a condition: what hardly varies explains nothing
     draws: int = 400  # of the weights, for the interval
     steps: int = 40  # of Newton's method, at most

@@ -51,7 +51,7 @@ from sorvolo.survey.wording import counted_list
 if TYPE_CHECKING:
     from sorvolo.missions.search.while_flying import SearchWhileFlying
     from sorvolo.missions.watch.run import EarlyFound, WatchUpdate
-    from sorvolo.tracking.picture_steps import PictureStep
+    from sorvolo.tracking.image_motion import PictureStep
 
 FINISHED, FAILED, STOPPED = "run.finished", "run.failed", "run.stopped"
 """The types of a journal's last line."""

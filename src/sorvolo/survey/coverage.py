@@ -15,9 +15,8 @@ class Gap(StrEnum):
     LEANING = "leaning"  # earlier pictures contradict the map there: crowns and walls that lean
     BLURRED = "blurred"  # its views are blurred
     ONE_VIEW = "one-view"  # seen in one view only, too few to announce a change
-    UNEXPLAINED = (
-        "unexplained"  # most of its views differ from the map, and no change is reported there
-    )
+    # most of its views differ from the map, and no change is reported there
+    UNEXPLAINED = "unexplained"
     INSENSITIVE = "insensitive"  # test objects that were drawn there were not found
 
 

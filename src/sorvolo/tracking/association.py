@@ -4,24 +4,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, PointsM, Rows
+from sorvolo.geometry.arrays import Floats, Mask, PointsM, Rows
 from sorvolo.tracking.motion import Motions
 
 _NEVER = -1e6  # a logarithm of odds that adds nothing beside any other
 
-
-@dataclass(frozen=True)
-class PairSettings:
-    """How place, class, size and looks speak for a pair; likelihoods as natural logarithms."""
-
-    gate: float = (
-        11.8  # squared distance in sigmas, two axes: 3 in 1000 of one object's sightings lie beyond
-    )
-    size_sigma: float = 0.4  # of the natural logarithm of the longer side
-    least_size: float = -3.0  # a size that fits worse counts no less: boxes are cut, bodies turn
-    looks_weight: float = 4.0  # for each unit that the cosine of the angle of two looks lacks
-    class_floor: float = 0.03  # chance of a class that a track never had
-    most_votes: int = 24  # pairs that are asked for the frame's shift
+_GATE = 11.8  # squared distance in sigmas, two axes: 3 in 1000 of one object's sightings lie beyond
+_LOOKS_WEIGHT = 4.0  # for each unit that the cosine of the angle of two looks lacks
+_CLASS_FLOOR = 0.03  # chance of a class that a track never had
+_MOST_VOTES = 24  # pairs that are asked for the frame's shift
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,49 +25,105 @@ class Pairs:
     def __len__(self) -> int:
         return len(self.tracks)
 
-    def joined(self, other: "Pairs") -> "Pairs":
-        """These and others."""
-        tracks = np.concatenate([self.tracks, other.tracks])
-        return Pairs(tracks, np.concatenate([self.sightings, other.sightings]))
 
+@dataclass(frozen=True, eq=False)
+class PairOdds:
+    """What speaks for each pair of a near track and a sighting, as natural logarithms.
 
-def place_likelihoods(
-    motions: Motions,
-    places_m: PointsM,
-    covariances_m2: Floats,
-    offsets_m: PointsM,
-    offsets_m2: Floats,
-    settings: PairSettings,
-) -> Floats:
-    """(tracks, sightings) log density of each sighting's place if it is that track's; very low beyond the gate.
-
-    `covariances_m2` (sightings, 2, 2) are the sightings' own; a track's sightings would lie `offsets_m` (tracks, 2)
-    beside it, with variance `offsets_m2` (tracks,) per axis.
+    `places_m` (sightings, 2) are without the shift's mean, `own_m2` (sightings, 2, 2) what each errs for itself, `fits`
+    (tracks, sightings) what beside place speaks for a pair, `unseen` the log density of new objects, `sure`
+    (sightings,) which may begin a track.
     """
-    gaps = (
-        places_m[None, None] - (motions.means[:, :, :2] + offsets_m[:, None])[:, :, None]
-    )  # (N, 2, M, 2)
-    loose = offsets_m2[:, None, None, None, None] * np.eye(2)
-    inverse = _inverse(motions.covariances[:, :, None, :2, :2] + covariances_m2[None, None] + loose)
-    x, y = gaps[..., 0], gaps[..., 1]
-    squared = (
-        inverse[..., 0, 0] * x * x + 2 * inverse[..., 0, 1] * x * y + inverse[..., 1, 1] * y * y
-    )
-    logs = -0.5 * (squared - np.log(_determinant(inverse))) - np.log(2 * np.pi)
-    logs = np.where(squared <= settings.gate, logs + np.log(motions.weights)[:, :, None], _NEVER)
-    return np.logaddexp(logs[:, 0], logs[:, 1])
+
+    motions: Motions
+    places_m: PointsM
+    own_m2: Floats
+    fits: Floats
+    unseen: float
+    sure: Mask
+
+    @property
+    def mean_own_m2(self) -> Floats:
+        """(sightings,) what each errs for itself, per axis."""
+        return np.asarray(np.trace(self.own_m2, axis1=1, axis2=2) / 2, np.float64)
+
+    def gains(self, offsets_m: PointsM, offsets_m2: Floats) -> Floats:
+        """(tracks, sightings) how much likelier pairs are than new objects; very low beyond the gate.
+
+        A track's sightings would lie `offsets_m` (tracks, 2) beside it, with variance `offsets_m2` (tracks,) per axis.
+        """
+        motions = self.motions
+        gaps = (
+            self.places_m[None, None] - (motions.means[:, :, :2] + offsets_m[:, None])[:, :, None]
+        )  # (N, 2, M, 2)
+        loose = offsets_m2[:, None, None, None, None] * np.eye(2)
+        inverse = _inverse(
+            motions.covariances[:, :, None, :2, :2] + self.own_m2[None, None] + loose
+        )
+        squared = _squared(inverse, gaps[..., 0], gaps[..., 1])
+        logs = -0.5 * (squared - np.log(_determinant(inverse))) - np.log(2 * np.pi)
+        logs = np.where(squared <= _GATE, logs + np.log(motions.weights)[:, :, None], _NEVER)
+        return np.logaddexp(logs[:, 0], logs[:, 1]) + self.fits - self.unseen
+
+    def assign(self, gain: Floats) -> Pairs:
+        """The best pairs, sure sightings first."""
+        first = assigned(np.where(self.sure, gain, -1.0))
+        gain = gain.copy()
+        gain[first.tracks], gain[:, first.sightings], gain[:, self.sure] = -1.0, -1.0, -1.0
+        rest = assigned(gain)
+        return Pairs(
+            np.concatenate([first.tracks, rest.tracks]),
+            np.concatenate([first.sightings, rest.sightings]),
+        )
+
+    def vote(
+        self, shares: Floats, loose_m2: Floats, slow_m2: float, gains: Floats, reluctance: float
+    ) -> PointsM:
+        """(2,) the error of the frame's shift under which the pattern of its sightings fits the tracks best.
+
+        Each likely pair votes for the error that brings it together; an error's worth is that of all sightings with
+        their best tracks. It has variance `slow_m2` per axis; a track shows its share of it (tracks,), with variance
+        `loose_m2` (tracks,) beside. `gains` (tracks, sightings) is what speaks for pairs in all; an error must be worth
+        `reluctance` more than none.
+        """
+        rows, columns = np.nonzero((gains > 0) & (shares > 0.3)[:, None])
+        if not len(rows):
+            return np.zeros(2)
+        best = np.argsort(-gains[rows, columns], kind="stable")[:_MOST_VOTES]
+        tracks_m = self.motions.places_m
+        track_m2 = self.motions.place_covariances_m2 + loose_m2[:, None, None] * np.eye(2)
+        asked = (self.places_m[columns[best]] - tracks_m[rows[best]]) / shares[rows[best], None]
+        errors = np.concatenate([np.zeros((1, 2)), asked])
+        near, seen = (np.unique(places) for places in np.nonzero(gains > 0))
+        gaps = self.places_m[None, seen] - tracks_m[near][:, None]  # (N, M, 2)
+        inverse = _inverse(track_m2[near][:, None] + self.own_m2[seen][None])
+        base = (
+            0.5 * np.log(_determinant(inverse))
+            - np.log(2 * np.pi)
+            + self.fits[np.ix_(near, seen)]
+            - self.unseen
+        )
+        steps = errors[:, None, :] * shares[near][None, :, None]  # (S, N, 2)
+        x, y = np.moveaxis(gaps[None] - steps[:, :, None], -1, 0)  # (S, N, M) each
+        worth = np.maximum(base - 0.5 * _squared(inverse, x, y), 0.0).max(axis=1).sum(axis=1)
+        worth -= 0.5 * (errors**2).sum(axis=1) / max(slow_m2, 1e-9)
+        worth[1:] -= reluctance
+        chosen: PointsM = errors[int(np.argmax(worth))]
+        return chosen
 
 
-def size_likelihoods(track_sides_m: Floats, seen_sides_m: Floats, settings: PairSettings) -> Floats:
-    """(tracks, sightings) how well longer sides fit, at best 0."""
+def size_likelihoods(
+    track_sides_m: Floats, seen_sides_m: Floats, sigma: float, least: float
+) -> Floats:
+    """(tracks, sightings) how well longer sides fit, `least` .. 0, their logarithms spread by `sigma`."""
     ratio = (
         np.log(np.maximum(seen_sides_m, 1e-3))[None]
         - np.log(np.maximum(track_sides_m, 1e-3))[:, None]
     )
-    return np.maximum(-0.5 * (ratio / settings.size_sigma) ** 2, settings.least_size)
+    return np.maximum(-0.5 * (ratio / sigma) ** 2, least)
 
 
-def looks_likelihoods(track_looks: Floats, seen_looks: Floats, settings: PairSettings) -> Floats:
+def looks_likelihoods(track_looks: Floats, seen_looks: Floats) -> Floats:
     """(tracks, sightings) how well appearance vectors fit, (tracks, D) and (sightings, D), at best 0; NaN: unknown.
 
     Vectors are histograms or embeddings of any scale; their angle counts.
@@ -84,12 +131,12 @@ def looks_likelihoods(track_looks: Floats, seen_looks: Floats, settings: PairSet
     with np.errstate(invalid="ignore", divide="ignore"):
         a = track_looks / np.linalg.norm(track_looks, axis=1, keepdims=True)
         b = seen_looks / np.linalg.norm(seen_looks, axis=1, keepdims=True)
-    return np.nan_to_num(settings.looks_weight * (a @ b.T - 1.0))
+    return np.nan_to_num(_LOOKS_WEIGHT * (a @ b.T - 1.0))
 
 
-def class_likelihoods(shares: Floats, labels: Rows, settings: PairSettings) -> Floats:
+def class_likelihoods(shares: Floats, labels: Rows) -> Floats:
     """(tracks, sightings) log of how likely each sighting's class is, by the tracks' shares (tracks, classes)."""
-    return np.log(settings.class_floor + (1 - settings.class_floor) * shares[:, labels])
+    return np.log(_CLASS_FLOOR + (1 - _CLASS_FLOOR) * shares[:, labels])
 
 
 def least_cost(costs: Floats) -> tuple[Rows, Rows]:
@@ -108,55 +155,8 @@ def assigned(gains: Floats) -> Pairs:
     return Pairs(rows[keep], columns[keep])
 
 
-def voted_shift(
-    motions: Motions,
-    places_m: PointsM,
-    covariances_m2: Floats,
-    shares: Floats,
-    loose_m2: Floats,
-    slow_m2: float,
-    fits: Floats,
-    gains: Floats,
-    new_log_density: float,
-    settings: PairSettings,
-    reluctance: float = 0.0,
-) -> PointsM:
-    """(2,) the error of the frame's shift under which the pattern of its sightings fits the tracks best.
-
-    Each likely pair votes for the error that brings it together; an error's worth is that of all sightings with their
-    best tracks. It has variance `slow_m2` per axis; a track shows its share of it (tracks,), with variance `loose_m2`
-    (tracks,) beside. `fits` (tracks, sightings) is what beside place speaks for pairs, `gains` what all together does;
-    an error must be worth `reluctance` more than none.
-    """
-    rows, columns = np.nonzero((gains > 0) & (shares > 0.3)[:, None])
-    if not len(rows):
-        return np.zeros(2)
-    best = np.argsort(-gains[rows, columns], kind="stable")[: settings.most_votes]
-    tracks_m, track_m2 = (
-        motions.places_m,
-        motions.place_covariances_m2 + loose_m2[:, None, None] * np.eye(2),
-    )
-    asked = (places_m[columns[best]] - tracks_m[rows[best]]) / shares[rows[best], None]
-    errors = np.concatenate([np.zeros((1, 2)), asked])
-    near, seen = (np.unique(each) for each in np.nonzero(gains > 0))
-    gaps = places_m[None, seen] - tracks_m[near][:, None]  # (N, M, 2)
-    inverse = _inverse(track_m2[near][:, None] + covariances_m2[seen][None])
-    base = (
-        0.5 * np.log(_determinant(inverse))
-        - np.log(2 * np.pi)
-        + fits[np.ix_(near, seen)]
-        - new_log_density
-    )
-    steps = errors[:, None, :] * shares[near][None, :, None]  # (S, N, 2)
-    x, y = np.moveaxis(gaps[None] - steps[:, :, None], -1, 0)  # (S, N, M) each
-    squared = (
-        inverse[..., 0, 0] * x * x + 2 * inverse[..., 0, 1] * x * y + inverse[..., 1, 1] * y * y
-    )
-    worth = np.maximum(base - 0.5 * squared, 0.0).max(axis=1).sum(axis=1)
-    worth -= 0.5 * (errors**2).sum(axis=1) / max(slow_m2, 1e-9)
-    worth[1:] -= reluctance
-    chosen: PointsM = errors[int(np.argmax(worth))]
-    return chosen
+def _squared(inverse: Floats, x: Floats, y: Floats) -> Floats:
+    return inverse[..., 0, 0] * x * x + 2 * inverse[..., 0, 1] * x * y + inverse[..., 1, 1] * y * y
 
 
 def _inverse(matrices: Floats) -> Floats:

@@ -16,18 +16,13 @@ from sorvolo.geometry.arrays import Floats, PointsM, Rows
 
 _TINY = 1e-9
 
-
-@dataclass(frozen=True)
-class ShiftSettings:
-    """How frames' shifts wander and jump."""
-
-    forgets_s: float = 60.0  # how long a GPS error lasts
-    first_jitter: float = (
-        0.4  # of the shared sigma: what changes from frame to frame, until the frames show it ...
-    )
-    least_jitter: float = 0.03  # ... and is never less
-    learns: float = 0.05  # weight of a frame in what changes from frame to frame
-    most_rows: int = 300  # places kept with what they share; those not seen for longest keep their own sigma only
+_FORGETS_S = 60.0  # how long a GPS error lasts
+# of the shared sigma: what changes from frame to frame, until the frames show it ...
+_FIRST_JITTER = 0.4
+_LEAST_JITTER = 0.03  # ... and is never less
+_LEARNS = 0.05  # weight of a frame in what changes from frame to frame
+# places kept with what they share; those not seen for longest keep their own sigma only
+_MOST_ROWS = 300
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +48,7 @@ class FittedShift:
 class CommonShift:
     """The shift of frames and the errors of places, by the ids of their tracks."""
 
-    def __init__(self, settings: ShiftSettings = ShiftSettings()) -> None:
-        self._settings = settings
+    def __init__(self) -> None:
         self.mean_m = np.zeros(2)
         self.jitter_m2 = -1.0
         self.jump_m = np.zeros(2)
@@ -72,10 +66,10 @@ class CommonShift:
         self._frame += 1
         self.jump_m = np.zeros(2)
         if self.jitter_m2 < 0:
-            self.jitter_m2 = self._settings.first_jitter**2 * shared_m2
+            self.jitter_m2 = _FIRST_JITTER**2 * shared_m2
             self._covariance[0, 0] = shared_m2
         self._left_m2 = self.jitter_m2
-        keeps = float(np.exp(-elapsed_s / self._settings.forgets_s))
+        keeps = float(np.exp(-elapsed_s / _FORGETS_S))
         slow_m2 = max(shared_m2 - self.jitter_m2, 0.25 * shared_m2)
         self.mean_m = keeps * self.mean_m
         self._covariance[0] *= keeps
@@ -202,8 +196,8 @@ class CommonShift:
         together_m = weights @ fitted.gaps_m
         seen_m2 = float(together_m @ together_m) / 2 - expected_m2 + self.jitter_m2
         self._lessons += 1
-        rate = max(self._settings.learns, 1 / (self._lessons + 3))
-        least_m2, most_m2 = self._settings.least_jitter**2 * self._shared_m2, self._shared_m2
+        rate = max(_LEARNS, 1 / (self._lessons + 3))
+        least_m2, most_m2 = _LEAST_JITTER**2 * self._shared_m2, self._shared_m2
         self.jitter_m2 = float(
             np.clip((1 - rate) * self.jitter_m2 + rate * seen_m2, least_m2, most_m2)
         )
@@ -224,11 +218,9 @@ class CommonShift:
         self._covariance, self._rows[number], self._seen[number] = grown, size, self._frame
 
     def _freeze(self) -> None:
-        if len(self._rows) <= self._settings.most_rows + 50:
+        if len(self._rows) <= _MOST_ROWS + 50:
             return
-        oldest = sorted(self._seen, key=self._seen.__getitem__)[
-            : len(self._rows) - self._settings.most_rows
-        ]
+        oldest = sorted(self._seen, key=self._seen.__getitem__)[: len(self._rows) - _MOST_ROWS]
         kept = {number: self.variance_m2(number) for number in oldest}
         self.drop(oldest)
         self._frozen.update(kept)

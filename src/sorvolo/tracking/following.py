@@ -8,24 +8,19 @@ import numpy as np
 
 from sorvolo.geometry.arrays import Floats, Mask, PointsM
 from sorvolo.geometry.level_ground import footprint
-from sorvolo.geometry.pose import Pose, rotation_from_vector, site_from_gimbal_rotation
+from sorvolo.geometry.pose import Pose, rotation_from_vector
 from sorvolo.survey.flight import CameraModel, CameraPrior, Frame
 from sorvolo.survey.objects import Detections, Sighting, Track
-from sorvolo.tracking.heading import CompassError, Heading, HeadingFromMotion
-from sorvolo.tracking.heading_check import HeadingTurn, heading_deg, is_checked, is_wrong, turned
+from sorvolo.tracking.headings import CompassError, HeadingCheck, HeadingFromPictures
 from sorvolo.tracking.image_motion import ImageMotion
-from sorvolo.tracking.locate import IMPOSSIBLE_SIZE, GroundHeight, LocateSettings, locate
-from sorvolo.tracking.scene_scale import SceneScale
+from sorvolo.tracking.laying import IMPOSSIBLE_SIZE, GroundHeight, LocateSettings, locate
+from sorvolo.tracking.sizes import SceneScale
 from sorvolo.tracking.tracker import IN_PICTURES, Tracker, TrackerSettings, TrackUpdate
 
 _MOST_DRONE_PLACES = 200_000  # frames: an hour and fifty minutes at 30 a second; by choice
-_GIMBAL_TILT_SIGMA_DEG = (
-    1.0  # a mapping doubts gimbals more, since its pictures measure tilt; here nothing else does
-)
+# a mapping doubts gimbals more, since its pictures measure tilt; here nothing else does
+_GIMBAL_TILT_SIGMA_DEG = 1.0
 _LEAST_DOWN = 0.1  # of the optical axis: nearer to the horizon a sampling distance means nothing
-_TURNS_DEG_S = 20.0  # a drone that turns faster has its heading not checked; by choice
-_CLOCK_OFF_NS = 1_000_000_000  # by which telemetry's clock may be off: so long after a turn headings are not checked
-_JUMP_DEG = 60.0  # from one frame to the next, against the pictures' own turning; by choice
 _OVER_MODEL = LocateSettings(ground_sigma_m=1.0)  # of a height model, where it stands on its own
 
 
@@ -93,8 +88,8 @@ class GroundFollower:
     ) -> None:
         self._camera, self._ground = camera, ground
         self._tracker = Tracker(settings)
-        self._heading = None if knows_heading else _HeadingFromPictures()
-        self._check = _HeadingCheck() if knows_heading and is_video else None
+        self._heading = None if knows_heading else HeadingFromPictures()
+        self._check = HeadingCheck() if knows_heading and is_video else None
         self._compass = CompassError()
         self._path: list[Floats] = []
         self.unlocated: Counter[str] = Counter()
@@ -196,86 +191,6 @@ class GroundFollower:
             return 0.0
         below_m = float(self._ground(prior.position_m[None, :2])[0])
         return below_m if np.isfinite(below_m) else 0.0
-
-
-class _HeadingFromPictures:
-    """The heading of a camera from the motion that its pictures show; without `over_guesses` the way begins anew where
-    a picture shows no motion that fits."""
-
-    def __init__(self, *, over_guesses: bool = True) -> None:
-        self._motion, self._heading = ImageMotion(), HeadingFromMotion()
-        self._segments, self._guessed, self._over_guesses = 1, 0, over_guesses
-
-    def take(
-        self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior
-    ) -> CameraPrior:
-        """The prior with the heading in it, where that is known by now."""
-        heading = self.heading(frame, time_ns, found, prior)
-        if not np.isfinite(heading.sigma_deg):
-            return prior
-        sigma_deg = np.array([*prior.attitude_sigma_deg[:2], heading.sigma_deg])
-        rotation = site_from_gimbal_rotation(heading.heading_deg, -90.0, 0.0)
-        return replace(prior, rotation=rotation, attitude_sigma_deg=sigma_deg)
-
-    def heading(self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior) -> Heading:
-        """The heading of a frame, which has to be given each; its sigma is infinite where it is not known by now."""
-        _, outline_px = self._motion.locate(found, frame, time_ns)
-        is_guess = self._motion.guessed != self._guessed and not self._over_guesses
-        if self._motion.segments != self._segments or is_guess:
-            self._heading.lose()
-        self._segments, self._guessed = self._motion.segments, self._motion.guessed
-        if not prior.knows_place:
-            return Heading(0.0, float("inf"))
-        return self._heading.add(time_ns / 1e9, outline_px, prior.position_m[:2])
-
-
-class _HeadingCheck:
-    """A video's headings held against the motion that its pictures show, where the camera looks about straight down.
-
-    A heading that cannot be (`heading_check.is_wrong`) is turned to what the pictures show, and the next ones by as
-    much until they show otherwise. While the drone turns nothing but a jump is judged: telemetry's clock may be off.
-    `turns_deg` are these turns, clockwise, one for each such frame.
-    """
-
-    def __init__(self) -> None:
-        self._pictures = _HeadingFromPictures(over_guesses=False)
-        self._turn: HeadingTurn | None = None
-        self._last: tuple[int, float, float] | None = None  # time, heading, turn, as last shown
-        self._steady_ns = 0  # the drone turns until then
-        self.turns_deg: list[float] = []
-
-    def take(
-        self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior
-    ) -> CameraPrior:
-        """The prior, turned where its heading is wrong."""
-        shown = self._pictures.heading(frame, time_ns, found, prior)
-        if not is_checked(prior):
-            return prior
-        if np.isfinite(shown.sigma_deg):
-            self._judge(time_ns, shown, prior)
-        if self._turn is None:
-            return prior
-        self.turns_deg.append(self._turn.turn_deg)
-        return turned(prior, self._turn)
-
-    def _judge(self, time_ns: int, shown: Heading, prior: CameraPrior) -> None:
-        """Decide anew by how much headings have to turn, where the frame allows it."""
-        turn = HeadingTurn(shown.heading_deg - heading_deg(prior), shown.sigma_deg)
-        before, self._last = self._last, (time_ns, shown.heading_deg, turn.turn_deg)
-        jump_deg = 0.0
-        if before is not None and time_ns > before[0]:
-            turns_deg_s = (
-                abs(HeadingTurn(shown.heading_deg - before[1], 0.0).turn_deg)
-                * 1e9
-                / (time_ns - before[0])
-            )
-            jump_deg = abs(HeadingTurn(turn.turn_deg - before[2], 0.0).turn_deg)
-            if turns_deg_s > _TURNS_DEG_S:
-                self._steady_ns = time_ns + _CLOCK_OFF_NS
-        if time_ns >= self._steady_ns:
-            self._turn = turn if is_wrong(turn, prior) else None
-        elif jump_deg > _JUMP_DEG:  # no clock that is off does that
-            self._turn = turn if abs(turn.turn_deg) > _JUMP_DEG else None
 
 
 class PictureFollower:

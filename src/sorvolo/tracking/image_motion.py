@@ -1,46 +1,33 @@
-"""The camera's own motion taken out of pictures that nothing places: sightings in a first picture's pixels."""
+"""The ground's motion through pictures: without telemetry to a first one, and from each searched frame to the next."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, Mask, PointsPx
+from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, Mask, Matrix3, PointsPx, frozen
 from sorvolo.survey.flight import Frame
 from sorvolo.survey.objects import Detections, Sighting
 
 _UNTIL = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.03)
 
+_WIDTH_PX = 480  # of the pictures in which motion is looked for
+_POINTS = 180  # that are followed, ...
+_LEAST_POINTS = 90  # ... new ones where fewer are left
+_WINDOW_PX = (17, 17)  # around a point that is followed (Lucas and Kanade)
+_LEVELS = 4  # of smaller pictures, for longer steps
+_THERE_AND_BACK_PX = 0.7  # points that miss by more on the way back are left out
+_FIT_PX = 1.5  # a point that agrees lies so near
+_LEAST_INLIERS = 12  # points that must agree ...
+_LEAST_INLIER_SHARE = 0.35  # ... and of all
 
-@dataclass(frozen=True)
-class FlowSettings:
-    """How points are followed, in the small pictures."""
-
-    width_px: int = 480  # of the pictures in which motion is looked for
-    points: int = 180  # that are followed, ...
-    least_points: int = 90  # ... new ones where fewer are left
-    window_px: tuple[int, int] = (17, 17)  # around a point that is followed (Lucas and Kanade)
-    levels: int = 4  # of smaller pictures, for longer steps
-    there_and_back_px: float = 0.7  # points that miss by more on the way back are left out
-    fit_px: float = 1.5  # a point that agrees lies so near
-    least_inliers: int = 12  # points that must agree ...
-    least_inlier_share: float = 0.35  # ... and of all
-
-
-@dataclass(frozen=True)
-class ImageMotionSettings:
-    """When the way is lost, and how far it may have drifted."""
-
-    failures: int = 4  # pictures in a row after which the way is lost
-    cut_likeness: float = 0.2  # of small thumbnails: less is another scene
-    thumbnail_px: tuple[int, int] = (32, 18)  # columns, rows of those thumbnails
-    box_sigma: float = 0.08  # of a box's middle, in shares of its side
-    least_sigma_px: float = 1.0  # however small the box
-    drift_share: float = (
-        0.004  # of the way gone over the ground, as one goes from points to new points
-    )
-    guess_share: float = 0.3  # of a step that was guessed
-    flow: FlowSettings = field(default_factory=FlowSettings)
+_FAILURES = 4  # pictures in a row after which the way is lost
+_CUT_LIKENESS = 0.2  # of small thumbnails: less is another scene
+_THUMBNAIL_PX = (32, 18)  # columns, rows of those thumbnails
+_BOX_SIGMA = 0.08  # of a box's middle, in shares of its side
+_LEAST_SIGMA_PX = 1.0  # however small the box
+_DRIFT_SHARE = 0.004  # of the way gone over the ground, as one goes from points to new points
+_GUESS_SHARE = 0.3  # of a step that was guessed
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +49,7 @@ class ImageMotion:
     picture its places are counted in: they have nothing to do with those of the segments before.
     """
 
-    def __init__(self, settings: ImageMotionSettings = ImageMotionSettings()) -> None:
-        self._settings = settings
+    def __init__(self) -> None:
         self.segments, self.guessed = 1, 0
         self._last: _View | None = None
         self._first_from_image = np.eye(2, 3)
@@ -92,14 +78,12 @@ class ImageMotion:
             ),
         )
         scale = float(np.sqrt(abs(np.linalg.det(self._first_from_image[:, :2]))))
-        drift_px = self._settings.drift_share * self._way_px + self._guessed_px
+        drift_px = _DRIFT_SHARE * self._way_px + self._guessed_px
         boxes = found.boxes_px.astype(np.float64)
         places = _moved(self._first_from_image, (boxes[:, :2] + boxes[:, 2:]) / 2 - 0.5)
         sides = (boxes[:, 2:] - boxes[:, :2]) * scale
         turn = self._first_from_image[:, :2] / max(scale, 1e-9)
-        own = (
-            np.maximum(self._settings.box_sigma * sides, self._settings.least_sigma_px * scale) ** 2
-        )
+        own = np.maximum(_BOX_SIGMA * sides, _LEAST_SIGMA_PX * scale) ** 2
         return [
             Sighting(
                 frame.index,
@@ -118,22 +102,19 @@ class ImageMotion:
 
     def _follow(self, image: ImageRGB, boxes_px: Floats) -> None:
         """Find where a picture lies."""
-        flow = self._settings.flow
-        shrink = min(1.0, flow.width_px / image.shape[1])
+        shrink = min(1.0, _WIDTH_PX / image.shape[1])
         gray = _small_gray(image, shrink)
-        thumbnail = cv2.resize(
-            gray, self._settings.thumbnail_px, interpolation=cv2.INTER_AREA
-        ).astype(np.float64)
+        thumbnail = cv2.resize(gray, _THUMBNAIL_PX, interpolation=cv2.INTER_AREA).astype(np.float64)
         if self._last is None or self._last.gray.shape != gray.shape:
             if self._last is not None:
                 self._begin_segment()
             self._look_anew(gray, thumbnail, boxes_px, shrink, np.zeros((0, 2)), np.zeros((0, 2)))
             return
-        here, places = _followed(self._last, gray, flow)
-        first_from_small, inliers = _similarity(here, places, flow)
+        here, places = _followed(self._last, gray)
+        first_from_small, inliers = _similarity(here, places)
         if first_from_small is None:
-            here, places = _followed(self._last, gray, flow, _whole_step(self._last.gray, gray))
-            first_from_small, inliers = _similarity(here, places, flow)
+            here, places = _followed(self._last, gray, _whole_step(self._last.gray, gray))
+            first_from_small, inliers = _similarity(here, places)
         if first_from_small is None:
             self._lose(gray, thumbnail, boxes_px, shrink)
             return
@@ -152,8 +133,8 @@ class ImageMotion:
         """A picture whose motion is not found: a guess, or another segment."""
         assert self._last is not None
         self._failures += 1
-        is_cut = _likeness(self._last.thumbnail, thumbnail) < self._settings.cut_likeness
-        if self._failures >= self._settings.failures or is_cut:
+        is_cut = _likeness(self._last.thumbnail, thumbnail) < _CUT_LIKENESS
+        if self._failures >= _FAILURES or is_cut:
             self._begin_segment()
             self._look_anew(gray, thumbnail, boxes_px, shrink, np.zeros((0, 2)), np.zeros((0, 2)))
             return
@@ -162,7 +143,7 @@ class ImageMotion:
         self._first_from_image = _composed(before, self._step)
         gone = self._first_from_image[:, 2] - before[:, 2]
         # the points of the last good picture stay
-        self._guessed_px += self._settings.guess_share * float(np.hypot(*gone)) + 2.0
+        self._guessed_px += _GUESS_SHARE * float(np.hypot(*gone)) + 2.0
 
     def _begin_segment(self) -> None:
         self.segments += 1
@@ -179,14 +160,13 @@ class ImageMotion:
         places: PointsPx,
     ) -> None:
         """Keep a picture's points, new ones where there are few, none on objects."""
-        flow = self._settings.flow
-        if len(here) < flow.least_points:
+        if len(here) < _LEAST_POINTS:
             free = np.full(gray.shape, 255, np.uint8)
             for left, top, right, bottom in np.clip(boxes_px * shrink, 0, None).astype(int):
                 free[max(top - 2, 0) : bottom + 3, max(left - 2, 0) : right + 3] = 0
             for x, y in here.astype(int):
                 cv2.circle(free, (int(x), int(y)), 8, 0, -1)
-            corners = cv2.goodFeaturesToTrack(gray, flow.points - len(here), 0.01, 8, mask=free)
+            corners = cv2.goodFeaturesToTrack(gray, _POINTS - len(here), 0.01, 8, mask=free)
             if corners is not None:
                 fresh = np.asarray(corners.reshape(-1, 2), np.float64)
                 first_from_small = _composed(
@@ -209,12 +189,12 @@ def _small_from_full(shrink: float) -> Floats:
 
 
 def _followed(
-    last: _View, gray: ImageGray, settings: FlowSettings, step_px: Floats | None = None
+    last: _View, gray: ImageGray, step_px: Floats | None = None
 ) -> tuple[PointsPx, PointsPx]:
     """Points found again, (M, 2), and their places; those that lead elsewhere on the way back are left out."""
-    if len(last.points_px) < settings.least_inliers:
+    if len(last.points_px) < _LEAST_INLIERS:
         return np.zeros((0, 2)), np.zeros((0, 2))
-    end, good = followed_points(last.gray, gray, last.points_px, settings, step_px)
+    end, good = followed_points(last.gray, gray, last.points_px, step_px)
     return end[good], last.places_px[good]
 
 
@@ -222,7 +202,6 @@ def followed_points(
     last: ImageGray,
     gray: ImageGray,
     points_px: PointsPx,
-    settings: FlowSettings,
     step_px: Floats | None = None,
 ) -> tuple[PointsPx, Mask]:
     """Where points (N, 2) of one small picture lie in another, and which (N,) lead back to where they came from.
@@ -237,8 +216,8 @@ def followed_points(
         gray,
         start,
         start + step,
-        winSize=settings.window_px,
-        maxLevel=settings.levels,
+        winSize=_WINDOW_PX,
+        maxLevel=_LEVELS,
         criteria=_UNTIL,
         flags=flags,
     )
@@ -247,13 +226,13 @@ def followed_points(
         last,
         end,
         end - step,
-        winSize=settings.window_px,
-        maxLevel=settings.levels,
+        winSize=_WINDOW_PX,
+        maxLevel=_LEVELS,
         criteria=_UNTIL,
         flags=flags,
     )
     miss = np.linalg.norm((back - start).reshape(-1, 2), axis=1)
-    good = (there.ravel() == 1) & (again.ravel() == 1) & (miss < settings.there_and_back_px)
+    good = (there.ravel() == 1) & (again.ravel() == 1) & (miss < _THERE_AND_BACK_PX)
     return end.reshape(-1, 2).astype(np.float64), good
 
 
@@ -264,12 +243,10 @@ def _whole_step(last: ImageGray, gray: ImageGray) -> Floats:
     return np.array([x, y])
 
 
-def _similarity(
-    here: PointsPx, places: PointsPx, settings: FlowSettings
-) -> tuple[Floats | None, Floats]:
+def _similarity(here: PointsPx, places: PointsPx) -> tuple[Floats | None, Floats]:
     """(2, 3) first picture from small picture by most points, and which (N,) they are; None where too few agree."""
     nothing = np.zeros(len(here), bool)
-    if len(here) < settings.least_inliers:
+    if len(here) < _LEAST_INLIERS:
         return None, nothing
     origin = places.mean(axis=0)  # a long way leads to large numbers
     spread = np.ptp(places, axis=0).max() / max(np.ptp(here, axis=0).max(), 1e-9)
@@ -278,7 +255,7 @@ def _similarity(
         here,
         places - origin,
         method=cv2.RANSAC,
-        ransacReprojThreshold=settings.fit_px * max(spread, 1e-3),
+        ransacReprojThreshold=_FIT_PX * max(spread, 1e-3),
         maxIters=500,
         confidence=0.999,
         refineIters=10,
@@ -286,7 +263,7 @@ def _similarity(
     if fit is None:
         return None, nothing
     inliers = kept.ravel().astype(bool)
-    enough = max(settings.least_inliers, settings.least_inlier_share * len(here))
+    enough = max(_LEAST_INLIERS, _LEAST_INLIER_SHARE * len(here))
     if inliers.sum() < enough or not np.isfinite(fit).all():
         return None, nothing
     fit[:, 2] += origin
@@ -311,3 +288,71 @@ def _composed(outer: Floats, inner: Floats) -> Floats:
 def _inverse(transform: Floats) -> Floats:
     back = np.linalg.inv(transform[:, :2])
     return np.column_stack([back, -back @ transform[:, 2]])
+
+
+STEP_S = 0.1
+"""Of a flight between two pictures that are compared: steps much longer find too little of the picture again."""
+
+SMALL_WIDTH_PX = 320
+"""Of the pictures that are compared: 3 ms of processor time a step."""
+
+_STEP_FIT_PX = 1.0  # a homography that is to carry boxes fits closer
+
+
+@dataclass(frozen=True, eq=False)
+class PictureStep:
+    """Where the ground of one picture lies in a later one: `to_from` (3, 3) takes its pixels there, homogeneous."""
+
+    from_ns: int
+    to_ns: int
+    to_from: Matrix3
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "to_from", frozen(self.to_from))
+
+
+class PictureSteps:
+    """Compares each picture with the one before it. Only `add` changes it.
+
+    The homography of level ground, fitted to corners that are followed (Bouguet 2001) by RANSAC: a camera that looks
+    aslant shows near ground move faster than far ground, which a similarity cannot express.
+    """
+
+    def __init__(self) -> None:
+        self._last: tuple[int, ImageGray] | None = None
+
+    def add(self, time_ns: int, gray: ImageGray, width_px: int) -> PictureStep | None:
+        """The step to a small picture from the last one, in pixels of the picture as it was taken, `width_px` wide.
+
+        None for the first one, and where the two do not show the same ground.
+        """
+        last, self._last = self._last, (time_ns, gray)
+        if last is None or last[1].shape != gray.shape or time_ns <= last[0]:
+            return None
+        to_from = _homography(last[1], gray)
+        if to_from is None:
+            return None
+        shrink = gray.shape[1] / width_px
+        offset = 0.5 * shrink - 0.5  # pixel centres stay on pixel centres
+        small_from_full = np.array([[shrink, 0, offset], [0, shrink, offset], [0, 0, 1.0]])
+        whole = np.linalg.inv(small_from_full) @ to_from @ small_from_full
+        return PictureStep(last[0], time_ns, whole / whole[2, 2])
+
+
+def _homography(last: ImageGray, gray: ImageGray) -> Matrix3 | None:
+    corners = cv2.goodFeaturesToTrack(last, _POINTS, 0.01, 8)
+    if corners is None or len(corners) < _LEAST_INLIERS:
+        return None
+    start = np.asarray(corners.reshape(-1, 2), np.float64)
+    end, good = followed_points(last, gray, start)
+    if good.sum() < _LEAST_INLIERS:
+        return None
+    cv2.setRNGSeed(1)
+    found, kept = cv2.findHomography(start[good], end[good], cv2.RANSAC, _STEP_FIT_PX, maxIters=500)
+    if found is None or kept.sum() < max(_LEAST_INLIERS, _LEAST_INLIER_SHARE * good.sum()):
+        return None
+    return (
+        np.asarray(found, np.float64)
+        if np.isfinite(found).all() and np.linalg.det(found) > 0
+        else None
+    )

@@ -23,19 +23,12 @@ class Habits:
     speed_m_s: float
     unsteadiness: float
     moving_share: float
-    sway_m: float = (
-        0.05  # per root second: people shift their weight, maps of neighbouring strips do not fit
-    )
+    # per root second: people shift their weight, maps of neighbouring strips do not fit
+    sway_m: float = 0.05
 
 
-@dataclass(frozen=True)
-class TurnSettings:
-    """How often objects start and stop."""
-
-    starts_every_s: float = (
-        60.0  # of one whose class moves half of the time; seldom movers start more seldom
-    )
-    stops_every_s: float = 60.0  # by choice, as starts
+_STARTS_EVERY_S = 60.0  # of one whose class moves half of the time; seldom movers start more seldom
+_STOPS_EVERY_S = 60.0  # by choice, as starts
 
 
 HABITS = {
@@ -104,15 +97,13 @@ def begun(places_m: PointsM, covariances_m2: Floats, habits: Floats) -> Motions:
     return Motions(means, covariances, np.column_stack([1 - habits[:, 2], habits[:, 2]]), habits)
 
 
-def predicted(
-    motions: Motions, elapsed_s: Floats, settings: TurnSettings = TurnSettings()
-) -> Motions:
+def predicted(motions: Motions, elapsed_s: Floats) -> Motions:
     """The same objects (N,) seconds later: models mixed as objects start and stop, then each moved on."""
     if not len(motions):
         return motions
     share = motions.habits[:, 2]
-    starts = (1 - np.exp(-elapsed_s / settings.starts_every_s)) * np.minimum(2 * share, 1.0)
-    stops = 1 - np.exp(-elapsed_s / settings.stops_every_s)
+    starts = (1 - np.exp(-elapsed_s / _STARTS_EVERY_S)) * np.minimum(2 * share, 1.0)
+    stops = 1 - np.exp(-elapsed_s / _STOPS_EVERY_S)
     turns = np.empty((len(motions), 2, 2))  # from, to
     turns[:, STANDS, STANDS], turns[:, STANDS, MOVES] = 1 - starts, starts
     turns[:, MOVES, STANDS], turns[:, MOVES, MOVES] = stops, 1 - stops

@@ -11,61 +11,48 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, Mask, PointsM
+from sorvolo.geometry.arrays import Floats, Rows
 from sorvolo.geometry.box_overlap import iou_matrix, nesting_matrix
 from sorvolo.survey.mosaic import PlacedFrame
 from sorvolo.survey.objects import TYPICAL_SIZE_M
 from sorvolo.tracking.association import least_cost
-from sorvolo.tracking.doubles import WITHIN
+from sorvolo.tracking.followed import WITHIN
 from sorvolo.tracking.laying import LaidSighting, shows, usual_height_m
-from sorvolo.tracking.plausible import length_log_odds, usual_length_m
-from sorvolo.tracking.view_evidence import EvidenceSettings, score_from_views
-from sorvolo.tracking.walking import Walk, WalkSettings, walks
+from sorvolo.tracking.sizes import length_log_odds, usual_length_m
+from sorvolo.tracking.view_evidence import score_from_views
 
 _TURNS = np.radians(np.arange(0.0, 180.0, 5.0))
 
+_GATE = 9.2  # squared distance in sigmas, two axes: 99 in 100 sightings of one object lie nearer
+# added for a sighting of another class: rather another object, yet classes are mistaken
+_OTHER_CLASS = 4.0
+_DRIFT_M = 0.12  # by which frames of one map lie beside each other where they were not linked
+_SAME_BOX = 0.55  # overlap of two boxes of one frame from which they show one object, whatever their classes
+# of the fewer views: what is seen twice in more frames than these is two objects
+_SHARED_FRAMES = 0.25
 
-@dataclass(frozen=True)
-class MatchSettings:
-    """Which sightings of several frames are one object that stands."""
+_TOP = 0.85  # of a body's height: tops are narrower than feet
+_HEIGHT_SIGMA = 0.3  # people stand, sit and lie
+_SIZE_SIGMA = 0.3  # of length and width
 
-    gate: float = (
-        9.2  # squared distance in sigmas, two axes: 99 in 100 sightings of one object lie nearer
-    )
-    other_class: float = 4.0  # added for a sighting of another class: rather another object, yet classes are mistaken
-    drift_m: float = (
-        0.12  # by which frames of one map lie beside each other where they were not linked
-    )
-    same_box: float = 0.55  # overlap of two boxes of one frame from which they show one object, whatever their classes
-    shared_frames: float = (
-        0.25  # of the fewer views: what is seen twice in more frames than these is two objects
-    )
+_LEAST_SCORE = 0.3  # from which on a class is reported for which none is given
+_STANDING_SHARE = 0.3  # of the frames that show a place: what so many saw there is no part of a way
+# by which the map's lengths may be off, relative: that of GPS heights over a flight
+_SCALE_SIGMA = 0.1
 
+# What moves while frames are seconds apart: sightings at changing places that one walker or car explains.
+_MOST_M_S = {"person": 4.0, "car": 20.0}  # a runner; a car in town; what is neither walks
+_OTHER_M_S = 4.0  # of a class of a user's own model, as a person's
 
-@dataclass(frozen=True)
-class BodySettings:
-    """What is known of a class's bodies beside their usual sizes, in shares of these."""
-
-    top: float = 0.85  # of a body's height: tops are narrower than feet
-    height_sigma: float = 0.3  # people stand, sit and lie
-    size_sigma: float = 0.3  # of length and width
-
-
-@dataclass(frozen=True)
-class StandingSettings:
-    """When an object stands where frames saw it, and which sightings are of it."""
-
-    least_score: float = 0.3  # from which on a class is reported for which none is given
-    standing_share: float = (
-        0.3  # of the frames that show a place: what so many saw there is no part of a way
-    )
-    evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
-    scale_sigma: float = (
-        0.1  # by which the map's lengths may be off, relative: that of GPS heights over a flight
-    )
-    matches: MatchSettings = field(default_factory=MatchSettings)
-    bodies: BodySettings = field(default_factory=BodySettings)
-    walks: WalkSettings = field(default_factory=WalkSettings)
+_LEAST_M_S = 0.25  # slower is a place badly known
+_LONGEST_GAP_S = 6.0  # between two sightings of a way
+# two sightings lie on a straight line whatever they are: these must be whole and ...
+_LEAST_VIEWS = 3
+_SURE_SCORE = 0.5  # ... of this score
+_AGAIN_S = 60.0  # what walks on as it did is known again after so long ...
+_SWERVE = 0.35  # ... within so much of the way that it goes meanwhile
+_MOST_OFF = 3.0  # sigmas, rms, from even motion along a line
+_WOBBLE_M_S2 = 0.4  # how much walkers turn and change their pace
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,63 +95,39 @@ def fuse(
     laid: Sequence[LaidSighting],
     frames: Sequence[PlacedFrame],
     least: Mapping[str, float] | None = None,
-    settings: StandingSettings = StandingSettings(),
 ) -> Fused:
     """The objects that the sightings of these frames show, each once, the surest first.
 
-    `least` is the score from which on each class is reported, `settings.least_score` that of a class it lacks. Weaker
-    sightings count as evidence: what all frames that show its place leave below it is dropped, unless several sightings
-    of that score lie on the way of something that walks or drives: that is reported once, as moving.
+    `least` is the score from which on each class is reported, else 0.3. Weaker sightings count as evidence: what all
+    frames that show its place leave below it is dropped, unless several sightings of that score lie on the way of
+    something that walks or drives: that is reported once, as moving.
     """
     if not laid:
         return Fused((), 0)
-    least = least or {}
+    thresholds = defaultdict(lambda: _LEAST_SCORE, least or {})
     strong = np.array(
-        [
-            each.sighting.score >= least.get(each.sighting.label, settings.least_score)
-            for each in laid
-        ]
+        [each.sighting.score >= thresholds[each.sighting.label] for each in laid], bool
     )
-    groups = _reported(_merged(_gathered(laid, settings.matches), laid, settings.matches), strong)
-    objects, unlikely = _standing_or_not(groups, laid, frames, least, settings)
-    left = [k for k in unlikely if strong[k]]
-    moving = walks([laid[k] for k in left], settings.walks)
-    objects += [_moving([left[k] for k in walk.members], walk, laid) for walk in moving]
+    # only groups of which a frame alone would report at least one sighting
+    groups = [group for group in _merged(_gathered(laid), laid) if strong[group].any()]
+    objects: list[Standing] = []
+    left: list[int] = []
+    for group, possible in zip(groups, _possible_views(groups, laid, frames)):
+        label, score = _score(group, possible, laid)
+        if score >= thresholds[label]:
+            objects.append(_standing(group, laid, possible, score))
+        elif len(_frames_of(group, laid)) < max(2.0, _STANDING_SHARE * possible):
+            left += [k for k in group if strong[k]]
+    alone = [laid[k] for k in left]
+    objects += [_moving([left[k] for k in walk], laid) for walk in _walks(alone)]
     used = sum(int(strong[list(each.members)].sum()) for each in objects)
     return Fused(tuple(sorted(objects, key=lambda each: -each.score)), int(strong.sum()) - used)
-
-
-def without_twins(
-    laid: Sequence[LaidSighting], settings: MatchSettings = MatchSettings()
-) -> list[list[int]]:
-    """The sightings of one frame, those together that are one object, the surest first.
-
-    They are boxes of several classes on one place, or of one class, one within the other.
-    """
-    order = sorted(range(len(laid)), key=lambda k: -laid[k].sighting.score)
-    boxes = np.array([each.sighting.box_px for each in laid], np.float64).reshape(-1, 4)
-    overlap, nesting = iou_matrix(boxes, boxes), nesting_matrix(boxes, boxes)
-    groups: list[list[int]] = []
-    for k in order:
-        for group in groups:
-            first = group[0]
-            if laid[first].sighting.label != laid[k].sighting.label:
-                is_same = overlap[first, k] > settings.same_box
-            else:
-                is_same = nesting[first, k] > WITHIN
-            if is_same:
-                group.append(k)
-                break
-        else:
-            groups.append([k])
-    return groups
 
 
 def fitted_size_m(
     laid: Sequence[LaidSighting],
     label: str,
     height_m: float,
-    settings: BodySettings = BodySettings(),
 ) -> Floats:
     """(2,) the longer and the shorter side of a box on the ground that has the sightings' sides.
 
@@ -179,11 +142,11 @@ def fitted_size_m(
     axes = np.array([each.axes for each in whole]).reshape(-1, 2)
     leans = np.repeat(np.array([each.lean for each in whole]), 2, axis=0)
     spans_m = np.maximum(
-        sides_m.ravel() - settings.top * height_m * np.abs((axes * leans).sum(axis=1)), 0.05
+        sides_m.ravel() - _TOP * height_m * np.abs((axes * leans).sum(axis=1)), 0.05
     )
     angle = np.arctan2(axes[:, 1], axes[:, 0])
     weight = 1.0 / (0.05 + 0.08 * spans_m)
-    prior = 1.0 / (settings.size_sigma * usual_m)
+    prior = 1.0 / (_SIZE_SIGMA * usual_m)
     best, best_cost = usual_m, np.inf
     for turn in _TURNS:
         matrix = np.abs(np.column_stack([np.cos(angle - turn), np.sin(angle - turn)]))
@@ -194,9 +157,6 @@ def fitted_size_m(
         if cost < best_cost:
             best, best_cost = sides, cost
     return np.sort(np.maximum(best, 0.05))[::-1]
-
-
-# ---- inside ---------------------------------------------------------------------------------------------------
 
 
 @dataclass(eq=False)
@@ -245,18 +205,23 @@ class _Gathering:
             self.label_scores[name] = self.label_scores.get(name, 0.0) + score
 
 
-def _gathered(laid: Sequence[LaidSighting], settings: MatchSettings) -> list[_Gathering]:
+def _gathered(laid: Sequence[LaidSighting]) -> list[_Gathering]:
     """Sightings frame by frame, each to the nearest object so far, no two of a frame to the same."""
+    by_frame: dict[int, list[int]] = defaultdict(list)
+    for k, each in enumerate(laid):
+        by_frame[each.sighting.frame_index].append(k)
     objects: list[_Gathering] = []
     places_m = np.zeros((0, 2))
-    for inside in _by_frame(laid):
-        groups = without_twins([laid[k] for k in inside], settings)
-        new = [_begin([inside[k] for k in group], laid) for group in groups]
-        costs = _costs(new, objects, places_m, laid, settings)
+    for inside in sorted(by_frame.values(), key=lambda rows: laid[rows[0]].sighting.time_ns):
+        new = [_begin(group, laid) for group in _without_twins(inside, laid)]
+        # squared distances in sigmas, at most the gate
+        costs = np.full((len(new), len(objects)), _GATE)
+        for row, begun in enumerate(new):
+            apart_m = np.hypot(*(places_m - begun.place_m).T)
+            for column in np.flatnonzero(apart_m < _reach_m(begun, laid)):
+                costs[row, column] = min(_GATE, _distance(begun, objects[int(column)]))
         rows, columns = least_cost(costs)
-        matched = {
-            row: column for row, column in zip(rows, columns) if costs[row, column] < settings.gate
-        }
+        matched = {row: column for row, column in zip(rows, columns) if costs[row, column] < _GATE}
         for row, begun in enumerate(new):
             if row in matched:
                 objects[matched[row]].take(begun)
@@ -266,31 +231,25 @@ def _gathered(laid: Sequence[LaidSighting], settings: MatchSettings) -> list[_Ga
     return objects
 
 
-def _costs(
-    new: Sequence[_Gathering],
-    objects: Sequence[_Gathering],
-    places_m: PointsM,
-    laid: Sequence[LaidSighting],
-    settings: MatchSettings,
-) -> Floats:
-    """(new, objects) squared distances in sigmas, at most the gate; `places_m` (objects, 2) are the objects' places."""
-    costs = np.full((len(new), len(objects)), settings.gate)
-    for row, begun in enumerate(new):
-        for column in np.flatnonzero(
-            np.hypot(*(places_m - begun.place_m).T) < _reach_m(begun, laid)
-        ):
-            costs[row, column] = min(
-                settings.gate, _distance(begun, objects[int(column)], settings)
-            )
-    return costs
+def _without_twins(inside: Sequence[int], laid: Sequence[LaidSighting]) -> list[list[int]]:
+    """The sightings of one frame, those together that are one object, the surest first.
 
-
-def _by_frame(laid: Sequence[LaidSighting]) -> list[list[int]]:
-    """The sightings of each frame, in order of time."""
-    by_frame: dict[int, list[int]] = defaultdict(list)
-    for k, each in enumerate(laid):
-        by_frame[each.sighting.frame_index].append(k)
-    return sorted(by_frame.values(), key=lambda inside: laid[inside[0]].sighting.time_ns)
+    They are boxes of several classes on one place, or of one class, one within the other.
+    """
+    sightings = [laid[k].sighting for k in inside]
+    boxes = np.array([each.box_px for each in sightings], np.float64).reshape(-1, 4)
+    overlap, nesting = iou_matrix(boxes, boxes), nesting_matrix(boxes, boxes)
+    groups: list[list[int]] = []
+    for row in sorted(range(len(inside)), key=lambda row: -sightings[row].score):
+        for group in groups:
+            first = group[0]
+            is_alike = sightings[first].label == sightings[row].label
+            if nesting[first, row] > WITHIN if is_alike else overlap[first, row] > _SAME_BOX:
+                group.append(row)
+                break
+        else:
+            groups.append([row])
+    return [[inside[row] for row in group] for group in groups]
 
 
 def _begin(members: list[int], laid: Sequence[LaidSighting]) -> _Gathering:
@@ -315,22 +274,31 @@ def _reach_m(each: _Gathering, laid: Sequence[LaidSighting]) -> float:
     )
 
 
-def _distance(one: _Gathering, other: _Gathering, settings: MatchSettings) -> float:
+def _distance(one: _Gathering, other: _Gathering) -> float:
     """Squared, in sigmas; more between classes."""
     apart_m = one.place_m - other.place_m
-    spread = one.covariance + other.covariance + settings.drift_m**2 * np.eye(2)
-    penalty = 0.0 if one.label == other.label else settings.other_class
+    spread = one.covariance + other.covariance + _DRIFT_M**2 * np.eye(2)
+    penalty = 0.0 if one.label == other.label else _OTHER_CLASS
     return float(apart_m @ np.linalg.solve(spread, apart_m)) + penalty
 
 
-def _merged(
-    objects: list[_Gathering], laid: Sequence[LaidSighting], settings: MatchSettings
-) -> list[list[int]]:
+def _merged(objects: list[_Gathering], laid: Sequence[LaidSighting]) -> list[list[int]]:
     """What is near enough to be one object and was never, or hardly, seen beside itself; the nearest pairs first."""
     alive = dict(enumerate(objects))
     frames = {k: _frames_of(each.members, laid) for k, each in alive.items()}
     while True:
-        pairs = _near_pairs(alive, frames, laid, settings)
+        keys = list(alive)
+        places_m = np.array([alive[key].place_m for key in keys])
+        pairs = []
+        for row, one in enumerate(keys):
+            apart_m = np.hypot(*(places_m[row + 1 :] - places_m[row]).T)
+            near = np.flatnonzero(apart_m < _reach_m(alive[one], laid))
+            for other in (keys[row + 1 + int(k)] for k in near):
+                shared = len(frames[one] & frames[other])
+                distance = _distance(alive[one], alive[other])
+                most = _SHARED_FRAMES * min(len(frames[one]), len(frames[other]))
+                if distance < _GATE and shared <= most:
+                    pairs.append((distance, one, other))
         if not pairs:
             return [
                 sorted(each.members, key=lambda k: laid[k].sighting.time_ns)
@@ -342,28 +310,6 @@ def _merged(
                 taken |= {one, other}
                 alive[one].take(alive.pop(other))
                 frames[one] |= frames[other]
-
-
-def _near_pairs(
-    alive: dict[int, _Gathering],
-    frames: dict[int, set[int]],
-    laid: Sequence[LaidSighting],
-    settings: MatchSettings,
-) -> list[tuple[float, int, int]]:
-    keys = list(alive)
-    places_m = np.array([alive[key].place_m for key in keys])
-    pairs = []
-    for row, one in enumerate(keys):
-        near = np.flatnonzero(
-            np.hypot(*(places_m[row + 1 :] - places_m[row]).T) < _reach_m(alive[one], laid)
-        )
-        for other in (keys[row + 1 + int(k)] for k in near):
-            shared = len(frames[one] & frames[other])
-            distance = _distance(alive[one], alive[other], settings)
-            most = settings.shared_frames * min(len(frames[one]), len(frames[other]))
-            if distance < settings.gate and shared <= most:
-                pairs.append((distance, one, other))
-    return pairs
 
 
 def _frames_of(members: Sequence[int], laid: Sequence[LaidSighting]) -> set[int]:
@@ -378,12 +324,19 @@ def _possible_views(
     What all of them cut is seen by none that shows it whole: there both are counted, the latter where it is sure of
     showing it, wherever it lies beyond the others' edges.
     """
-    firsts = [[laid[k] for k in group] for group in groups]
-    places_m, up_m, reach_m = _usual_bodies(firsts)
-    open_m = np.array([_open_m(group) for group in firsts])
-    usual_m = np.array([usual_length_m(group[0].sighting.label) for group in firsts])
-    reach_m = np.where(open_m > 0, np.maximum(reach_m, usual_m / 2) + 2 * open_m, reach_m)
-    counts = np.zeros(len(groups), int)
+    count = len(groups)
+    places_m, up_m, reach_m = np.zeros((count, 2)), np.zeros(count), np.zeros(count)
+    open_m = np.zeros(count)  # how far the middle of what the edge always cut may lie beyond
+    for row, group in enumerate(groups):
+        chosen = [laid[k] for k in group]
+        places_m[row] = np.median([each.sighting.position_m for each in chosen], axis=0)
+        up_m[row] = np.median([each.middle_up_m for each in chosen])
+        reach_m[row] = np.median([each.sighting.size_m[0] for each in chosen]) / 2
+        open_m[row] = np.sqrt(min(np.trace(each.beyond_m2) for each in chosen) / 2)
+        if open_m[row] > 0:
+            usual_m = usual_length_m(chosen[0].sighting.label)
+            reach_m[row] = np.maximum(reach_m[row], usual_m / 2) + 2 * open_m[row]
+    counts = np.zeros(count, int)
     for frame in frames:
         counts += shows(frame, places_m, up_m, reach_m).astype(int)
     seen = [len(_frames_of(group, laid)) for group in groups]
@@ -393,52 +346,7 @@ def _possible_views(
     ]
 
 
-def _usual_bodies(groups: Sequence[Sequence[LaidSighting]]) -> tuple[PointsM, Floats, Floats]:
-    """The medians of each group's places (N, 2), heights of their middles (N,) and half lengths (N,)."""
-    places_m = np.array(
-        [np.median([each.sighting.position_m for each in group], axis=0) for group in groups]
-    )
-    up_m = np.array([np.median([each.middle_up_m for each in group]) for group in groups])
-    reach_m = (
-        np.array([np.median([each.sighting.size_m[0] for each in group]) for group in groups]) / 2
-    )
-    return places_m, up_m, reach_m
-
-
-def _open_m(group: Sequence[LaidSighting]) -> float:
-    """How far the middle of what the picture's edge always cut may lie beyond; 0 where a frame shows it whole."""
-    return float(np.sqrt(min(np.trace(each.beyond_m2) for each in group) / 2))
-
-
-def _reported(groups: Sequence[list[int]], strong: Mask) -> list[list[int]]:
-    """The groups of which a frame alone would report at least one sighting."""
-    return [group for group in groups if strong[group].any()]
-
-
-def _standing_or_not(
-    groups: Sequence[Sequence[int]],
-    laid: Sequence[LaidSighting],
-    frames: Sequence[PlacedFrame],
-    least: Mapping[str, float],
-    settings: StandingSettings,
-) -> tuple[list[Standing], list[int]]:
-    """The objects that stand, and the sightings of other groups that may be on the way of something that moves."""
-    if not groups:
-        return [], []
-    objects: list[Standing] = []
-    unlikely: list[int] = []
-    for group, possible in zip(groups, _possible_views(groups, laid, frames)):
-        label, score = _score(group, possible, laid, settings)
-        if score >= least.get(label, settings.least_score):
-            objects.append(_standing(group, laid, possible, score, settings))
-        elif len(_frames_of(group, laid)) < max(2.0, settings.standing_share * possible):
-            unlikely += group
-    return objects, unlikely
-
-
-def _score(
-    group: Sequence[int], possible: int, laid: Sequence[LaidSighting], settings: StandingSettings
-) -> tuple[str, float]:
+def _score(group: Sequence[int], possible: int, laid: Sequence[LaidSighting]) -> tuple[str, float]:
     """What these sightings show, and the score of its being there: each frame's best score of that class counts, and
     how long it is."""
     label, _, _ = _named(group, laid)
@@ -447,16 +355,13 @@ def _score(
         seen = laid[k].sighting
         if seen.label == label:
             best[seen.frame_index] = max(seen.score, best.get(seen.frame_index, 0.0))
-    of_length = length_log_odds(
-        label, _seen_length_m([laid[k] for k in group]), settings.scale_sigma
-    )
-    return label, score_from_views(list(best.values()), possible, settings.evidence, of_length)
-
-
-def _seen_length_m(chosen: Sequence[LaidSighting]) -> float:
-    """The median of the boxes' longer sides; NaN where no frame shows it whole, or on a map without metres."""
-    whole_m = [each.sighting.size_m[0] for each in chosen if not each.is_cut and each.middle_up_m]
-    return float(np.median(whole_m)) if whole_m else float("nan")
+    # the longer sides of what a frame shows whole, on a map with metres
+    lengths_m = [
+        laid[k].sighting.size_m[0] for k in group if not laid[k].is_cut and laid[k].middle_up_m
+    ]
+    length_m = float(np.median(lengths_m)) if lengths_m else float("nan")
+    of_length = length_log_odds(label, length_m, _SCALE_SIGMA)
+    return label, score_from_views(list(best.values()), possible, of_length)
 
 
 def _named(
@@ -476,11 +381,7 @@ def _named(
 
 
 def _standing(
-    members: Sequence[int],
-    laid: Sequence[LaidSighting],
-    possible: int,
-    score: float,
-    settings: StandingSettings,
+    members: Sequence[int], laid: Sequence[LaidSighting], possible: int, score: float
 ) -> Standing:
     """One object that stands, from all its sightings."""
     label, _, shares = _named(members, laid)
@@ -488,15 +389,25 @@ def _standing(
     whole = [each for each in chosen if not each.is_cut] or chosen
     has_metres = any(each.middle_up_m for each in chosen)
     usual_up_m = usual_height_m(label) / 2 if has_metres else 0.0
-    answer, covariance = _place_and_rise(whole, usual_up_m, settings)
-    height_m = 2 * max(usual_up_m + float(answer[2]), 0.0)
-    size_m = (
-        fitted_size_m(chosen, label, height_m, settings.bodies)
-        if has_metres
-        else _median_sides(chosen)
-    )
-    if all(each.is_cut for each in whole):  # no frame shows it whole: how long it is nobody saw
+    # least squares: what was seen from several sides shows how far above the usual height its middle lies
+    rows, right = [], []
+    for each in whole:
+        place_m = each.sighting.position_m + each.lean * (usual_up_m - each.middle_up_m)
+        weight = 1.0 / float(np.hypot(each.own_sigma_m, _DRIFT_M))
+        rows.append(np.column_stack([np.eye(2), -each.lean]) * weight)
+        right.append(place_m * weight)
+    rows.append(np.array([[0.0, 0.0, 1.0 / max(_HEIGHT_SIGMA * usual_up_m, 1e-3)]]))
+    right.append(np.zeros(1))
+    normal = (matrix := np.concatenate(rows)).T @ matrix
+    answer = np.asarray(np.linalg.solve(normal, matrix.T @ np.concatenate(right)), np.float64)
+    beyond_m2 = min((each.beyond_m2 for each in whole), key=np.trace)
+    covariance = np.linalg.inv(normal)[:2, :2] + beyond_m2
+    if all(each.is_cut for each in whole):  # no frame shows it whole: nobody saw how long it is
         size_m = np.full(2, np.nan)
+    elif has_metres:
+        size_m = fitted_size_m(chosen, label, 2 * max(usual_up_m + float(answer[2]), 0.0))
+    else:
+        size_m = np.asarray(np.median([each.sighting.size_m for each in chosen], axis=0))
     return Standing(
         tuple(members),
         _best(members, laid, label),
@@ -510,48 +421,26 @@ def _standing(
     )
 
 
-def _place_and_rise(
-    whole: Sequence[LaidSighting], usual_up_m: float, settings: StandingSettings
-) -> tuple[Floats, Floats]:
-    """(3,) place and how far its middle lies above the usual height, by least squares, and the place's covariance.
-
-    What was seen from several sides shows how high its middle lies.
-    """
-    rows, right = [], []
-    for each in whole:
-        place_m = each.sighting.position_m + each.lean * (usual_up_m - each.middle_up_m)
-        weight = 1.0 / float(np.hypot(each.own_sigma_m, settings.matches.drift_m))
-        rows.append(np.column_stack([np.eye(2), -each.lean]) * weight)
-        right.append(place_m * weight)
-    rows.append(np.array([[0.0, 0.0, 1.0 / max(settings.bodies.height_sigma * usual_up_m, 1e-3)]]))
-    right.append(np.zeros(1))
-    normal = (matrix := np.concatenate(rows)).T @ matrix
-    answer = np.asarray(np.linalg.solve(normal, matrix.T @ np.concatenate(right)), np.float64)
-    return answer, np.linalg.inv(normal)[:2, :2] + min(
-        (each.beyond_m2 for each in whole), key=np.trace
-    )
-
-
-def _moving(members: Sequence[int], walk: Walk, laid: Sequence[LaidSighting]) -> Standing:
+def _moving(members: Sequence[int], laid: Sequence[LaidSighting]) -> Standing:
+    """One object that moves, from the sightings on its way in order of time."""
     label, score, shares = _named(members, laid)
     chosen = [laid[k] for k in members]
-    size_m = fitted_size_m(chosen, label, usual_height_m(label))
+    times_s = _times_s(chosen)
+    place_m, velocity_m_s, sigma_m = _line(range(len(chosen)), chosen, times_s, float(times_s[-1]))
+    if chosen[-1].is_cut:
+        sigma_m = max(sigma_m, chosen[-1].own_sigma_m)
     return Standing(
         tuple(members),
         _best(members, laid, label),
         label,
         score,
         shares,
-        walk.position_m,
-        walk.sigma_m,
-        size_m,
-        walk.possible_views,
-        walk.velocity_m_s,
+        place_m,
+        sigma_m,
+        fitted_size_m(chosen, label, usual_height_m(label)),
+        len(members),
+        velocity_m_s,
     )
-
-
-def _median_sides(chosen: Sequence[LaidSighting]) -> Floats:
-    return np.asarray(np.median([each.sighting.size_m for each in chosen], axis=0), np.float64)
 
 
 def _best(members: Sequence[int], laid: Sequence[LaidSighting], label: str) -> int:
@@ -564,3 +453,144 @@ def _best(members: Sequence[int], laid: Sequence[LaidSighting], label: str) -> i
         return doubt * each.sighting.score * float((right - left) * (bottom - top)) ** 0.25
 
     return max(members, key=clearness)
+
+
+def _walks(laid: Sequence[LaidSighting]) -> list[list[int]]:
+    """The walks among these sightings, none of which stands, each the indices of its sightings in order of time.
+
+    A walk needs three sightings of one class on an even way, or two sure ones, no faster than its class moves and fast
+    enough to be seen. The longest, then the straightest, are taken first; a walk that goes on as another one ended is
+    part of it. Each sighting is in one walk at most.
+    """
+    times_s = _times_s(laid)
+    order: Rows = np.argsort(times_s, kind="stable")
+    candidates = []
+    for at, first in enumerate(order):
+        for second in order[at + 1 :]:
+            if times_s[second] - times_s[first] > _LONGEST_GAP_S:
+                break
+            way = _followed(int(first), int(second), laid, times_s, order)
+            if way is not None:
+                candidates.append(way)
+    candidates.sort(key=lambda way: (-len(way[0]), way[1]))
+    taken: set[int] = set()
+    result: list[list[int]] = []
+    for members, _ in candidates:
+        if taken.isdisjoint(members):
+            taken.update(members)
+            result.append(members)
+    return _joined(result, laid, times_s)
+
+
+def _followed(
+    first: int,
+    second: int,
+    laid: Sequence[LaidSighting],
+    times_s: Floats,
+    order: Rows,
+) -> tuple[list[int], float] | None:
+    """The sightings on the way that two begin, and how far they lie off it, rms in sigmas; None where it is no way."""
+    one, two = laid[first].sighting, laid[second].sighting
+    gap_s = float(times_s[second] - times_s[first])
+    fastest_m_s = _MOST_M_S.get(one.label, _OTHER_M_S)
+    if one.label != two.label or gap_s <= 0:
+        return None
+    speed_m_s = float(np.hypot(*(two.position_m - one.position_m))) / gap_s
+    if not _LEAST_M_S <= speed_m_s <= fastest_m_s:
+        return None
+    members = _prolonged([first, second], laid, times_s, order)
+    if len(members) < _LEAST_VIEWS:
+        is_sure = all(laid[k].sighting.score >= _SURE_SCORE and not laid[k].is_cut for k in members)
+        return (members, 0.0) if is_sure else None
+    _, velocity_m_s, _ = _line(members, laid, times_s, float(times_s[members[-1]]))
+    off = _off(members, laid, times_s)
+    if off > _MOST_OFF or not _LEAST_M_S <= np.hypot(*velocity_m_s) <= fastest_m_s:
+        return None
+    return members, off
+
+
+def _prolonged(
+    way: list[int],
+    laid: Sequence[LaidSighting],
+    times_s: Floats,
+    order: Rows,
+) -> list[int]:
+    """A way with the later sightings of its class that lie on it."""
+    members, label = list(way), laid[way[0]].sighting.label
+    for k in order[np.searchsorted(times_s[order], times_s[way[-1]], side="right") :]:
+        after_s = float(times_s[k] - times_s[members[-1]])
+        if after_s > _LONGEST_GAP_S:
+            break
+        if after_s <= 0 or laid[k].sighting.label != label:
+            continue
+        expected_m, _, spread = _line(members, laid, times_s, float(times_s[k]))
+        sigma_m = np.hypot(np.hypot(spread, _sigma_m(laid[k])), 0.5 * _WOBBLE_M_S2 * after_s**2)
+        if np.hypot(*(laid[k].sighting.position_m - expected_m)) < _MOST_OFF * sigma_m:
+            members.append(int(k))
+    return members
+
+
+def _joined(
+    ways: list[list[int]], laid: Sequence[LaidSighting], times_s: Floats
+) -> list[list[int]]:
+    """The same walks, those in one that show one walker out of view for a while."""
+    result: list[list[int]] = []
+    for later in sorted(ways, key=lambda members: times_s[members[0]]):
+        begins_s = float(times_s[later[0]])
+        best, best_m = None, np.inf
+        for earlier in result:
+            gap_s = begins_s - float(times_s[earlier[-1]])
+            one, other = laid[earlier[-1]].sighting, laid[later[0]].sighting
+            if one.label != other.label or not 0 < gap_s <= _AGAIN_S:
+                continue
+            expected_m, before_m_s, spread = _line(earlier, laid, times_s, begins_s)
+            _, after_m_s, _ = _line(later, laid, times_s, begins_s)
+            speed_m_s = float(np.hypot(*before_m_s))
+            apart_m = float(np.hypot(*(other.position_m - expected_m)))
+            turned_m_s = float(np.hypot(*(after_m_s - before_m_s)))
+            reach_m = 1.0 + min(2 * spread, 3.0) + _SWERVE * speed_m_s * gap_s
+            if apart_m <= reach_m and turned_m_s <= max(speed_m_s, 0.5):
+                best, best_m = (earlier, apart_m) if apart_m < best_m else (best, best_m)
+        if best is None:
+            result.append(later)
+        else:
+            best += later
+    return result
+
+
+def _line(
+    members: Sequence[int], laid: Sequence[LaidSighting], times_s: Floats, at_s: float
+) -> tuple[Floats, Floats, float]:
+    """Even motion through the last sightings: the place at a time, the velocity, and the place's sigma per axis."""
+    last = members[-4:]  # people turn: what is long ago shows little of where they go
+    since_s = times_s[last] - at_s
+    places_m = np.array([laid[k].sighting.position_m for k in last])
+    weights = 1.0 / np.array([_sigma_m(laid[k]) for k in last])
+    matrix = np.column_stack([np.ones(len(last)), since_s]) * weights[:, None]
+    solution, _, _, _ = np.linalg.lstsq(matrix, places_m * weights[:, None], rcond=None)
+    covariance = np.linalg.pinv(matrix.T @ matrix)
+    return solution[0], solution[1], float(np.sqrt(max(covariance[0, 0], 0.0)))
+
+
+def _off(members: Sequence[int], laid: Sequence[LaidSighting], times_s: Floats) -> float:
+    """How far the sightings lie from even motion through their neighbours in time, rms in sigmas."""
+    squares = []
+    for before, k, after in zip(members, members[1:], members[2:]):
+        share = (times_s[k] - times_s[before]) / (times_s[after] - times_s[before])
+        expected_m = (1 - share) * laid[before].sighting.position_m + share * laid[
+            after
+        ].sighting.position_m
+        wobble_m = 0.5 * _WOBBLE_M_S2 * (times_s[after] - times_s[before]) ** 2 / 4
+        sigma_m = np.hypot(1.5 * _sigma_m(laid[k]), wobble_m)
+        squares.append(
+            float(((laid[k].sighting.position_m - expected_m) ** 2).sum()) / sigma_m**2 / 2
+        )
+    return float(np.sqrt(np.mean(squares)))
+
+
+def _times_s(laid: Sequence[LaidSighting]) -> Floats:
+    return np.array([each.sighting.time_ns for each in laid], np.int64) / 1e9
+
+
+def _sigma_m(each: LaidSighting) -> float:
+    return float(np.hypot(each.sighting.sigma_m, 0.1))

@@ -5,90 +5,69 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sorvolo.errors import GeometryError, SettingsError
 from sorvolo.geometry.arrays import Floats, Labels, PointsM, Rows
 from sorvolo.survey.objects import Sighting, Track
 from sorvolo.tracking.association import (
+    PairOdds,
     Pairs,
-    PairSettings,
-    assigned,
     class_likelihoods,
     looks_likelihoods,
-    place_likelihoods,
     size_likelihoods,
-    voted_shift,
 )
-from sorvolo.tracking.common_shift import CommonShift, ShiftSettings
-from sorvolo.tracking.doubles import (
-    JoiningSettings,
+from sorvolo.tracking.common_shift import CommonShift
+from sorvolo.tracking.followed import (
+    Followed,
     double_of,
     earlier_mover,
     frame_doubles,
     inward_m,
     neighbours,
 )
-from sorvolo.tracking.followed import Followed
 from sorvolo.tracking.motion import MOVES, Motions, begun, corrected, habits_of, predicted
 from sorvolo.tracking.view_evidence import USUAL_LOG_ODDS
 
+# What is the sighting's own error and what the frame's, and when the frame's may have jumped.
+_LEAST_OWN_SHARE = 0.02  # of a sighting's whole variance that is its own
+_UNEVEN = 0.1  # of the shared sigma: turns and tilts do not shift a whole frame evenly
+# share of a frame's sure sightings: if more belong nowhere, the shift may have jumped ...
+_PUZZLED = 0.3
+_JUMP_RELUCTANCE = 5.0  # ... if that explains them by so much better, a natural logarithm
 
-@dataclass(frozen=True)
-class SharedErrorSettings:
-    """What is the sighting's own error and what the frame's, and when the frame's may have jumped."""
-
-    least_own_share: float = 0.02  # of a sighting's whole variance that is its own
-    uneven: float = 0.1  # of the shared sigma: turns and tilts do not shift a whole frame evenly
-    puzzled: float = 0.3  # share of a frame's sure sightings: if more belong nowhere, the shift may have jumped ...
-    jump_reluctance: float = 5.0  # ... if that explains them by so much better, a natural logarithm
-    shift: ShiftSettings = field(default_factory=ShiftSettings)
-
-
-@dataclass(frozen=True)
-class EvidenceRules:
-    """How sightings and misses become evidence (natural logarithms of odds), beside `TrackerSettings`."""
-
-    usual_step_s: float = 0.2  # sightings and gaps closer in time than this count less each
-    forgotten_s: float = 120.0  # tentative tracks out of view
-    most: float = 6.0  # evidence beyond this does not count: what leaves must be noticed
-    ended: float = -1.5  # log likelihood of a sighting where a track ended
-    long_s: float = 1.0  # two views so far apart in time are enough
-    mover_views: int = 4  # at least, until one that moves is sure: any two sightings make a mover
-    first_views: int = 15  # within which a mover may turn out to be one that was seen before
+# How sightings and misses become evidence, natural logarithms of odds.
+_USUAL_STEP_S = 0.2  # sightings and gaps closer in time than this count less each
+_FORGOTTEN_S = 120.0  # tentative tracks out of view
+_MOST_EVIDENCE = 6.0  # evidence beyond this does not count: what leaves must be noticed
+_ENDED = -1.5  # log likelihood of a sighting where a track ended
+_MISSED = 0.4  # for each frame without it: people by day are reported in a third of the views that show them
+_LEAST_EVIDENCE = 2.5  # odds of about two to one, where views err apart
+_LONG_S = 1.0  # two views so far apart in time are enough
+_MOVER_VIEWS = 4  # at least, until one that moves is sure: any two sightings make a mover
+_FIRST_VIEWS = 15  # within which a mover may turn out to be one that was seen before
+_NEIGHBOUR_M = 4.0  # within which two tracks may be one object
 
 
 @dataclass(frozen=True)
 class TrackerSettings:
     """When sightings make an object. `unit_m` is how many metres a unit of the places is, for speeds and distances.
 
-    `evidence` grows with each sighting by its score's log odds beyond the usual ones, and shrinks by `missed` with each
-    frame that shows the place without the object. `alone` has the score of each class from which one frame that alone
-    shows a place is enough: photos, which may show it once; empty for a video, which shows it in many frames.
+    `alone` has the score of each class from which one frame that alone shows a place is enough: photos, which may show
+    it once; empty for a video, which shows it in many frames.
     """
 
-    sure_score: float = (
-        0.3  # sightings below this only prolong tracks (Zhang et al. 2022, ByteTrack)
-    )
+    # sightings below this only prolong tracks (Zhang et al. 2022, ByteTrack)
+    sure_score: float = 0.3
     least_views: int = 3  # two are enough where they lie a second apart
-    least_evidence: float = 2.5  # odds of about two to one, where views err apart
-    missed: float = 0.4  # people by day are reported in a third of the views that show them
     alone: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     new_per_m2: float = 5e-4  # how densely objects lie that nobody has seen yet
-    neighbour_m: float = 4.0  # within which two tracks may be one object
     unit_m: float = 1.0
-    evidence: EvidenceRules = field(default_factory=EvidenceRules)
-    errors: SharedErrorSettings = field(default_factory=SharedErrorSettings)
-    pairs: PairSettings = field(default_factory=PairSettings)
-    joining: JoiningSettings = field(default_factory=JoiningSettings)
+    size_sigma: float = 0.4  # of the natural logarithm of the longer side
+    least_size: float = -3.0  # a size that fits worse counts no less: boxes are cut, bodies turn
 
     def __post_init__(self) -> None:
-        if not 0 <= self.sure_score <= 1:
-            raise SettingsError(f"sure_score must lie in [0, 1], got {self.sure_score}")
-        if self.least_views < 1 or min(self.least_evidence, self.missed) < 0:
-            raise SettingsError("least_views must be at least 1, evidence must not be negative")
-        if min(self.new_per_m2, self.neighbour_m, self.unit_m) <= 0:
-            raise SettingsError("new_per_m2, neighbour_m and unit_m must be positive")
+        if self.least_views < 1 or min(self.sure_score, self.new_per_m2, self.unit_m) < 0:
+            raise SettingsError("least_views must be at least 1, the others not negative")
 
 
 IN_PICTURES = TrackerSettings(unit_m=0.05)
@@ -121,7 +100,7 @@ class Tracker:
 
     def __init__(self, settings: TrackerSettings | None = None, *, first_id: int = 1) -> None:
         self._settings = settings or TrackerSettings()
-        self._shift = CommonShift(self._settings.errors.shift)
+        self._shift = CommonShift()
         self._followed: list[Followed] = []
         self.next_id = first_id
         self._time_ns: int | None = None
@@ -208,9 +187,7 @@ class Tracker:
         for row, column in zip(pairs.tracks, pairs.sightings):
             followed = near[row]
             followed.go_on(motions.only(slice(row, row + 1)), time_ns)
-            weight = min(
-                1.0, (time_ns - followed.last_ns) / 1e9 / self._settings.evidence.usual_step_s
-            )
+            weight = min(1.0, (time_ns - followed.last_ns) / 1e9 / _USUAL_STEP_S)
             if self._record(followed, seen, int(column), weight):
                 new.append(followed.id)
         return new
@@ -241,33 +218,32 @@ class Tracker:
         if not near or not len(seen.places_m):
             return none, motions
         ids = [each.id for each in near]
-        odds = _PairOdds(
+        odds = PairOdds(
             motions,
             seen.places_m - self._shift.mean_m,
             seen.own_m2,
             self._fits(near, seen),
             float(np.log(self._settings.new_per_m2 * self._settings.unit_m**2)),
             seen.scores >= self._settings.sure_score,
-            self._settings.pairs,
         )
         pairs = self._paired(odds, ids)
         if not len(pairs):
             return none, motions
         return pairs, self._corrected(odds, ids, pairs)
 
-    def _paired(self, odds: "_PairOdds", ids: list[int]) -> Pairs:
+    def _paired(self, odds: PairOdds, ids: list[int]) -> Pairs:
         """The likeliest pairs, while the frame's shift is found from their pattern."""
-        shift, own_m2, rules = self._shift, odds.mean_own_m2, self._settings.errors
+        shift, own_m2 = self._shift, odds.mean_own_m2
         shares, loose_m2 = shift.predict(ids)
         none_m = np.zeros((len(ids), 2))
         gain = odds.gains(none_m, loose_m2 + shift.jitter_m2)
         pairs = odds.assign(gain)
-        is_puzzled = int(odds.sure.sum()) - len(pairs) >= max(2, rules.puzzled * odds.sure.sum())
+        is_puzzled = int(odds.sure.sum()) - len(pairs) >= max(2, _PUZZLED * odds.sure.sum())
         if is_puzzled and self._shared_m > 0:
             jump_m2 = self._shared_m**2
             wide = odds.gains(none_m, loose_m2 + shift.jitter_m2 + jump_m2)
             if odds.vote(
-                np.ones(len(ids)), loose_m2 + shift.jitter_m2, jump_m2, wide, rules.jump_reluctance
+                np.ones(len(ids)), loose_m2 + shift.jitter_m2, jump_m2, wide, _JUMP_RELUCTANCE
             ).any():
                 shift.loosen(jump_m2)
                 shares, loose_m2 = shift.predict(ids)
@@ -283,7 +259,7 @@ class Tracker:
             pairs = odds.assign(odds.gains(*shift.offsets(fitted, ids)))
         return pairs
 
-    def _corrected(self, odds: "_PairOdds", ids: list[int], pairs: Pairs) -> Motions:
+    def _corrected(self, odds: PairOdds, ids: list[int], pairs: Pairs) -> Motions:
         """The tracks' motions with their sightings taken in, the map's places and shift settled by them."""
         motions = odds.motions
         matched, gaps_m, variances_m2 = self._misses(odds, ids, pairs)
@@ -316,7 +292,7 @@ class Tracker:
         return replace(motions, means=means, covariances=covariances, weights=weights)
 
     def _misses(
-        self, odds: "_PairOdds", ids: list[int], pairs: Pairs
+        self, odds: PairOdds, ids: list[int], pairs: Pairs
     ) -> tuple[list[int], PointsM, Floats]:
         """How far pairs miss each other: ids, seen less known places (M, 2), and their variances (M,)."""
         matched = odds.motions.only(pairs.tracks)
@@ -333,24 +309,25 @@ class Tracker:
         """(tracks, sightings) what beside place speaks for each pair, as logs."""
         shares = np.array([[each.scores.get(name, 0.0) for name in self._classes] for each in near])
         shares /= shares.sum(axis=1, keepdims=True)
-        rules = self._settings.pairs
         fits = class_likelihoods(
-            shares, np.array([self._classes.index(label) for label in seen.labels]), rules
+            shares, np.array([self._classes.index(label) for label in seen.labels])
         )
-        fits += size_likelihoods(np.array([each.sides_m[0] for each in near]), seen.sides_m, rules)
-        fits += np.array([self._settings.evidence.ended if each.ended else 0.0 for each in near])[
-            :, None
-        ]
+        fits += size_likelihoods(
+            np.array([each.sides_m[0] for each in near]),
+            seen.sides_m,
+            self._settings.size_sigma,
+            self._settings.least_size,
+        )
+        fits += np.array([_ENDED if each.ended else 0.0 for each in near])[:, None]
         if seen.looks is not None:
             unknown = np.full(seen.looks.shape[1], np.nan)
             known = np.array([unknown if each.looks is None else each.looks for each in near])
-            fits += looks_likelihoods(known, seen.looks, rules)
+            fits += looks_likelihoods(known, seen.looks)
         fits[:, list(seen.doubles)] = -np.inf
         return fits
 
     def _record(self, followed: Followed, seen: "_Seen", column: int, weight: float) -> bool:
         """Give a track its sighting; whether that confirms it."""
-        settings, rules = self._settings, self._settings.evidence
         if followed.is_out:
             followed.passes, followed.is_out = followed.passes + 1, False
         followed.record(seen.sightings[column], seen.looks_of(column))
@@ -358,17 +335,17 @@ class Tracker:
             if stronger == column:
                 followed.vote(seen.labels[row], float(seen.scores[row]))
         followed.evidence = min(
-            followed.evidence + max(weight, 0.3) * _log_odds(seen.scores[column]), rules.most
+            followed.evidence + max(weight, 0.3) * _log_odds(seen.scores[column]), _MOST_EVIDENCE
         )
         followed.ended = False
-        is_long = followed.last_ns - followed.first_ns >= rules.long_s * 1e9
-        least_views = min(settings.least_views, 2) if is_long else settings.least_views
+        is_long = followed.last_ns - followed.first_ns >= _LONG_S * 1e9
+        least_views = min(self._settings.least_views, 2) if is_long else self._settings.least_views
         if followed.moves:
-            least_views = max(least_views, rules.mover_views)
+            least_views = max(least_views, _MOVER_VIEWS)
         if (
             followed.confirmed
             or followed.views < least_views
-            or followed.evidence < settings.least_evidence
+            or followed.evidence < _LEAST_EVIDENCE
         ):
             return False
         followed.confirmed = True
@@ -441,11 +418,8 @@ class Tracker:
                 continue
             missing.append(followed)
             if depth > 2 * sigma + followed.sides_m[0] / 2 or footprint_m is None:
-                usual_step_s = self._settings.evidence.usual_step_s
                 followed.was_missed = True
-                followed.evidence -= self._settings.missed * min(
-                    1.0, max(elapsed_s, 0.02) / usual_step_s
-                )
+                followed.evidence -= _MISSED * min(1.0, max(elapsed_s, 0.02) / _USUAL_STEP_S)
                 if followed.confirmed and not followed.ended and followed.evidence < 0:
                     followed.ended = True
                     ended.append(followed.id)
@@ -466,7 +440,7 @@ class Tracker:
         """Note which tracks are out of view, and give up tentative ones that are doubtful or long unseen."""
         for followed in self._followed:
             followed.is_out |= followed.id not in near_ids and followed.last_ns < time_ns
-        oldest_ns = time_ns - self._settings.evidence.forgotten_s * 1e9
+        oldest_ns = time_ns - _FORGOTTEN_S * 1e9
         self._keep(
             [
                 each
@@ -477,7 +451,7 @@ class Tracker:
 
     def _join(self, now: list[Followed], missing: list[Followed]) -> dict[int, int]:
         """Merge tracks that turn out to be one object; the earlier id stays."""
-        reach_m = self._settings.neighbour_m / self._settings.unit_m
+        reach_m = _NEIGHBOUR_M / self._settings.unit_m
         _count_meetings(now, missing, reach_m)
         merged: dict[int, int] = {}
         by_id = {each.id: each for each in self._followed}
@@ -499,77 +473,17 @@ class Tracker:
         other = double_of(
             followed,
             by_id,
-            self._settings.neighbour_m / self._settings.unit_m,
-            self._settings.joining,
+            _NEIGHBOUR_M / self._settings.unit_m,
         )
-        if (
-            other is None
-            and followed.moves
-            and followed.views <= self._settings.evidence.first_views
-        ):
+        if other is None and followed.moves and followed.views <= _FIRST_VIEWS:
             density = self._settings.new_per_m2 * self._settings.unit_m**2
-            other = earlier_mover(followed, self._followed, density, self._settings.joining)
+            other = earlier_mover(followed, self._followed, density)
         return other
 
     def _keep(self, kept: list[Followed]) -> None:
         ids = {each.id for each in kept}
         self._shift.drop([each.id for each in self._followed if each.id not in ids])
         self._followed = kept
-
-
-@dataclass(frozen=True, eq=False)
-class _PairOdds:
-    """What speaks for each pair of a near track and a sighting, as logs.
-
-    `places_m` (sightings, 2) are without the shift's mean, `own_m2` (sightings, 2, 2) what each errs for itself, `fits`
-    (tracks, sightings) what beside place speaks for a pair, `unseen` the log density of new objects, `sure`
-    (sightings,) which may begin a track.
-    """
-
-    motions: Motions
-    places_m: PointsM
-    own_m2: Floats
-    fits: Floats
-    unseen: float
-    sure: NDArray[np.bool_]
-    settings: PairSettings
-
-    @property
-    def mean_own_m2(self) -> Floats:
-        """(sightings,) what each errs for itself, per axis."""
-        return np.asarray(np.trace(self.own_m2, axis1=1, axis2=2) / 2, np.float64)
-
-    def gains(self, offsets_m: PointsM, offsets_m2: Floats) -> Floats:
-        """(tracks, sightings) how much likelier pairs are than new objects, tracks off by so much, (N, 2) and (N,)."""
-        near = place_likelihoods(
-            self.motions, self.places_m, self.own_m2, offsets_m, offsets_m2, self.settings
-        )
-        return near + self.fits - self.unseen
-
-    def assign(self, gain: Floats) -> Pairs:
-        """The best pairs, sure sightings first."""
-        first = assigned(np.where(self.sure, gain, -1.0))
-        gain = gain.copy()
-        gain[first.tracks], gain[:, first.sightings], gain[:, self.sure] = -1.0, -1.0, -1.0
-        return first.joined(assigned(gain))
-
-    def vote(
-        self, shares: Floats, left_m2: Floats, slow_m2: float, gain: Floats, reluctance: float
-    ) -> PointsM:
-        """The shift that most pairs agree in (`voted_shift`)."""
-        return voted_shift(
-            self.motions,
-            self.places_m,
-            self.own_m2,
-            shares,
-            left_m2,
-            slow_m2,
-            self.fits,
-            gain,
-            self.unseen,
-            self.settings,
-            reluctance,
-        )
 
 
 class _Seen:
@@ -586,9 +500,9 @@ class _Seen:
         self.scores = np.array([each.score for each in sightings])
         self.labels = [each.label for each in sightings]
         self.sides_m = np.array([each.size_m[0] for each in sightings])
-        self.own_m2 = _own_covariances(sightings, settings.errors)
+        self.own_m2 = _own_covariances(sightings)
         boxes_px = np.array([each.box_px for each in sightings]).reshape(-1, 4)
-        self.doubles = frame_doubles(boxes_px, self.labels, self.scores, settings.joining)
+        self.doubles = frame_doubles(boxes_px, self.labels, self.scores)
 
     def looks_of(self, row: int) -> Floats | None:
         """An appearance vector, if there is one."""
@@ -622,15 +536,14 @@ def _count_meetings(now: list[Followed], missing: list[Followed], reach_m: float
         second.apart[first.id] = second.apart.get(first.id, 0) + 1
 
 
-def _own_covariances(sightings: Sequence[Sighting], errors: SharedErrorSettings) -> Floats:
+def _own_covariances(sightings: Sequence[Sighting]) -> Floats:
     """(N, 2, 2) what sightings err each for itself."""
     whole = np.array([each.covariance_m2 for each in sightings]).reshape(-1, 2, 2)
     shared = np.array([each.shared_sigma_m for each in sightings])
     values, vectors = np.linalg.eigh(whole)
-    least = np.maximum(errors.least_own_share * values.mean(axis=1), 1e-6)
+    least = np.maximum(_LEAST_OWN_SHARE * values.mean(axis=1), 1e-6)
     own = (
-        np.maximum(values - shared[:, None] ** 2, least[:, None])
-        + (errors.uneven * shared[:, None]) ** 2
+        np.maximum(values - shared[:, None] ** 2, least[:, None]) + (_UNEVEN * shared[:, None]) ** 2
     )
     return (vectors * own[:, None, :]) @ vectors.swapaxes(1, 2)
 

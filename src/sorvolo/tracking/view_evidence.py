@@ -1,7 +1,6 @@
 """How sure a thing on a map is: by all views that could show it, those that show nothing there included."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,24 +9,12 @@ USUAL_LOG_ODDS = -1.7
 from it is 0.16 of people by day, 0.31 of cars, thermal 0.19 and 0.12; one for all, by choice."""
 
 
-@dataclass(frozen=True)
-class EvidenceSettings:
-    """What a view is worth; the share is that of the things that the packaged detector saw in 29 photos of `caliterra`
-    and the 32 of `fixed_wing`, nearly all of them false."""
-
-    least_seen: float = 0.05  # weaker sightings are none, and none counts as this
-    usual: float = USUAL_LOG_ODDS  # of whatever a view shows: what is beyond it speaks for the thing, below it against
-    shared: float = (
-        0.63  # share of the variance of log-odds that lies between things, not between views of one
-    )
+LEAST_SEEN = 0.05  # weaker sightings are none, and none counts as this
+# share of the variance of log-odds that lies between things, not between views of one
+SHARED = 0.63
 
 
-def score_from_views(
-    scores: Sequence[float],
-    views: int,
-    settings: EvidenceSettings = EvidenceSettings(),
-    more_log_odds: float = 0.0,
-) -> float:
+def score_from_views(scores: Sequence[float], views: int, more_log_odds: float = 0.0) -> float:
     """The score, 0 to 1, of a thing that views of these scores show, of `views` that could show it.
 
     `scores`, each 0 to 1, hold one a view and at most `views`; `more_log_odds` is what else is known. The views'
@@ -36,16 +23,14 @@ def score_from_views(
     view counts for what it is.
     """
     every = np.concatenate(
-        [np.asarray(scores, np.float64), np.full(views - len(scores), settings.least_seen)]
+        [np.asarray(scores, np.float64), np.full(views - len(scores), LEAST_SEEN)]
     )
     inside = np.clip(every, 1e-3, 1 - 1e-3)
-    beyond = float((np.log(inside / (1 - inside)) - settings.usual).sum())
-    odds = settings.usual + beyond / (1 + (views - 1) * settings.shared) + more_log_odds
+    beyond = float((np.log(inside / (1 - inside)) - USUAL_LOG_ODDS).sum())
+    odds = USUAL_LOG_ODDS + beyond / (1 + (views - 1) * SHARED) + more_log_odds
     return float(1 / (1 + np.exp(-odds)))
 
 
-def least_seen(
-    thresholds: Mapping[str, float], settings: EvidenceSettings = EvidenceSettings()
-) -> float:
+def least_seen(thresholds: Mapping[str, float]) -> float:
     """From which score on a view's sightings are evidence, where each class is reported from `thresholds` on."""
-    return min([settings.least_seen, *thresholds.values()])
+    return min([LEAST_SEEN, *thresholds.values()])

@@ -30,7 +30,7 @@ from sorvolo.search.plant_places import PlantField, PlantPlace
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import PlacedFrame
 from sorvolo.tracking.laying import pose_of
-from sorvolo.tracking.planted import reported_plants
+from sorvolo.tracking.map_objects import reported_plants
 
 _AROUND_M = 6.0  # of a plant: sightings farther away are of other things; more than its own length
 _REACH_M = 5.0  # beside a frame's ground: what stands there leans or throws its shadow in

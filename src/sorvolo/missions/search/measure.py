@@ -26,7 +26,7 @@ from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import PlacedFrame
 from sorvolo.survey.objects import CLASSES, TYPICAL_SIZE_M
 from sorvolo.tracking.laying import LaidSighting, lay_on_ground, pose_of
-from sorvolo.tracking.planted import reported_plants
+from sorvolo.tracking.map_objects import reported_plants
 from sorvolo.tracking.view_evidence import least_seen
 
 ConditionsAt: TypeAlias = Callable[[Sequence[Floats], float], Conditions]

@@ -37,7 +37,7 @@ from sorvolo.store.images import jpeg_from_image
 from sorvolo.survey.flight import Frame, Site
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import Detections, Sighting, Track
-from sorvolo.tracking.doubles import without_doubles
+from sorvolo.tracking.followed import without_doubles
 
 _MOST_WAITING = 4  # frames; a disk that is slower than the detector slows the watch, it does not fill the memory
 _TRACKS_EVERY_S = 5.0  # the file is whole each time and grows; by choice

@@ -32,7 +32,7 @@ from sorvolo.store.exports.cursor_on_target import COT_TYPES
 from sorvolo.store.exports.detection_files import JOURNAL, claimed_folder
 from sorvolo.store.site.journal import RunJournal, content_sha256
 from sorvolo.survey.flight import Frame, LostFrame
-from sorvolo.tracking.picture_steps import SMALL_WIDTH_PX, STEP_S, PictureStep, PictureSteps
+from sorvolo.tracking.image_motion import SMALL_WIDTH_PX, STEP_S, PictureStep, PictureSteps
 
 _AHEAD = 4  # decoded frames that wait for the detector
 _STOPPED = "stopped on demand"

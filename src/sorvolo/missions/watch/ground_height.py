@@ -11,7 +11,7 @@ from sorvolo.geometry.track import corners_around, known_points
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.store.rasters.height_model import read_height_model
-from sorvolo.tracking.locate import GroundHeight
+from sorvolo.tracking.laying import GroundHeight
 
 _AROUND_M = 2000.0  # of the flight's fixes, so far the model is read
 

@@ -22,8 +22,8 @@ from sorvolo.tracking.following import (
     Taken,
     watched_prior,
 )
-from sorvolo.tracking.locate import IMPOSSIBLE_SIZE, GroundHeight
-from sorvolo.tracking.photo_headings import PhotoHeadings
+from sorvolo.tracking.headings import PhotoHeadings
+from sorvolo.tracking.laying import IMPOSSIBLE_SIZE, GroundHeight
 from sorvolo.tracking.tracker import TrackerSettings
 
 _COMPASS_REPORTED_DEG = 2.0  # by which a compass is off: less is not worth a notice; by choice

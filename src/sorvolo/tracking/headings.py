@@ -1,0 +1,361 @@
+"""Where a camera's top points: by the pictures' way without a compass, and how wrong compasses and telemetry are."""
+
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sorvolo.geometry.arrays import Floats, ImageRGB, Matrix3, PointsM, PointsPx
+from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.homography import apply_homography
+from sorvolo.geometry.level_ground import ground_from_pixels
+from sorvolo.geometry.pose import Pose, rotation_from_vector, site_from_gimbal_rotation
+from sorvolo.registration.shared_view import SmallView, second_from_first, small_view
+from sorvolo.survey.flight import CameraPrior, Frame
+from sorvolo.survey.objects import Detections
+from sorvolo.tracking.image_motion import ImageMotion
+
+_WINDOW_S = 20.0  # of the way that is laid on the fixes
+_LEAST_M = 6.0  # of way, rms: less is within the fixes' own errors
+_LEAST_SIGMA_DEG = 4.0  # however well ways and pictures fit
+_STEPS_PER_ERROR = 8.0  # neighbouring fixes, and neighbouring frames' tilts, err alike
+
+_STRETCH_S = 2.0  # of the way that one check looks back
+_LEAST_WAY_M = 15.0  # a shorter one counts less: the fixes wander
+_GAIN_PER_S = 0.3  # of what is seen
+_LEARNS_S = 15.0  # after that the way back over the map moves the shift
+_MOST_DEG = 15.0  # corrected at most: a compass that is off by more is broken
+_BROKEN_S = 10.0  # a gap in time after which it begins anew
+
+
+@dataclass(frozen=True)
+class Heading:
+    """Clockwise from north, of the picture's top; `sigma_deg` is infinite while it is not known."""
+
+    heading_deg: float
+    sigma_deg: float
+
+
+class HeadingFromMotion:
+    """A downward camera's heading from its own pictures and the fixes; `add` and `lose` change it.
+
+    `ImageMotion` lays each picture into the first one, which shows how the camera turned and moved since, all but the
+    direction in which it began; the least-squares turn of that way onto the fixes of the last seconds is this direction
+    (Procrustes in the plane, as complex numbers: real part right or east, imaginary part up or north).
+    """
+
+    def __init__(self) -> None:
+        self._turned_rad = 0.0  # clockwise since the first picture
+        self._points: deque[tuple[float, complex, complex]] = deque()
+
+    def add(self, time_s: float, outline_px: PointsPx, place_m: Floats) -> Heading:
+        """Take in one picture and return its heading.
+
+        `outline_px` (4, 2) are its corners, from the top-left one clockwise, in the first picture's pixels; `place_m`
+        (2,) the fix, east and north.
+        """
+        right, down = outline_px[1] - outline_px[0]
+        self._turned_rad = float(np.arctan2(down, right))
+        x, y = outline_px.mean(axis=0)
+        self._points.append((time_s, complex(x, -y), complex(place_m[0], place_m[1])))
+        while time_s - self._points[0][0] > _WINDOW_S:
+            self._points.popleft()
+        return self._known()
+
+    def lose(self) -> None:
+        """The pictures' way is broken (a cut, a frame that fits nothing): begin anew."""
+        self._points.clear()
+
+    def _known(self) -> Heading:
+        seen = np.array([point[1] for point in self._points])
+        fixes = np.array([point[2] for point in self._points])
+        seen, fixes = seen - seen.mean(), fixes - fixes.mean()
+        spread_px = float(np.sqrt(np.mean(np.abs(seen) ** 2)))
+        if (
+            len(seen) < 5
+            or float(np.sqrt(np.mean(np.abs(fixes) ** 2))) < _LEAST_M
+            or spread_px <= 0
+        ):
+            return Heading(0.0, float("inf"))
+        turn = np.vdot(seen, fixes) / np.vdot(seen, seen).real
+        reach_m = abs(turn) * spread_px
+        miss_m = float(np.sqrt(np.mean(np.abs(fixes - turn * seen) ** 2)))
+        count = max(1.0, len(seen) / _STEPS_PER_ERROR)
+        sigma_deg = float(np.degrees(np.arctan2(miss_m, reach_m * np.sqrt(count))))
+        heading_deg = float(np.degrees(-np.angle(turn) + self._turned_rad)) % 360
+        sigma_deg = max(sigma_deg, _LEAST_SIGMA_DEG)
+        return Heading(heading_deg, sigma_deg if reach_m > 2 * miss_m else float("inf"))
+
+
+class CompassError:
+    """How wrong a compass is, from what the ground seems to do while the camera flies over it; only `add` changes it.
+
+    Places laid with a heading that is wrong by an angle are turned about the camera; as it flies on, all that stands
+    seems to move sideways, by this angle times its way. A tracker takes that for the frames' common shift, of which it
+    follows a part: so the shift's way is held against the camera's and what they agree on is taken off bit by bit, less
+    and less: on the way back over a map that was begun with the wrong heading the shift shows nothing of the compass.
+    """
+
+    def __init__(self) -> None:
+        self.clockwise_deg, self._learnt_s = 0.0, 0.0
+        self._points: deque[tuple[float, Floats, Floats]] = deque()
+
+    def add(self, time_s: float, camera_m: Floats, shift_m: Floats) -> float:
+        """Take in one frame: where its camera was and the shift of its sightings, (2,) east and north.
+
+        Returns by how much the compass reads too far clockwise, as known by now, in degrees.
+        """
+        if self._points and not 0 <= time_s - self._points[-1][0] < _BROKEN_S:
+            self._points.clear()
+        self._points.append((time_s, camera_m, shift_m.copy()))
+        _, camera_before_m, shift_before_m = self._points[0]
+        way_m, slip_m = camera_m - camera_before_m, shift_m - shift_before_m
+        if time_s - self._points[0][0] < _STRETCH_S:
+            return self.clockwise_deg
+        self._points.popleft()
+        way_m2 = float(way_m @ way_m)
+        # against the fixes' own wander a short way shows little
+        seen_rad = float(way_m[0] * slip_m[1] - way_m[1] * slip_m[0]) / (way_m2 + _LEAST_WAY_M**2)
+        frame_s = time_s - self._points[-2][0] if len(self._points) > 1 else 0.0
+        gain = _GAIN_PER_S * min(frame_s, 1.0) * float(np.exp(-self._learnt_s / _LEARNS_S))
+        self._learnt_s += frame_s * way_m2 / (way_m2 + _LEAST_WAY_M**2)
+        change_deg = gain * float(np.degrees(seen_rad))
+        self.clockwise_deg = float(np.clip(self.clockwise_deg + change_deg, -_MOST_DEG, _MOST_DEG))
+        return self.clockwise_deg
+
+
+class HeadingFromPictures:
+    """The heading of a camera from the motion that its pictures show; without `over_guesses` the way begins anew where
+    a picture shows no motion that fits."""
+
+    def __init__(self, *, over_guesses: bool = True) -> None:
+        self._motion, self._heading = ImageMotion(), HeadingFromMotion()
+        self._segments, self._guessed, self._over_guesses = 1, 0, over_guesses
+
+    def take(
+        self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior
+    ) -> CameraPrior:
+        """The prior with the heading in it, where that is known by now."""
+        heading = self.heading(frame, time_ns, found, prior)
+        if not np.isfinite(heading.sigma_deg):
+            return prior
+        sigma_deg = np.array([*prior.attitude_sigma_deg[:2], heading.sigma_deg])
+        rotation = site_from_gimbal_rotation(heading.heading_deg, -90.0, 0.0)
+        return replace(prior, rotation=rotation, attitude_sigma_deg=sigma_deg)
+
+    def heading(self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior) -> Heading:
+        """The heading of a frame, which has to be given each; its sigma is infinite where it is not known by now."""
+        _, outline_px = self._motion.locate(found, frame, time_ns)
+        is_guess = self._motion.guessed != self._guessed and not self._over_guesses
+        if self._motion.segments != self._segments or is_guess:
+            self._heading.lose()
+        self._segments, self._guessed = self._motion.segments, self._motion.guessed
+        if not prior.knows_place:
+            return Heading(0.0, float("inf"))
+        return self._heading.add(time_ns / 1e9, outline_px, prior.position_m[:2])
+
+
+_LEAST_DOWN = 0.96  # of the optical axis: 16 degrees off straight down or less; the heading of others is not checked
+_WRONG_DEG = 30.0  # less is within what tilts, winds and small compasses do; by choice
+_WRONG_SIGMAS = 4.0  # and it must be beyond what both sides may err by; by choice
+
+
+@dataclass(frozen=True)
+class HeadingTurn:
+    """By how much a heading has to turn clockwise, from -180 to 180 degrees, and how well that is known."""
+
+    turn_deg: float
+    sigma_deg: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "turn_deg", (self.turn_deg + 180) % 360 - 180)
+
+
+def is_checked(prior: CameraPrior) -> bool:
+    """Whether a camera's place and heading are known at all, and it looks about straight down."""
+    is_known = (
+        prior.knows_place
+        and bool(np.isfinite(prior.attitude_sigma_deg[2]))
+        and prior.position_m[2] > 0
+    )
+    return is_known and -float(prior.rotation[2, 2]) >= _LEAST_DOWN
+
+
+def is_wrong(shown: HeadingTurn, prior: CameraPrior) -> bool:
+    """Whether a heading by telemetry is one that cannot be, where pictures show this turn."""
+    both_deg = float(np.hypot(shown.sigma_deg, prior.attitude_sigma_deg[2]))
+    return abs(shown.turn_deg) > max(_WRONG_DEG, _WRONG_SIGMAS * both_deg)
+
+
+def heading_deg(prior: CameraPrior) -> float:
+    """Where the picture's top points, clockwise from north."""
+    return float(np.degrees(np.arctan2(-prior.rotation[0, 1], -prior.rotation[1, 1])))
+
+
+def turned(prior: CameraPrior, turn: HeadingTurn) -> CameraPrior:
+    """The prior turned about the vertical, its heading as well known as the turn."""
+    rotation = (
+        rotation_from_vector(np.array([0.0, 0.0, -np.radians(turn.turn_deg)])) @ prior.rotation
+    )
+    sigma_deg = np.array([*prior.attitude_sigma_deg[:2], turn.sigma_deg])
+    return replace(prior, rotation=rotation, attitude_sigma_deg=sigma_deg)
+
+
+_TURNS_DEG_S = 20.0  # a drone that turns faster has its heading not checked; by choice
+_CLOCK_OFF_NS = 1_000_000_000  # by which telemetry's clock may be off: so long after a turn headings are not checked
+_JUMP_DEG = 60.0  # from one frame to the next, against the pictures' own turning; by choice
+
+
+class HeadingCheck:
+    """A video's headings held against the motion that its pictures show, where the camera looks about straight down.
+
+    A heading that cannot be (`heading_check.is_wrong`) is turned to what the pictures show, and the next ones by as
+    much until they show otherwise. While the drone turns nothing but a jump is judged: telemetry's clock may be off.
+    `turns_deg` are these turns, clockwise, one for each such frame.
+    """
+
+    def __init__(self) -> None:
+        self._pictures = HeadingFromPictures(over_guesses=False)
+        self._turn: HeadingTurn | None = None
+        self._last: tuple[int, float, float] | None = None  # time, heading, turn, as last shown
+        self._steady_ns = 0  # the drone turns until then
+        self.turns_deg: list[float] = []
+
+    def take(
+        self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior
+    ) -> CameraPrior:
+        """The prior, turned where its heading is wrong."""
+        shown = self._pictures.heading(frame, time_ns, found, prior)
+        if not is_checked(prior):
+            return prior
+        if np.isfinite(shown.sigma_deg):
+            self._judge(time_ns, shown, prior)
+        if self._turn is None:
+            return prior
+        self.turns_deg.append(self._turn.turn_deg)
+        return turned(prior, self._turn)
+
+    def _judge(self, time_ns: int, shown: Heading, prior: CameraPrior) -> None:
+        """Decide anew by how much headings have to turn, where the frame allows it."""
+        turn = HeadingTurn(shown.heading_deg - heading_deg(prior), shown.sigma_deg)
+        before, self._last = self._last, (time_ns, shown.heading_deg, turn.turn_deg)
+        jump_deg = 0.0
+        if before is not None and time_ns > before[0]:
+            turns_deg_s = (
+                abs(HeadingTurn(shown.heading_deg - before[1], 0.0).turn_deg)
+                * 1e9
+                / (time_ns - before[0])
+            )
+            jump_deg = abs(HeadingTurn(turn.turn_deg - before[2], 0.0).turn_deg)
+            if turns_deg_s > _TURNS_DEG_S:
+                self._steady_ns = time_ns + _CLOCK_OFF_NS
+        if time_ns >= self._steady_ns:
+            self._turn = turn if is_wrong(turn, prior) else None
+        elif jump_deg > _JUMP_DEG:  # no clock that is off does that
+            self._turn = turn if abs(turn.turn_deg) > _JUMP_DEG else None
+
+
+_MOST_SIGMA_DEG = 20.0  # a heading shown less well is not used; by choice
+# a photo that shows nothing shares its predecessor's error if their headings are as alike
+_ALIKE_DEG = 45.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Last:
+    """The photo before: what is kept of it, its prior as telemetry has it, and turned right, and by how much."""
+
+    view: SmallView
+    prior: CameraPrior
+    right: CameraPrior
+    turn: HeadingTurn | None = None
+
+
+class PhotoHeadings:
+    """The headings of photos, one after another, in order of time. `see` and `take` change it.
+
+    The middle of the photo before lies on the ground where telemetry has it, almost straight below that camera,
+    whatever its heading. Where the new photo shows that place, the direction to it from the new camera must be the
+    same: the turn about the vertical by which it is not is the heading's error. (Angles of a gimbal that are wrong by
+    half a turn, for a whole strip, occur in real flights.) The first photo is held against the one after it, which
+    `see` is given before. `turns_deg` are the turns, clockwise, of the photos that were corrected.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        self._camera = camera
+        self._last: _Last | None = None
+        self.turns_deg: list[float] = []
+
+    def see(self, image: ImageRGB, prior: CameraPrior) -> None:
+        """Hold the next photo given to `take` against this one."""
+        self._last = _Last(small_view(image), prior, prior) if is_checked(prior) else None
+
+    def take(self, image: ImageRGB, prior: CameraPrior) -> CameraPrior:
+        """A photo's prior, with the heading that its picture shows where telemetry's is wrong, else as it is."""
+        if not is_checked(prior):
+            self._last = None
+            return prior
+        view = small_view(image)
+        turn = None if self._last is None else self._turn(view, prior, self._last)
+        right = prior
+        if turn is not None:
+            self.turns_deg.append(turn.turn_deg)
+            right = turned(prior, turn)
+        self._last = _Last(view, prior, right, turn)
+        return right
+
+    def _turn(self, view: SmallView, prior: CameraPrior, before: _Last) -> HeadingTurn | None:
+        """The turn of a photo that shows, or shares, a wrong heading; None where it stays as it is."""
+        here_from_before = second_from_first(before.view, view)
+        if here_from_before is None:
+            return _carried(before, prior)
+        shown = self._shown(prior, before.right, before.view.size_px, here_from_before)
+        if shown is None:
+            return _carried(before, prior)
+        return shown if is_wrong(shown, prior) else None
+
+    def _shown(
+        self,
+        prior: CameraPrior,
+        other: CameraPrior,
+        other_size_px: tuple[int, int],
+        here_from_other: Matrix3,
+    ) -> HeadingTurn | None:
+        """What the middle of another photo shows of a photo's heading; None where that is known too badly."""
+        middle_px = (np.array([other_size_px[::-1]], np.float64) - 1) / 2
+        seen_m = (
+            self._on_ground(apply_homography(here_from_other, middle_px), prior)
+            - prior.position_m[:2]
+        )
+        true_m = self._on_ground(middle_px, other) - prior.position_m[:2]
+        reach_m = min(float(np.linalg.norm(seen_m)), float(np.linalg.norm(true_m)))
+        if not reach_m > 0:  # at the horizon there is none
+            return None
+        tilt_deg = max(each.attitude_sigma_deg[:2].max() for each in (prior, other))
+        fix_m = max(each.position_sigma_m[:2].max() for each in (prior, other))
+        miss_m = np.sqrt(2) * np.hypot(
+            fix_m, prior.position_m[2] * np.radians(tilt_deg)
+        )  # of both photos
+        sigma_deg = float(np.hypot(np.degrees(miss_m / reach_m), _LEAST_SIGMA_DEG))
+        turn_deg = _bearing_deg(true_m) - _bearing_deg(seen_m)
+        return HeadingTurn(turn_deg, sigma_deg) if sigma_deg <= _MOST_SIGMA_DEG else None
+
+    def _on_ground(self, pixels: PointsPx, prior: CameraPrior) -> PointsM:
+        """(2,) where a pixel, (1, 2), lies on the level ground."""
+        return ground_from_pixels(self._camera, Pose(prior.rotation, prior.position_m), pixels)[0]
+
+
+def _carried(before: _Last, prior: CameraPrior) -> HeadingTurn | None:
+    """The turn of the photo before, for one with about the same heading by telemetry: it is wrong by the same."""
+    if before.turn is None:
+        return None
+    cosine = (np.trace(before.prior.rotation.T @ prior.rotation) - 1) / 2
+    if np.degrees(np.arccos(np.clip(cosine, -1, 1))) > _ALIKE_DEG:
+        return None
+    return HeadingTurn(
+        before.turn.turn_deg, float(np.hypot(before.turn.sigma_deg, prior.attitude_sigma_deg[2]))
+    )
+
+
+def _bearing_deg(east_north_m: PointsM) -> float:
+    """Clockwise from north, of (2,)."""
+    return float(np.degrees(np.arctan2(east_north_m[0], east_north_m[1])))
