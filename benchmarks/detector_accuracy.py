@@ -20,8 +20,8 @@ import numpy as np
 import detection_data
 from mosaic_methods import commit, machine
 from provenance import note_scoring
-from sorvolo.detection.scores import score_set
 from sorvolo.lab.datasets import read_dataset
+from sorvolo.lab.evaluation.detection_scores import score_set
 from sorvolo.lab.evaluation.detector import (
     EvaluationSettings,
     evaluate_detector,

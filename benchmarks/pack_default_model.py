@@ -23,8 +23,13 @@ import torch
 
 from detection_data import hituav, in_order, tinyperson
 from sorvolo.detection.detector import Detector
-from sorvolo.detection.metrics import ClassMatch, counts_at, judged_classes, match_pictures
 from sorvolo.lab.datasets import read_dataset
+from sorvolo.lab.evaluation.detection_metrics import (
+    ClassMatch,
+    counts_at,
+    judged_classes,
+    match_pictures,
+)
 from sorvolo.lab.simulate.pictures import simulate_pictures
 from sorvolo.lab.simulation.pictures import PictureSettings
 from sorvolo.lab.training.onnx_export import check_export, export_onnx

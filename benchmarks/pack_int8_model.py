@@ -18,8 +18,8 @@ from pack_default_model import HOME
 from provenance import note_scoring
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.quantise import quantise
-from sorvolo.detection.scores import score_set
 from sorvolo.lab.datasets import read_dataset
+from sorvolo.lab.evaluation.detection_scores import score_set
 from sorvolo.lab.evaluation.detector import LEAST_SCORE
 from sorvolo.lab.simulate.pictures import simulate_pictures
 from sorvolo.lab.simulation.pictures import PictureSettings

@@ -26,9 +26,9 @@ from rendered_people import read_scenes
 from second_look import Looker
 from sorvolo.detection.contract import Pyramid
 from sorvolo.detection.pyramid import agreed_in_sizes
-from sorvolo.detection.scores import score_set
 from sorvolo.detection.session import Seen
 from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.lab.evaluation.detection_scores import score_set
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import Detections

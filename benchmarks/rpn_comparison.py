@@ -21,7 +21,7 @@ from torch import nn
 
 from detection_data import hituav
 from mosaic_methods import commit, machine
-from sorvolo.detection.metrics import judged_classes, match_pictures
+from sorvolo.lab.evaluation.detection_metrics import judged_classes, match_pictures
 from sorvolo.lab.training.drawing import batches_from
 from sorvolo.lab.training.faster_rcnn import FasterRCNN
 from sorvolo.lab.training.feature_pyramid import convolution

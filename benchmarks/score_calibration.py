@@ -31,10 +31,10 @@ from provenance import commit, machine, note_scoring
 from sorvolo.detection.calibration import platt_fit, platt_scaled
 from sorvolo.detection.contract import Calibration
 from sorvolo.detection.detector import Detector
-from sorvolo.detection.metrics import TENTHS, match_pictures
 from sorvolo.detection.models import find_model
 from sorvolo.detection.session import Session
 from sorvolo.geometry.calibration_bins import calibration_bins
+from sorvolo.lab.evaluation.detection_metrics import TENTHS, match_pictures
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES, Detections
 from train_default_model import reader

@@ -25,9 +25,9 @@ from own_scale import own_scale
 from provenance import commit, machine, note_scoring
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import find_model
-from sorvolo.detection.scores import score_set
 from sorvolo.detection.session import Seen, Session
 from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.lab.evaluation.detection_scores import score_set
 from sorvolo.lab.evaluation.detector import LEAST_SCORE
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.survey.labels import LabelledSet

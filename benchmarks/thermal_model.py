@@ -23,8 +23,8 @@ from mosaic_methods import commit, machine
 from sorvolo.detection.contract import METADATA_KEY
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import find_model
-from sorvolo.detection.scores import Arm, compare_arms
 from sorvolo.detection.session import Session
+from sorvolo.lab.evaluation.detection_scores import Arm, compare_arms
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import CLASSES

@@ -21,11 +21,11 @@ import detection_data
 from detector_accuracy import people_by_centre
 from mosaic_methods import commit, machine
 from sorvolo.detection.contract import ModelInfo
-from sorvolo.detection.scores import score_set
 from sorvolo.detection.session import Seen
 from sorvolo.detection.suppression import SeenTile, merge_tiles
 from sorvolo.detection.tiling import plan_tiles
 from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.lab.evaluation.detection_scores import score_set
 from sorvolo.lab.training.drawing import batches_from
 from sorvolo.lab.training.faster_rcnn import FasterRCNN
 from sorvolo.lab.training.joint import JointSettings, JointTraining

@@ -7,9 +7,8 @@ import pytest
 
 from sorvolo.detection.calibration import platt_scaled
 from sorvolo.detection.contract import Calibration
-from sorvolo.detection.held_out import Checked, best_sizes_px
-from sorvolo.detection.intervals import differences, draw_groups, group_tables, intervals
-from sorvolo.detection.metrics import (
+from sorvolo.errors import InputError
+from sorvolo.lab.evaluation.detection_metrics import (
     SIZES_PX,
     best_threshold,
     confusion,
@@ -23,7 +22,13 @@ from sorvolo.detection.metrics import (
     thesis_ap,
     thesis_map,
 )
-from sorvolo.errors import InputError
+from sorvolo.lab.evaluation.detection_scores import (
+    differences,
+    draw_groups,
+    group_tables,
+    intervals,
+)
+from sorvolo.lab.train.held_out import Checked, best_sizes_px
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import Detections
 

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from sorvolo.lab.evaluation.changes import FlightChanges
     from sorvolo.lab.evaluation.mask_folders import MaskScores
     from sorvolo.lab.evaluation.mosaic import MosaicEvaluation
+    from sorvolo.lab.evaluation.track_metrics import FlightObjects
     from sorvolo.mosaic.map_quality import Spread
-    from sorvolo.tracking.metrics import FlightObjects
 
 evaluate_app = typer.Typer(no_args_is_help=True)
 evaluate_app.command()(detector)

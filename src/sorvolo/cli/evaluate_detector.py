@@ -17,8 +17,12 @@ from sorvolo.cli.progress import ProgressReport
 from sorvolo.errors import SettingsError
 
 if TYPE_CHECKING:
-    from sorvolo.detection.intervals import Difference, Interval
-    from sorvolo.detection.scores import SetComparison, SetScores
+    from sorvolo.lab.evaluation.detection_scores import (
+        Difference,
+        Interval,
+        SetComparison,
+        SetScores,
+    )
     from sorvolo.lab.evaluation.detector import DetectorEvaluation, EvaluationSettings
     from sorvolo.survey.labels import LabelledSet
 

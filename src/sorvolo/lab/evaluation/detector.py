@@ -9,14 +9,20 @@ from typing import Any, Literal
 
 from sorvolo.capture.photos import read_picture
 from sorvolo.detection.detector import Detector
-from sorvolo.detection.intervals import DRAWS
-from sorvolo.detection.metrics import Mistake, judged_classes
 from sorvolo.detection.models import find_model
-from sorvolo.detection.scores import Arm, SetComparison, SetScores, compare_arms, score_set
 from sorvolo.detection.session import read_info
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import BoxesPx, ImageRGB
 from sorvolo.lab.datasets import read_datasets
+from sorvolo.lab.evaluation.detection_metrics import Mistake, judged_classes
+from sorvolo.lab.evaluation.detection_scores import (
+    DRAWS,
+    Arm,
+    SetComparison,
+    SetScores,
+    compare_arms,
+    score_set,
+)
 from sorvolo.lab.train.holding_out import hold_out
 from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.exports.detector_files import (

@@ -16,18 +16,18 @@ from sorvolo.lab.evaluation.frame_rows import (
     time_ns_of,
     truth_file,
 )
-from sorvolo.mosaic.paired_flights import PairedFlights
-from sorvolo.store.exports.plain import features_path
-from sorvolo.store.site.archive import Archive
-from sorvolo.survey.flight import Site
-from sorvolo.survey.objects import CLASSES
-from sorvolo.tracking.metrics import (
+from sorvolo.lab.evaluation.track_metrics import (
     FlightObjects,
     JudgedObject,
     frames_over,
     middle_of,
     score_objects,
 )
+from sorvolo.mosaic.paired_flights import PairedFlights
+from sorvolo.store.exports.plain import features_path
+from sorvolo.store.site.archive import Archive
+from sorvolo.survey.flight import Site
+from sorvolo.survey.objects import CLASSES
 
 _LEAST_FRAMES = 2  # frames that were searched must show a true object before it has to be found
 _VISIBLE = 0.5  # share of an object that nothing hides

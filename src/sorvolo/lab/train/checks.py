@@ -2,10 +2,15 @@
 
 from collections.abc import Callable, Sequence
 
-from sorvolo.detection.held_out import Checked, mean_known
-from sorvolo.detection.metrics import ClassMatch, CocoNumbers, judged_classes, match_pictures
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.lab.evaluation.detection_metrics import (
+    ClassMatch,
+    CocoNumbers,
+    judged_classes,
+    match_pictures,
+)
+from sorvolo.lab.train.held_out import Checked, mean_known
 from sorvolo.lab.training.faster_rcnn import FasterRCNN
 from sorvolo.lab.training.progress import Check
 from sorvolo.lab.training.seeing import see

@@ -15,10 +15,10 @@ from sorvolo import __version__
 from sorvolo.capture.photos import read_picture
 from sorvolo.detection.calibration import scaled_thresholds
 from sorvolo.detection.contract import FORMAT, Calibration
-from sorvolo.detection.held_out import Checked, best_sizes_px, found_sizes_px
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.lab.train.checks import check_model, check_of
+from sorvolo.lab.train.held_out import Checked, best_sizes_px, found_sizes_px
 from sorvolo.lab.train.sets import (
     DataOptions,
     TrainingSets,

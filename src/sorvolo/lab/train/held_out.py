@@ -8,14 +8,14 @@ import numpy as np
 
 from sorvolo.detection.calibration import platt_fit
 from sorvolo.detection.contract import Calibration
-from sorvolo.detection.metrics import (
+from sorvolo.geometry.arrays import Floats
+from sorvolo.lab.evaluation.detection_metrics import (
     ClassMatch,
     CocoNumbers,
     Threshold,
     at_score,
     reporting_threshold,
 )
-from sorvolo.geometry.arrays import Floats
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 
 _FALLBACK_THRESHOLD = 0.5  # where nothing was held out to choose one
