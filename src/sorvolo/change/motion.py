@@ -163,9 +163,7 @@ _PLACE_SHARE = 0.05  # ... and this share of its length: its outline is drawn an
 _CAR_M = 2.5  # what is longer may move as cars do, the rest as people do
 # grey levels that turn a blob's looks by a radian: 19 in 20 keep theirs within 20
 _COLOUR_LEVELS = 40.0
-_TRACKER = TrackerSettings(
-    sure_score=0.0, new_per_m2=0.001, size_sigma=0.25, least_size=-4.0
-)
+_TRACKER = TrackerSettings(sure_score=0.0, new_per_m2=0.001, size_sigma=0.25, least_size=-4.0)
 
 
 # When something counts as moving.
