@@ -48,8 +48,6 @@ COMMANDS = {
         "default",
         "--steps",
         "60",
-        "--device",
-        "cpu",
     ],
     "detector": ["evaluate", "detector", "default", "labelled", "--out", "measured"],
     "reproduce": ["reproduce", "--simulated", "--quick", "--train-steps", "0", "--out", "chapter4"],

@@ -177,7 +177,6 @@ def test_nothing_is_left_of_a_map_that_could_not_begin(
 @pytest.mark.parametrize(
     ("option", "value", "words"),
     [
-        ("--overlap", "1.5", "overlap must lie between 0 and 1, got 1.5"),
         ("--gsd", "-1", "(--gsd) must lie in 1e-4 to 100 m, got -1.0"),
         ("--offset", "1e9", "(--offset) must be a year of seconds at most, got 1000000000.0"),
     ],
@@ -218,8 +217,11 @@ def test_classes_that_name_none_are_an_error(
     [
         (["--thermal", "0.3"], "give their number with --pictures"),
         (["--ground", "urbn"], "none of dirt, countryside"),
-        (["--pictures", "3", "--preset", "survey", "--fps", "5"], "leave out --preset, --fps"),
-        (["--pictures", "3", "--gps-noise", "0"], "leave out --gps-noise"),
+        (
+            ["--pictures", "3", "--preset", "survey", "--strips", "5"],
+            "leave out --preset, --strips",
+        ),
+        (["--pictures", "3", "--relief", "0"], "leave out --relief"),
     ],
 )
 def test_simulate_leaves_no_option_unheard(
@@ -228,11 +230,6 @@ def test_simulate_leaves_no_option_unheard(
     assert cli.main(["simulate", str(tmp_path / "made"), *options]) == 1
     assert words in capsys.readouterr().err
     assert not (tmp_path / "made").exists()
-
-
-def test_presets_are_listed_without_a_folder(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["simulate", "--list-presets"]) == 0
-    assert capsys.readouterr().out.split()[:2] == ["demo", "survey"]
 
 
 def test_json_is_pure(capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,8 +14,8 @@ import pytest
 
 from small_flights import simulate_into
 from sorvolo.cli import main as cli
-from sorvolo.cli.demo import _is_simulated, _next_steps
 from sorvolo.cli.progress import words_of
+from sorvolo.cli.simulate import _is_simulated, _next_steps
 from sorvolo.lab.simulation.presets import preset
 from sorvolo.lab.simulation.settings import SimulationSettings
 from sorvolo.store.site.archive import Archive

@@ -33,7 +33,7 @@ def _run(arguments: list[str], **environment: str) -> subprocess.CompletedProces
 _NAMES = [each.name or "" for each in app.registered_commands]
 
 
-@pytest.mark.parametrize("command", ["", *_NAMES, "evaluate detector", "models fetch"])
+@pytest.mark.parametrize("command", ["", *_NAMES, "evaluate detector", "models verify"])
 def test_help_loads_nothing_heavy(command: str) -> None:
     run = _run(["-c", _PROBE, *command.split(), "--help"])
     assert run.returncode == 0, run.stderr

@@ -104,7 +104,7 @@ def test_json_then_words(model: Path, tmp_path: Path, capsys: pytest.CaptureFixt
         place = _ORIGIN.site_from_wgs84(np.array([latitude]), np.array([longitude]), np.zeros(1))[0]
         assert place[:2] == pytest.approx((east_m, north_m), abs=0.5)
 
-    assert cli.main([*_arguments(video, model, out), "--every", "2"]) == 0
+    assert cli.main([*_arguments(video, model, out), "--fps", "5"]) == 0
     words = capsys.readouterr().out
     assert "2 small objects" in words and "15 of 30 frames searched" in words
     first = printed["tracks"]["features"][0]["properties"]
@@ -117,12 +117,7 @@ def test_nothing_found_is_no_error(
     model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     video = _fly(tmp_path / "flight", 6, with_telemetry=False)
-    assert (
-        cli.main(
-            [*_arguments(video, model, tmp_path / "out"), "--classes", "car", "--tiles", "none"]
-        )
-        == 0
-    )
+    assert cli.main([*_arguments(video, model, tmp_path / "out"), "--classes", "car"]) == 0
     out = capsys.readouterr().out
     assert "nothing" in out and "followed in the picture" in " ".join(out.split())
 
@@ -131,12 +126,8 @@ def test_nothing_found_is_no_error(
     ("extra", "words"),
     [
         (["--classes", "boat"], "knows no 'boat'"),
-        (["--tiles", "big"], "auto, none, or a number"),
         (["--cot", "tak.local"], "udp://host:port"),
         (["--cot", "udp://tak.invalid"], "'tak.invalid' has no address"),
-        (["--cot-type", "person"], "person=a-f-G"),
-        (["--cot-type", "persn=a-f-G"], "--cot-type persn"),
-        (["--every", "2", "--fps", "3"], "not both"),
         (["--model", "no-such-model"], "no-such-model"),
         (["--alert-command", "no-such-program"], "no program"),
         (["--alert-url", "ftp://x"], "web address"),

@@ -1,4 +1,4 @@
-"""Installed models: found by name, fetched by hash or not at all, verified."""
+"""Installed models: found by name, verified; files fetched by hash or not at all."""
 
 import hashlib
 import json
@@ -24,16 +24,14 @@ from sorvolo.detection.models import (
     models_folder,
 )
 from sorvolo.detection.session import read_info
-from sorvolo.errors import InputError, SettingsError
-from sorvolo.missions.fetched_files import WebRedirects
-from sorvolo.missions.model_files import fetch_model
+from sorvolo.errors import InputError
+from sorvolo.missions.fetched_files import WebRedirects, copy_by_hash
 from sorvolo.survey.objects import CLASSES
 
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("SORVOLO_MODELS", str(tmp_path / "own"))
-    monkeypatch.delenv("SORVOLO_MODELS_URL", raising=False)
     for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
         monkeypatch.delenv(name, raising=False)
     return tmp_path / "own"
@@ -47,6 +45,14 @@ def model(tmp_path: Path) -> Path:
 
 def _hash(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _install(folder: Path, model: Path) -> None:
+    """Put a model among one's own, with a card that has its hash."""
+    folder.mkdir(exist_ok=True)
+    path = folder / model.name
+    path.write_bytes(model.read_bytes())
+    path.with_suffix(".json").write_text(json.dumps({"sha256": _hash(model)}))
 
 
 class _Shelf(BaseHTTPRequestHandler):
@@ -118,47 +124,28 @@ def test_where_own_models_lie(
     assert [each for each in installed_models() if not each.is_packaged] == []
 
 
-def test_fetched_from_the_web_from_a_file_and_by_name(
-    folder: Path, model: Path, address: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    fetched = fetch_model(f"{address}/coast.onnx?version=2", _hash(model).upper())
-    assert (fetched.name, fetched.path) == ("coast", folder / "coast.onnx")
-    assert fetched.path.read_bytes() == model.read_bytes() and integrity(fetched) is Integrity.GOOD
-    fetch_model(str(model), _hash(model), name="from-disk")
-    monkeypatch.setenv("SORVOLO_MODELS_URL", f"{address}/")
-    fetch_model("coast", _hash(model))
-    assert [each.name for each in installed_models() if not each.is_packaged] == [
-        "coast",
-        "from-disk",
-    ]
-
-
-def test_what_is_not_the_file_never_appears(
-    folder: Path, model: Path, address: str, tmp_path: Path
-) -> None:
+def test_what_is_not_the_file_is_refused(model: Path, address: str, tmp_path: Path) -> None:
+    copy_by_hash(f"{address}/coast.onnx?version=2", tmp_path / "x", _hash(model), offline="wait")
+    assert (tmp_path / "x").read_bytes() == model.read_bytes()
+    copy_by_hash(str(model), tmp_path / "y", _hash(model), offline="wait")
     attempts = [
         (f"{address}/coast.onnx", "0" * 64, "is not the file"),
         (f"{address}/cut-coast.onnx", _hash(model), "is not the file|cannot be fetched"),
         (f"{address}/none.onnx", _hash(model), "cannot be fetched \\(Not Found"),
-        ("http://127.0.0.1:9/x.onnx", _hash(model), "Without a network"),
-        ("coast", _hash(model), "SORVOLO_MODELS_URL"),
+        ("http://127.0.0.1:9/x.onnx", _hash(model), "Without a network, wait"),
     ]
     for source, sha256, reason in attempts:
         with pytest.raises(InputError, match=reason):
-            fetch_model(source, sha256)
-    text = tmp_path / "page.onnx"
-    text.write_text("<html>")
-    with pytest.raises(InputError, match="cannot be run"):
-        fetch_model(str(text), _hash(text))
-    assert list(folder.iterdir()) == []
+            copy_by_hash(source, tmp_path / "z", sha256, offline="wait")
 
 
-def test_a_redirect_is_followed_over_the_web_alone(folder: Path, model: Path, address: str) -> None:
-    assert fetch_model(f"{address}/to-http-coast.onnx", _hash(model), name="moved").name == "moved"
+def test_a_redirect_is_followed_over_the_web_alone(
+    model: Path, address: str, tmp_path: Path
+) -> None:
+    copy_by_hash(f"{address}/to-http-coast.onnx", tmp_path / "x", _hash(model), offline="")
     for scheme in ("ftp", "file"):
         with pytest.raises(InputError, match=f"cannot be fetched .*edirect.* .?{scheme}"):
-            fetch_model(f"{address}/to-{scheme}-coast.onnx", _hash(model), name="elsewhere")
-    assert not (folder / "elsewhere.onnx").exists()
+            copy_by_hash(f"{address}/to-{scheme}-coast.onnx", tmp_path, _hash(model), offline="")
 
 
 @pytest.mark.parametrize(
@@ -188,46 +175,8 @@ def test_a_redirect_never_gives_up_encryption(asked: str, offered: str, is_follo
             follow()
 
 
-def test_a_failed_fetch_leaves_the_old_model(
-    folder: Path, model: Path, address: str, tmp_path: Path
-) -> None:
-    fetch_model(f"{address}/coast.onnx", _hash(model))
-    square_model(model)
-    with pytest.raises(InputError):
-        fetch_model(f"{address}/coast.onnx", "1" * 64)
-    (kept,) = [each for each in installed_models() if not each.is_packaged]
-    assert (
-        integrity(kept) is Integrity.GOOD
-        and Detector.load("coast", provider="cpu").info.name == "coast"
-    )
-
-
-def test_a_fetched_file_that_is_no_model_is_named_as_it_was_given(
-    folder: Path, tmp_path: Path
-) -> None:
-    junk = tmp_path / "junk.onnx"
-    junk.write_bytes(b"junk")
-    with pytest.raises(InputError, match=f"^nothing was installed: {junk} cannot be run"):
-        fetch_model(str(junk), _hash(junk))
-    assert not folder.exists() or not list(folder.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("source", "sha256", "name"),
-    [
-        ("x.onnx", "12ab", ""),
-        ("given", "0" * 64, "../up"),
-        ("given", "0" * 64, ".hidden"),
-        ("ftp://a/b.onnx", "0" * 64, ""),
-    ],
-)
-def test_wishes_of_fetch_that_cannot_be(model: Path, source: str, sha256: str, name: str) -> None:
-    with pytest.raises(SettingsError):
-        fetch_model(str(model) if source == "given" else source, sha256, name=name)
-
-
 def test_the_command(folder: Path, model: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["models", "fetch", str(model), "--sha256", _hash(model)]) == 0
+    _install(folder, model)
     assert cli.main(["models", "verify", "coast"]) == 0
     assert capsys.readouterr().out.endswith("coast: good\n")
     assert cli.main(["models", "list", "--json"]) == 0
@@ -255,7 +204,7 @@ def test_classes_on_request_are_named(
         sum("reported only where asked for (--classes), from score" in line for line in lines) == 1
     )
     assert sum("reported from score" in line for line in lines) == 2
-    fetch_model(str(model), _hash(model))
+    _install(folder, model)
     assert cli.main(["models", "list"]) == 0
     assert "person, car, small object (on request)" in capsys.readouterr().out
 
@@ -263,7 +212,7 @@ def test_classes_on_request_are_named(
 def test_a_card_s_measurements_are_a_table(
     folder: Path, model: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    fetch_model(str(model), _hash(model))
+    _install(folder, model)
     ap50, ap = (
         {"value": 0.6224, "low": 0.4, "high": 0.77},
         {"value": 0.264, "low": None, "high": None},
@@ -315,7 +264,7 @@ def test_what_is_no_model_is_reported_as_what_it_is(
 def test_verify_finds_changed_damaged_and_unknown_files(
     folder: Path, model: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    fetch_model(str(model), _hash(model))
+    _install(folder, model)
     path = folder / "coast.onnx"
     path.write_bytes(square_model(model.with_name("other.onnx")).read_bytes())
     assert cli.main(["models", "verify", "coast"]) == 1
@@ -350,7 +299,7 @@ def test_a_model_that_only_looks_again_searches_nothing(
     """It finds nobody in whole pictures, so that an empty watch would mislead; it is asked by other models alone."""
     monkeypatch.setenv("COLUMNS", "200")
     model = rectangle_model(tmp_path / "again.onnx", name="again", second_only=True)
-    fetch_model(str(model), _hash(model))
+    _install(folder, model)
     for wanted in ("again", model):
         with pytest.raises(
             InputError, match=r"'again' only looks again at what other models report.*default"
@@ -369,7 +318,7 @@ def test_a_model_that_only_looks_again_searches_nothing(
 
 
 def test_help_of_every_command_has_an_example(capsys: pytest.CaptureFixture[str]) -> None:
-    for command in ("list", "show", "fetch", "verify", "quantise"):
+    for command in ("list", "show", "verify"):
         assert cli.main(["models", command, "--help"]) == 0
         example = capsys.readouterr().out.split("Example", 1)[1]
         assert f"sorvolo models {command}" in " ".join(example.replace("│", " ").split())
@@ -399,12 +348,3 @@ def test_the_packaged_model_hands_thermal_frames_to_the_thermal_one() -> None:
     detector.detect(np.zeros((64, 64, 3), np.uint8))
     (notice,) = detector.notices
     assert notice.code == "thermal_model" and "'thermal'" in notice.text
-
-
-def test_the_help_of_quantise_names_the_extra_that_it_needs(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert cli.main(["models", "quantise", "--help"]) == 0
-    assert (
-        "extra `training`" in capsys.readouterr().out
-    )  # words in square brackets are taken for markup

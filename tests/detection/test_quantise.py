@@ -11,8 +11,6 @@ from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import find_model
 from sorvolo.detection.quantise import pool_before_rounding, quantise
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.missions.model_files import quantise_model
-from sorvolo.store.images import jpeg_from_image
 
 
 def _pictures(count: int) -> list[np.ndarray]:
@@ -96,21 +94,6 @@ def test_too_few_pictures_or_nothing_to_gain(model: Path, tmp_path: Path) -> Non
     (tmp_path / "int8.onnx").write_bytes(quantise(model, _pictures(8)).model)
     with pytest.raises(InputError, match="already"):
         quantise(tmp_path / "int8.onnx", _pictures(8))
-
-
-def test_from_a_folder_of_pictures(model: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "flight"
-    folder.mkdir()
-    for index, picture in enumerate(_pictures(10)):
-        (folder / f"{index}.jpg").write_bytes(jpeg_from_image(picture))
-    out = tmp_path / "small.onnx"
-    assert quantise_model(model, folder, out, most=9).convolutions == 2
-    assert Detector.load(out, provider="cpu").info.precision == "int8"
-    with pytest.raises(InputError, match="no folder"):
-        quantise_model(model, tmp_path / "gone", out, most=9)
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="no pictures"):
-        quantise_model(model, tmp_path / "empty", out, most=9)
 
 
 def test_convolutions_of_the_head_before_a_fully_connected_layer_are_whole_numbers_too(

@@ -298,10 +298,7 @@ def test_the_command_reads_labels_prints_numbers_and_writes_the_report(toy, coco
         "Walker=person,Truck=car",
         "--unlabelled",
         "small object",
-        "--draws",
-        "20",
     ]
-    printed += ["--tiles", "none"]
     assert (
         main(
             [
@@ -331,7 +328,7 @@ def test_the_command_reads_labels_prints_numbers_and_writes_the_report(toy, coco
     assert main(["evaluate", "detector", "no-such-model", str(coco), *printed]) == 1
 
 
-def test_pictures_are_shown_as_to_watch_unless_asked_otherwise(toy, coco, monkeypatch):
+def test_pictures_are_shown_as_to_watch(toy, coco, monkeypatch):
     shown = []
     detect = Detector.detect
 
@@ -347,12 +344,8 @@ def test_pictures_are_shown_as_to_watch_unless_asked_otherwise(toy, coco, monkey
         str(coco),
         "--classes",
         "Walker=person,Truck=car",
-        "--draws",
-        "20",
     ]
     assert main(command) == 0 and set(shown) == {"auto"}
-    shown.clear()
-    assert main([*command, "--tiles", "none"]) == 0 and set(shown) == {None}
 
 
 def test_a_damaged_picture_is_left_out_for_all_models_and_named(toy, coco, tmp_path, capsys):
@@ -365,8 +358,6 @@ def test_a_damaged_picture_is_left_out_for_all_models_and_named(toy, coco, tmp_p
         "Walker=person,Truck=car",
         "--unlabelled",
         "small object",
-        "--draws",
-        "20",
     ]
     command = ["evaluate", "detector", str(toy), str(folder), *names]
     assert main([*command, "--out", str(tmp_path / "whole")]) == 0
@@ -407,28 +398,6 @@ def test_names_that_nothing_has_are_reported(toy, coco, capsys):
         "unlabelled: 'Car' is no class; there are: person, car, small object"
         in capsys.readouterr().err
     )
-
-
-def test_what_was_left_out_on_reading_is_reported_of_chosen_pictures_too(coco):
-    names = {"Walker": "person"}
-    (whole,), (some,) = (
-        read_sets([coco], classes=names, videos=videos) for videos in ("", "coco|.*")
-    )
-    assert whole.notices and [each.text for each in some.notices] == [
-        each.text for each in whole.notices
-    ]
-
-
-def test_videos_choose_pictures(coco):
-    names = {"Walker": "person", "Truck": "car"}
-    (chosen,) = read_sets([coco], classes=names, videos="video1")
-    assert [picture.group for picture in chosen.pictures] == ["video1", "video1"]
-    with pytest.raises(
-        InputError, match="no video or flight fits 'night'; there are video0, video1"
-    ):
-        read_sets([coco], classes=names, videos="night")
-    with pytest.raises(SettingsError, match="no regular expression"):
-        read_sets([coco], classes=names, videos="(")
 
 
 def test_what_a_training_held_out_can_be_measured_alone(many):

@@ -132,7 +132,7 @@ def test_heights_of_a_map_that_contradicts_itself_or_mixes_lenses_state_it(
     }
     report["notices"] = [{"code": "zoom", "count": 2, "text": "different focal lengths"}]
     path.write_text(json.dumps(report))
-    assert main(["heights", str(site), "--no-orthophoto", "--json"]) == 3
+    assert main(["heights", str(site), "--json"]) == 3
     warnings = " ".join(json.loads(capsys.readouterr().out)["heights"]["warnings"])
     assert "two scales" in warnings and "each focal length as a flight of their own" in warnings
 
@@ -216,16 +216,15 @@ def test_volumes_profiles_and_contours_are_measured(
                 "contours",
                 str(with_heights),
                 "--interval",
-                "0.5",
+                "0.125",
                 "--out",
                 str(out),
-                "--surface",
             ]
         )
         == 0
     )
     features = json.loads(out.read_text())["features"]
-    assert features and all(each["properties"]["height_m"] % 0.5 == 0 for each in features)
+    assert features and all(each["properties"]["height_m"] % 0.125 == 0 for each in features)
 
 
 def test_measuring_names_what_is_missing(with_heights: Path, tmp_path: Path) -> None:

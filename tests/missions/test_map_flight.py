@@ -4,7 +4,7 @@ import json
 import shutil
 from collections import Counter
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -20,6 +20,7 @@ from sorvolo.missions.flight.setup import prepare
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.map.planar_run import PlanarRun
 from sorvolo.missions.site.history import site_history
+from sorvolo.mosaic.roi_stitching import RoiStitchingSettings
 from sorvolo.store.exports.plain import features_path
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.flight import Frame, PosedFrame
@@ -412,21 +413,14 @@ def test_frames_outside_the_area_are_not_used(
 
 
 @pytest.mark.parametrize("transform", ["similarity", "homography"])
-def test_the_thesis_method(photographed: Path, tmp_path: Path, transform: str) -> None:
+def test_the_thesis_method(
+    photographed: Path, tmp_path: Path, transform: Literal["similarity", "homography"]
+) -> None:
     photos = _some_photos(photographed, tmp_path / "few", 0, 7)
     site = tmp_path / "site"
-    run_map(
-        site,
-        photos,
-        "--camera",
-        photographed / "camera.xml",
-        "--method",
-        "thesis",
-        "--transform",
-        transform,
-        "--thesis",
-        "features=3000",
-    )
+    stitching = RoiStitchingSettings(transform=transform, max_features=3000)
+    settings = MapSettings(method="thesis", thesis=stitching, model="none")
+    list(map_flights([photos], site, settings, camera=photographed / "camera.xml"))
     report = report_of(site, "few")
     assert report["method"] == "thesis" and report["settings"]["thesis"]["transform"] == transform
     assert report["frames"]["vision"] == 7
@@ -558,7 +552,8 @@ def test_every_selected_frame_ends_once_with_a_reason_unless_by_vision(
     filmed: Path, tmp_path: Path
 ) -> None:
     site = tmp_path / "site"
-    run_map(site, _film(filmed), "--camera", filmed / "camera.xml", "--overlap", "0.5")
+    settings = MapSettings(overlap=0.5, model="none")
+    list(map_flights([_film(filmed)], site, settings, camera=filmed / "camera.xml"))
     frames, counted = frames_of(site, "flight1")["features"], report_of(site, "flight1")["frames"]
     assert max(Counter(each["properties"]["frame"] for each in frames).values()) == 1
     assert len(frames) == counted["selected"]

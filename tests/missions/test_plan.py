@@ -14,19 +14,17 @@ from sorvolo.cli.plan import plan as plan_command
 from sorvolo.detection.models import find_model
 from sorvolo.detection.session import read_info
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.geometry.planning import BOTTOM_CRITICAL_M, FRONT_CRITICAL_M, Task
+from sorvolo.geometry.planning import FRONT_CRITICAL_M, Task
 from sorvolo.missions.plan_flight import (
     PlanSettings,
     answer_questions,
     camera_to_plan_with,
-    critical_dimension_m,
     plan_over,
-    seen_person_m,
     write_plan,
 )
 from sorvolo.survey.area import Area
 
-THESIS_LENS = camera_to_plan_with("", 1.7, 6.97, (1280, 720))
+THESIS_LENS = camera_to_plan_with(f"focal_px={1.7 / 6.97e-3}", (1280, 720))
 FIELD = [[12.5, 41.9], [12.503, 41.9], [12.503, 41.902], [12.5, 41.902]]
 AREA = Area(((np.array(FIELD),),), "field")
 APP = typer.Typer()
@@ -45,17 +43,9 @@ def run(*arguments):
 
 
 def test_the_thesiss_heights_come_out_of_the_command():
-    thesis = (
-        "--focal-mm",
-        1.7,
-        "--pixel-um",
-        6.97,
-        "--task",
-        "detection",
-        "--facing",
-        "front",
-        "--json",
-    )
+    # a lens of 1.7 mm, pixels of 6.97 um, a person who faces the camera: 0.75 m
+    lens = ("--camera", f"focal_px={1.7 / 6.97e-3}", "--size", "1280x720")
+    thesis = (*lens, "--task", "detection", "--critical-m", 0.75, "--json")
     result = run(*thesis, "--model", "none", "--max-height", 150)
     assert result.exit_code == 0, result.output
     answers = json.loads(result.output)
@@ -101,11 +91,8 @@ def test_the_packaged_detector_bounds_the_height_by_its_own_word():
 
 
 def test_another_object_is_not_bounded_by_how_people_are_found():
-    answers = answer_questions(
-        THESIS_LENS, PlanSettings(critical_m=4.0, person_m=seen_person_m("bottom", 4.0))
-    )
+    answers = answer_questions(THESIS_LENS, PlanSettings(critical_m=4.0, person_m=math.nan))
     assert set(answers.height_bounds_m) == {"task", "ceiling"}
-    assert seen_person_m("front", math.nan) == 1.7
 
 
 def test_answers_fit_together():
@@ -121,35 +108,14 @@ def test_answers_fit_together():
     assert answers.minimum_frame_rate_hz == pytest.approx(4.0 / answers.photo_spacing_m)
 
 
-def test_the_critical_dimension_is_the_persons_unless_given():
-    assert critical_dimension_m("front", math.nan) == FRONT_CRITICAL_M
-    assert critical_dimension_m("bottom", math.nan) == BOTTOM_CRITICAL_M
-    assert critical_dimension_m("bottom", 2.0) == 2.0
-
-
 def test_a_preset_plans_with_its_full_photo():
-    model = camera_to_plan_with("Mavic 2 Pro", math.nan, math.nan, None)
+    model = camera_to_plan_with("Mavic 2 Pro")
     assert (model.camera.width_px, model.camera.height_px) == (5472, 3648)
-
-
-@pytest.mark.parametrize(
-    ("option", "focal_mm", "pixel_um"),
-    [
-        ("", math.nan, math.nan),
-        ("", 4.0, math.nan),
-        ("Mavic 2 Pro", 4.0, 2.0),
-        ("", 0.0, 2.0),
-        ("", 4.0, -2.0),
-    ],
-)
-def test_a_camera_that_is_not_given_is_asked_for(option, focal_mm, pixel_um):
-    with pytest.raises(SettingsError):
-        camera_to_plan_with(option, focal_mm, pixel_um, None)
 
 
 def test_a_nonsense_camera_lists_the_presets():
     with pytest.raises(InputError, match="Phantom 3"):
-        camera_to_plan_with("Concorde", math.nan, math.nan, None)
+        camera_to_plan_with("Concorde")
 
 
 @pytest.fixture

@@ -294,8 +294,6 @@ def test_the_command_refuses_what_it_cannot_use(
         assert f"{option} is for flights that are mapped now" in capsys.readouterr().err
     assert main(["search", str(tmp_path), "--plants", "2"]) == 1
     assert "--plants" in capsys.readouterr().err
-    assert main(["search", str(tmp_path), "--sun", "south"]) == 1
-    assert "--sun" in capsys.readouterr().err
 
 
 def test_classes_that_cannot_be_measured_are_refused(site: Path, tmp_path: Path) -> None:
@@ -351,7 +349,7 @@ def test_what_cannot_be_used_is_refused_before_a_flight_is_mapped(
     ("inputs", "wishes", "words"),
     [
         (["photos"], ["--flight", "flight1"], "flights that the map has"),
-        (["photos"], ["--seed", "-1"], "--seed"),
+        (["photos"], ["--plants", "2"], "--plants"),
         (["follow:a", "follow:b"], [], "one live flight"),
     ],
 )

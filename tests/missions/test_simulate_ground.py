@@ -61,10 +61,6 @@ def test_a_flight_over_an_orthophoto_is_mapped_back_onto_it(
                 "2",
                 "--height",
                 "20",
-                "--size",
-                "480x270",
-                "--gps-noise",
-                "0.02",
             ]
         )
         == 0

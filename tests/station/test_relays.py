@@ -17,7 +17,6 @@ import pytest
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
-from sorvolo.cli import serve
 from sorvolo.errors import SettingsError
 from sorvolo.station.events import EventLog, NewEvent
 from sorvolo.station.mqtt import MqttSender, mqtt_place
@@ -163,20 +162,6 @@ def test_a_password_in_a_broker_s_address_is_refused() -> None:
         mqtt_place("mqtts://crew:p%40ss@broker.example")
     assert "p%40ss" not in str(refused.value)
     assert "p@ss" not in repr(OutwardSettings(mqtt="mqtt://crew@host", mqtt_password="p@ss"))
-
-
-def test_the_password_of_a_broker_comes_from_a_file_of_one_s_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    file = tmp_path / "password"
-    file.write_text("p@ss\n")
-    file.chmod(0o644)
-    with pytest.raises(SettingsError, match="chmod 600"):
-        serve._mqtt_password(file)
-    file.chmod(0o600)
-    assert serve._mqtt_password(file) == "p@ss"
-    monkeypatch.setenv("SORVOLO_MQTT_PASSWORD", "other")
-    assert serve._mqtt_password(None) == "other"
 
 
 class Broker:

@@ -107,8 +107,6 @@ class StationProcess(Station):
                 str(self._root),
                 "--port",
                 str(self._port),
-                "--free-floor",
-                "0",
             ]
         )
         wait_for(self._answers)

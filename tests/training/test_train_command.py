@@ -75,8 +75,6 @@ def test_the_command_learns_and_writes_a_model_that_runs(data: Path, tmp_path: P
         "64",
         "--val",
         "0.25",
-        "--device",
-        "cpu",
     ]
     assert main(["train", str(data), "--out", str(out), *options, "--json"]) == 0
 
@@ -235,8 +233,6 @@ def test_what_was_remarked_is_reported_on_the_terminal_too(
     options = [
         "--weights",
         "none",
-        "--rpn",
-        "standard",
         "--steps",
         "1",
         "--batch",
@@ -360,8 +356,6 @@ def test_bad_input_is_reported(
     assert "steps must lie in 1" in words(place, "--steps", "0")
     assert "holds no checkpoint.pt to go on from" in words(place, "--resume")
     assert "no weights at" in words(place, "--weights", "gone.pth")
-    assert "device must be auto, cpu or cuda, got 'tpu'" in words(place, "--device", "tpu")
-    assert "device must be auto, cpu or cuda, got 'cudaa'" in words(place, "--device", "cudaa")
     assert "THEIRS=OURS" in words(place, "--classes", "=car")
     assert "ignore: 'Bicycle' is no name in the labels; there are: car" in words(
         place, "--ignore", "Bicycle"
@@ -371,8 +365,12 @@ def test_bad_input_is_reported(
     )
     assert "none of its class names" in (printed := words(place, "--classes", "Boat=boat"))
     assert "such as --classes " in printed and "=person" in printed
+    devices = [("tpu", "device must be auto, cpu or cuda, got 'tpu'")]
     if not torch.cuda.is_available():
-        assert "sees no GPU; use --device cpu" in words(place, "--device", "cuda")
+        devices.append(("cuda", "sees no GPU; use the device cpu"))
+    for device, refused in devices:
+        with pytest.raises(SettingsError, match=refused):
+            list(train_detector([data], tmp_path / "new", _settings(), device=device))
 
 
 def test_pictures_without_any_object_teach_nothing(tmp_path: Path) -> None:
@@ -408,8 +406,6 @@ def test_a_model_that_finds_nothing_is_warned_of(
         "64",
         "--val",
         "0.25",
-        "--device",
-        "cpu",
     ]
     assert main(["train", str(data), "--out", str(tmp_path / "out"), *options]) == 0
     words = "the model finds next to nothing: its AP50 on the held-out pictures is 0.0"

@@ -29,8 +29,6 @@ def _command(data: Path, out: Path, *more: str) -> list[str]:
         str(out),
         "--weights",
         "none",
-        "--rpn",
-        "standard",
         "--steps",
         str(_STEPS),
         "--batch",
@@ -39,8 +37,6 @@ def _command(data: Path, out: Path, *more: str) -> list[str]:
         "64",
         "--val",
         "0.25",
-        "--device",
-        "cpu",
         "--json",
         *more,
     ]

@@ -14,6 +14,10 @@ from square_pictures import labelled_squares
 from sorvolo.cli.main import main
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import find_model
+from sorvolo.errors import InputError
+from sorvolo.lab.train.detector import train_detector
+from sorvolo.lab.train.sets import DataOptions
+from sorvolo.lab.train.settings import TrainSettings
 from sorvolo.lab.train.start import (
     kept_on_request,
     kept_thermal_by,
@@ -23,7 +27,7 @@ from sorvolo.lab.train.start import (
 )
 from sorvolo.lab.training.exported import ExportedModel
 
-_BRIEFLY = ("--batch", "2", "--side", "64", "--val", "0.25", "--device", "cpu")
+_BRIEFLY = ("--batch", "2", "--side", "64", "--val", "0.25")
 
 
 def _settle_by_a_hundred(patch: pytest.MonkeyPatch) -> None:
@@ -240,18 +244,10 @@ def test_what_of_the_use_of_a_model_is_kept(
 
 @pytest.mark.long
 def test_the_four_steps_begin_from_a_model_too(learnt: Path, data: Path, tmp_path: Path) -> None:
-    command = [
-        "train",
-        str(data),
-        "--out",
-        str(tmp_path / "out"),
-        "--weights",
-        str(learnt),
-        "--steps",
-        "4",
-        *_BRIEFLY,
-    ]
-    assert main([*command, "--schedule", "four-steps"]) == 0
+    settings = TrainSettings(
+        schedule="four-steps", weights=str(learnt), steps=4, batch=2, side_px=64
+    )
+    list(train_detector([data], tmp_path / "out", settings, DataOptions("0.25"), device="cpu"))
     assert json.loads((tmp_path / "out" / "training.json").read_text())["export"]["good"]
 
 
@@ -298,10 +294,9 @@ def test_models_that_do_not_fit_are_reported(
     assert "cannot be learnt on from: a model file of the preset accurate lacks" in words(
         "--weights", accurate, "--preset", "accurate"
     )
-    assert "does not fit the network" in (
-        printed := words("--weights", str(learnt), "--rpn", "standard")
-    )
-    assert "same preset, --rpn" in printed
+    standard = TrainSettings(rpn="standard", weights=str(learnt), steps=1, batch=2, side_px=64)
+    with pytest.raises(InputError, match=r"does not fit the network.* same preset, rpn"):
+        list(train_detector([data], tmp_path / "out", standard, DataOptions("0.25"), device="cpu"))
     assert "is in int8 and cannot be learnt on from; give the float32 model" in words(
         "--weights", "default-int8"
     )

@@ -1,4 +1,4 @@
-"""`sorvolo archive`: all sites of a folder indexed, the flights that saw a place, and a table of them all."""
+"""`sorvolo archive` and `sorvolo site`: an index of many sites; copies of one."""
 
 import json
 from collections.abc import Sequence
@@ -12,16 +12,20 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sorvolo.cli.archive_table import export_command
-from sorvolo.cli.exit_codes import FAILED
-from sorvolo.cli.options import AsJson, wanted_classes
+from sorvolo.cli.options import AsJson, CatalogueAddress, wanted_classes
+from sorvolo.cli.printing import FAILED
 from sorvolo.cli.progress import shown_work
-from sorvolo.survey.wording import counted
+from sorvolo.cli.sites import show_copy
+from sorvolo.survey.wording import counted, counted_list
 
 if TYPE_CHECKING:
+    from sorvolo.store.copies.transfer import CopyOutcome
     from sorvolo.store.index.finding import FoundFlight, FoundThing
 
 archive_app = typer.Typer(no_args_is_help=True)
+site_app = typer.Typer(no_args_is_help=True)
+
+_MAX_FAULTS = 20  # lines on a terminal; by choice
 
 Root = Annotated[Path, typer.Argument(help="The folder that holds the site folders.")]
 
@@ -31,18 +35,10 @@ def archive() -> None:
     """Find flights, objects and changes of all sites of a folder by place and time."""
 
 
-archive_app.command("export")(export_command)
-
-
 @archive_app.command("index")
 def index_command(
     root: Root,
-    catalogue: Annotated[
-        str,
-        typer.Option(
-            help="Where a new index lies: postgresql://USER@HOST/DATABASE with PostGIS. Without it: a file."
-        ),
-    ] = "",
+    catalogue: CatalogueAddress = "",
     as_json: AsJson = False,
 ) -> None:
     """Make the index of an archive, or update it: only what has changed is read.
@@ -126,15 +122,15 @@ def _show(found: Sequence["FoundFlight"], console: Console) -> None:
     table = Table(box=SIMPLE_HEAD, padding=0)
     for name in ("flown", "site", "flight", "by", "frames", "best frame", "found there"):
         table.add_column(name, overflow="fold")
-    for each in found:
+    for flight in found:
         table.add_row(
-            time_words(each.first_ns)[:19],
-            escape(each.site),
-            escape(each.flight),
-            each.kind,
-            f"{each.frames:,}",
-            escape(each.best_frame),
-            "\n".join(_words(thing) for thing in each.things),
+            time_words(flight.first_ns)[:19],
+            escape(flight.site),
+            escape(flight.flight),
+            flight.kind,
+            f"{flight.frames:,}",
+            escape(flight.best_frame),
+            "\n".join(_words(thing) for thing in flight.things),
         )
     console.print(table)
 
@@ -143,3 +139,130 @@ def _words(thing: "FoundThing") -> str:
     kind = f", {thing.kind}" if thing.kind and thing.kind != thing.label else ""
     verdict = f", {thing.verdict}" if thing.verdict else ""
     return escape(f"{thing.label}{kind} ({thing.id}, {thing.distance_m:.1f} m{verdict})")
+
+
+@archive_app.command("export")
+def export_command(
+    root: Annotated[
+        str, typer.Argument(help="The folder that holds the site folders, or s3://BUCKET/PREFIX.")
+    ],
+    out: Annotated[Path, typer.Option(help="The file to write: NAME.parquet.")],
+    as_json: AsJson = False,
+) -> None:
+    """Write all sites, flights, versions, changes and objects as stac-geoparquet, for DuckDB, GeoPandas or QGIS.
+
+    Needs the package pyarrow, which the extra `archive` installs. The exit code is 1 if a site could not be read; the
+    others are written.
+
+    Example: sorvolo archive export maps --out archive.parquet
+    """
+    from sorvolo.missions.archive.export import export_archive
+
+    outcome = shown_work(
+        export_archive(root, out),
+        lambda progress, update: progress.show(
+            "reading sites", update.done, update.sites or None, update.site
+        ),
+    )
+    if as_json:
+        typer.echo(json.dumps({"root": root, "file": str(out), **asdict(outcome)}, indent=1))
+    else:
+        typer.echo(f"{out}: {counted_list(outcome.kinds, none='no sites')}")
+        if outcome.local:
+            typer.echo(f"left out, without a place on Earth: {', '.join(outcome.local)}")
+        for name, fault in outcome.faults.items():
+            typer.echo(f"{name}: {fault}", err=True)
+    if outcome.faults:
+        raise typer.Exit(FAILED)
+
+
+@site_app.callback()
+def site() -> None:
+    """Copy sites to other places, verify the copies, and prune sites in a store."""
+
+
+@site_app.command("copy")
+def copy_command(
+    source: Annotated[str, typer.Argument(help="Folder of the map, or s3://BUCKET/NAME.")],
+    target: Annotated[
+        str,
+        typer.Argument(help="A new or empty folder or s3:// place, or that of an earlier copy."),
+    ],
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Copy nothing: compare the copy with the map.")
+    ] = False,
+    catalogue: CatalogueAddress = "",
+    as_json: AsJson = False,
+) -> None:
+    """Copy a map with all its versions, flights, pictures and findings; an interrupted copy continues.
+
+    Every file is checked by its SHA-256. While a flight is being mapped, the copy is the map as of the last complete
+    flight. The exit code is 1 if a file is missing, damaged or, with --verify, different.
+
+    Example: sorvolo site copy field /media/usb/field
+
+    Example: sorvolo site copy field /media/usb/field --verify
+    """
+    from sorvolo.missions.site.copy import copy_site, verify_copy
+
+    work = verify_copy(source, target) if verify else copy_site(source, target, catalogue)
+    outcome = show_copy(work, "comparing, file" if verify else "copying, file")
+    if as_json:
+        row = asdict(outcome) | {"faults": dict(outcome.faults), "is_whole": not outcome.faults}
+        typer.echo(json.dumps({"source": source, "target": target, **row}, indent=1))
+    else:
+        _show_copied(outcome, target, verified=verify)
+    if outcome.faults:
+        raise typer.Exit(FAILED)
+
+
+@site_app.command("prune")
+def prune_command(
+    place: Annotated[str, typer.Argument(help="The site in a store: s3://BUCKET/NAME.")],
+    keep_days: Annotated[
+        float, typer.Option(min=0.0, help="Keep what was stored less than this many days ago.")
+    ] = 7.0,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Remove nothing: count.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Remove what a site in a store no longer uses: earlier maps, pictures of flights that were mapped again.
+
+    Versions of the map, and all that the site names, stay.
+
+    Example: sorvolo site prune s3://survey-archive/field --dry-run
+    """
+    from sorvolo.missions.site.copy import prune_site
+
+    pruned = prune_site(place, keep_days, only_count=dry_run)
+    if as_json:
+        typer.echo(json.dumps({"place": place, "dry_run": dry_run, **asdict(pruned)}, indent=1))
+    else:
+        done = "would remove" if dry_run else "removed"
+        typer.echo(
+            f"{place}: {done} {counted(pruned.objects, 'object')} ({pruned.bytes / 1e6:,.1f} MB); "
+            f"{pruned.kept_bytes / 1e6:,.1f} MB remain"
+        )
+
+
+def _show_copied(outcome: "CopyOutcome", target: str, *, verified: bool) -> None:
+    done = "compared" if verified else "copied"
+    typer.echo(
+        f"{target}: {done} {outcome.copied:,} of {outcome.files:,} files ({outcome.copied_bytes / 1e6:,.1f} MB), "
+        f"version {outcome.newest} of the map"
+    )
+    if outcome.left_out:
+        names = ", ".join(outcome.left_out[:_MAX_FAULTS])
+        typer.echo(
+            f"not copied, not part of the map: {names}{', ...' if len(outcome.left_out) > _MAX_FAULTS else ''}"
+        )
+    for path, fault in list(outcome.faults.items())[:_MAX_FAULTS]:
+        typer.echo(f"{path}: {fault}", err=True)
+    if len(outcome.faults) > _MAX_FAULTS:
+        typer.echo(f"and {len(outcome.faults) - _MAX_FAULTS:,} more (--json lists all)", err=True)
+    if not outcome.faults:
+        typer.echo("every file matches" if verified else "the copy is complete")
+    elif not verified:
+        typer.echo(
+            "the rest was copied; restore these files of the map from another copy, or map again",
+            err=True,
+        )

@@ -14,22 +14,28 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sorvolo.cli.exit_codes import FAILED, TO_CHECK
-from sorvolo.cli.map import ended_by_signal
-from sorvolo.cli.options import AsJson, Camera, CotAuthority, CotCertificate, GiveUp, wanted_classes
-from sorvolo.cli.progress import ProgressReport
-from sorvolo.cli.shown import show_path
-from sorvolo.cli.watch import (
+from sorvolo.cli.options import (
     AlertCommand,
     AlertUrl,
+    AsJson,
+    Camera,
+    Classes,
     Cot,
+    CotAuthority,
+    CotCertificate,
+    GiveUp,
     LeastScore,
+    Model,
+    Resolution,
     Save,
     SaveOption,
-    SearchedClasses,
     SearchRate,
-    warn_of_interpreted,
+    wanted_classes,
 )
+from sorvolo.cli.printing import FAILED, TO_CHECK, show_path
+from sorvolo.cli.progress import ProgressReport
+from sorvolo.cli.sites import ended_by_signal
+from sorvolo.cli.watch import warn_of_interpreted
 from sorvolo.errors import SettingsError
 from sorvolo.survey.wording import counted
 
@@ -92,16 +98,6 @@ ExecutorName = Annotated[
 Workers = Annotated[
     int | None, typer.Option(help="Flights at once, at most.", show_default="one for each core")
 ]
-Resolution = Annotated[
-    float | None,
-    typer.Option(help="Ground resolution of new maps, m a pixel. Without it: the frames' own."),
-]
-Model = Annotated[
-    str,
-    typer.Option(
-        help="Detector for people, cars and small objects: a model's name, a file, or none."
-    ),
-]
 Receivers = Annotated[
     list[str] | None,
     typer.Option(
@@ -142,7 +138,7 @@ def batch(
     stall: Stall = 300.0,
     retry: Retry = False,
     copy_to: CopyTo = "",
-    classes: SearchedClasses = None,
+    classes: Classes = None,
     least_score: LeastScore = None,
     fps: SearchRate = None,
     save: SaveOption = Save.NONE,

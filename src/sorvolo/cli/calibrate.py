@@ -25,7 +25,6 @@ def calibrate(
     out: Annotated[Path, typer.Option("--out", "-o", help="Camera file to write.")] = Path(
         "camera.xml"
     ),
-    square: Annotated[float, typer.Option(help="Side of a square, mm.")] = 25.0,
     as_json: AsJson = False,
 ) -> None:
     """Make a camera file from pictures of a checkerboard, taken with the size and zoom that will fly.
@@ -40,11 +39,11 @@ def calibrate(
         write_calibration,
     )
 
-    chessboard = parse_board(board, square)
+    chessboard = parse_board(board)
     looked = []
     with Console(stderr=True).status("searching for the board") as status:
-        for each in find_views(inputs, chessboard):
-            looked.append(each)
+        for picture in find_views(inputs, chessboard):
+            looked.append(picture)
             found = sum(isinstance(view.view, BoardView) for view in looked)
             status.update(f"board found in {found} of {counted(len(looked), 'picture')}")
         status.update("computing the camera")

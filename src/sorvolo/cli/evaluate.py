@@ -6,28 +6,139 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from sorvolo.cli.evaluate_detector import detector
-from sorvolo.cli.places_of_sites import SiteArgument, opened_site
+from sorvolo import __version__
+from sorvolo.cli.options import (
+    AsJson,
+    GroupPattern,
+    IgnoredClasses,
+    LabelClasses,
+    OnlyFlight,
+    ResultsFolder,
+    SiteArgument,
+    Truth,
+    UnlabelledClasses,
+    class_names,
+    names,
+)
+from sorvolo.cli.progress import ProgressReport
+from sorvolo.cli.sites import opened_site
 from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
     from sorvolo.lab.evaluation.change_metrics import EventScores
     from sorvolo.lab.evaluation.changes import FlightChanges
+    from sorvolo.lab.evaluation.detection_scores import (
+        Difference,
+        Interval,
+        SetComparison,
+        SetScores,
+    )
     from sorvolo.lab.evaluation.mask_folders import MaskScores
     from sorvolo.lab.evaluation.mosaic import MosaicEvaluation
     from sorvolo.lab.evaluation.track_metrics import FlightObjects
     from sorvolo.mosaic.map_quality import Spread
 
 evaluate_app = typer.Typer(no_args_is_help=True)
-evaluate_app.command()(detector)
+
+ComparedModels = Annotated[
+    list[str] | None,
+    typer.Option(help="Another model to compare on the same pictures. Can be repeated."),
+]
+FromAbove = Annotated[
+    bool,
+    typer.Option(
+        "--from-above", help="The pictures look straight down: models that want it look twice."
+    ),
+]
 
 
 @evaluate_app.callback()
 def evaluate() -> None:
     """Measure results against truth, references, or themselves."""
+
+
+@evaluate_app.command()
+def detector(
+    model: Annotated[
+        str,
+        typer.Argument(
+            help="A model's name or file, or detections.json; several seeds separated by commas."
+        ),
+    ],
+    data: Annotated[list[Path], typer.Argument(help="Labelled pictures: folders or label files.")],
+    compare: ComparedModels = None,
+    classes: LabelClasses = None,
+    ignore: IgnoredClasses = "",
+    unlabelled: UnlabelledClasses = "",
+    group_pattern: GroupPattern = None,
+    from_above: FromAbove = False,
+    out: ResultsFolder = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure detectors on labelled pictures: COCO AP, the thesis's mAP, recall by size, confusions, worst errors.
+
+    Example: sorvolo evaluate detector default labelled --out measured
+
+    Example: sorvolo evaluate detector ours.onnx hituav --classes Person=person,Car=car --ignore DontCare,Bicycle
+
+    Example: sorvolo evaluate detector a1.onnx,a2.onnx data --compare b1.onnx,b2.onnx --out side-by-side
+    """
+    from sorvolo.lab.evaluation.detector import (
+        PAGE,
+        EvaluationSettings,
+        evaluate_detector,
+        evaluation_numbers,
+        known_classes,
+        read_sets,
+        write_evaluation,
+    )
+    from sorvolo.store.exports.plain import plain_json
+
+    settings = EvaluationSettings(from_above=from_above)
+    arms = [list(names(arm)) for arm in (model, *(compare or ()))]
+    labelled = read_sets(
+        data,
+        classes=class_names(classes),
+        ignore=names(ignore),
+        unlabelled=names(unlabelled),
+        group_pattern=group_pattern,
+        known=known_classes(arms),
+    )
+    with ProgressReport(Console(stderr=True)) as progress:
+        measured = evaluate_detector(
+            arms,
+            labelled,
+            settings,
+            lambda step: progress.show(
+                f"{step.model} on {step.set_name}, picture", step.pictures_done, step.pictures_total
+            ),
+        )
+    notices = [*(note.text for part in labelled for note in part.notices), *measured.notices]
+    description = {
+        "sorvolo": __version__,
+        "data": ", ".join(map(str, data)),
+        "arms": "; ".join(", ".join(arm) for arm in arms),
+        "from_above": from_above,
+        "notices": "; ".join(notices),
+    }
+    if out is not None:
+        write_evaluation(measured, out, description)
+    if as_json:
+        typer.echo(json.dumps(plain_json(evaluation_numbers(measured, description)), indent=1))
+        return
+    console = Console()
+    for notice in notices:
+        console.print(f"note: {notice}", markup=False)
+    for scores in measured.sets:
+        _show_scores(console, scores)
+    for side_by_side in measured.comparisons:
+        _show_comparison(console, side_by_side)
+    if out is not None:
+        console.print(f"the whole report: {out / PAGE}")
 
 
 @evaluate_app.command()
@@ -41,7 +152,7 @@ def mosaic(
         Path | None,
         typer.Option(help="CSV of camera positions: frame,longitude_deg,latitude_deg[,height_m]."),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Measure the accuracy of a map, and how much it deviates from its own frames.
 
@@ -70,14 +181,9 @@ def changes(
             help="Folder of a map that was compared, or s3://BUCKET/NAME; or a folder of masks."
         ),
     ],
-    truth: Annotated[
-        Path, typer.Option(help="Folder that `sorvolo simulate` made, or a folder of masks.")
-    ],
-    flight: Annotated[str | None, typer.Option(help="Only this compared flight.")] = None,
-    least_px: Annotated[
-        int, typer.Option(help="Changed pixels that make a frame positive; 1 as in the thesis.")
-    ] = 1,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON list.")] = False,
+    truth: Truth,
+    flight: OnlyFlight = None,
+    as_json: AsJson = False,
 ) -> None:
     """Measure changes against the truth: by pixel and frame (the thesis's Tables 4.3 to 4.5), and by event.
 
@@ -89,7 +195,7 @@ def changes(
     from sorvolo.lab.evaluation.changes import evaluate_changes
 
     with opened_site(found) as place:
-        measured = evaluate_changes(place.folder, truth, flight=flight, least_px=least_px)
+        measured = evaluate_changes(place.folder, truth, flight=flight)
     if as_json:
         typer.echo(json.dumps(measures_as_json(measured), indent=1))
         return
@@ -101,9 +207,9 @@ def changes(
 @evaluate_app.command()
 def objects(
     site: SiteArgument,
-    truth: Annotated[Path, typer.Option(help="Folder that `sorvolo simulate` made.")],
-    flight: Annotated[str | None, typer.Option(help="Only this flight.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON list.")] = False,
+    truth: Truth,
+    flight: OnlyFlight = None,
+    as_json: AsJson = False,
 ) -> None:
     """Measure the objects on the map against the truth: found, missed, false, counted once, how well placed.
 
@@ -285,3 +391,74 @@ def _add(table: Table, name: str, spread: "Spread") -> None:
             f"{spread.rms_px:.2f}",
             str(spread.count),
         )
+
+
+def _show_scores(console: Console, scores: "SetScores") -> None:
+    table = Table(title=scores.name, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for name in ("class", "labels", "AP", "AP50", "precision", "recall", "from", "thesis AP"):
+        table.add_column(name, no_wrap=True, justify="left" if name == "class" else "right")
+    for row in scores.classes:
+        table.add_row(
+            row.label,
+            str(row.labels),
+            _between(scores.intervals[f"AP {row.label}"]),
+            _between(scores.intervals[f"AP50 {row.label}"]),
+            _share(row.reported.precision),
+            _share(row.reported.recall),
+            f"{row.reported.score:.2f}",
+            _share(row.thesis_ap),
+        )
+    table.add_section()
+    table.add_row(
+        "mean",
+        "",
+        _between(scores.intervals["AP"]),
+        _between(scores.intervals["AP50"]),
+        "",
+        "",
+        "",
+        _share(scores.thesis_map),
+    )
+    console.print(table)
+    if scores.groups > 1:
+        console.print(
+            f"{scores.pictures:,} pictures of {scores.groups} videos or flights; 95 % intervals over these",
+            highlight=False,
+        )
+    for remark in scores.remarks:
+        console.print(f"{scores.name}: {remark}")
+
+
+def _show_comparison(console: Console, comparison: "SetComparison") -> None:
+    first = comparison.arms[0].name
+    head = [arm.name for arm in comparison.arms] + [
+        f"{arm.name} less {first}" for arm in comparison.arms[1:]
+    ]
+    table = Table(
+        "measure",
+        *head,
+        title=f"side by side: {comparison.name} (differences in percentage points)",
+    )
+    for name, value in comparison.arms[0].mean.items():
+        if not math.isfinite(value):
+            continue
+        cells = [_share(arm.mean[name]) for arm in comparison.arms]
+        cells += [_difference(found[name]) for found in comparison.differences]
+        table.add_row(name, *cells)
+    console.print(table)
+
+
+def _difference(found: "Difference") -> str:
+    """In percentage points, with the bounds where there are any."""
+    low, high = 100 * found.low, 100 * found.high
+    bounds = f" ({low:+.1f} to {high:+.1f})" if math.isfinite(low) else ""
+    return f"{100 * found.value:+.1f}{bounds}"
+
+
+def _between(interval: "Interval") -> str:
+    bounds = (
+        f"\n{100 * interval.low:.1f}-{100 * interval.high:.1f}"
+        if math.isfinite(interval.low)
+        else ""
+    )
+    return _share(interval.value) + bounds

@@ -1,6 +1,9 @@
-"""`sorvolo heights`: a height model, the bare ground and a true orthophoto of a mapped flight."""
+"""`sorvolo heights` and `sorvolo measure`: height models of mapped flights, and volumes between them."""
 
+import csv
 import json
+import math
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,28 +13,28 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sorvolo.cli.exit_codes import TO_CHECK
-from sorvolo.cli.options import AsJson
-from sorvolo.cli.places_of_sites import SiteArgument, opened_site
+from sorvolo.cli.options import AsJson, Flight, SiteArgument
+from sorvolo.cli.printing import TO_CHECK, read_json, show_path
 from sorvolo.cli.progress import ProgressReport
-from sorvolo.cli.shown import read_json, show_path
+from sorvolo.cli.sites import opened_site
+from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
+    from sorvolo.missions.heights.measure import MeasuredVolume
     from sorvolo.store.site.catalogue_place import Catalogues
+
+measure_app = typer.Typer(no_args_is_help=True)
 
 
 def heights(
     site: SiteArgument,
-    flight: Annotated[
-        str, typer.Option(help="Which flight. Without it: that of the newest map.")
-    ] = "",
+    flight: Flight = "",
     cell: Annotated[
         float | None,
         typer.Option(
-            help="Side of the height model's cells, m. Without it: 3 to 6 pixels of the map."
+            help="Side of the height model's cells, m.", show_default="3 to 6 pixels of the map"
         ),
     ] = None,
-    orthophoto: Annotated[bool, typer.Option(help="Also make a true orthophoto.")] = True,
     as_json: AsJson = False,
 ) -> None:
     """Make heights of a mapped flight: heights.tif, terrain.tif and orthophoto.tif in the flight's folder.
@@ -43,7 +46,7 @@ def heights(
     Example: sorvolo heights field --flight DJI_0042 --cell 0.1
     """
     with opened_site(site, writes=True) as place:
-        report = make_and_read(place.folder, flight, cell, has_orthophoto=orthophoto)
+        report = make_and_read(place.folder, flight, cell)
         if as_json:
             typer.echo(json.dumps({"site": str(place.folder), "heights": report}, indent=1))
         else:
@@ -52,27 +55,109 @@ def heights(
         raise typer.Exit(TO_CHECK)
 
 
+@measure_app.callback()
+def measure() -> None:
+    """Measure volumes, profiles and contours on the heights of flights."""
+
+
+@measure_app.command()
+def volume(
+    site: SiteArgument,
+    area: Annotated[
+        Path, typer.Option(help="Area to measure: GeoJSON, KML, KMZ or a list of corners.")
+    ],
+    since: Annotated[
+        str,
+        typer.Option(
+            help="Earlier flight to compare with.", show_default="the ground around the area"
+        ),
+    ] = "",
+    flight: Flight = "",
+    as_json: AsJson = False,
+) -> None:
+    """Measure what was dug and heaped in an area between two flights, or a pile above the ground around it.
+
+    The later flight is first aligned with the earlier one by the ground outside the area.
+
+    Example: sorvolo measure volume field --area pit.geojson --since may --flight june
+
+    Example: sorvolo measure volume field --area pile.geojson
+    """
+    from sorvolo.missions.heights.measure import measure_volume
+    from sorvolo.store.exports.plain import plain_json
+
+    with opened_site(site) as place:
+        found = measure_volume(place.folder, area, flight=flight, since=since)
+    if as_json:
+        typer.echo(json.dumps({**plain_json(found), "net_m3": found.volume.net_m3}, indent=1))
+    else:
+        _show_volume(found, Console())
+
+
+@measure_app.command()
+def profile(
+    site: SiteArgument,
+    at: Annotated[
+        list[str], typer.Option(help="A place of the line, LAT,LON in degrees; give two or more.")
+    ],
+    flight: Flight = "",
+) -> None:
+    """Print heights along a line as CSV: way, place, surface with its sigma, and bare ground, m.
+
+    Example: sorvolo measure profile field --at 46.8426,-91.9945 --at 46.8430,-91.9940 > profile.csv
+    """
+    from sorvolo.missions.heights.measure import measure_profile
+
+    with opened_site(site) as place:
+        rows = measure_profile(place.folder, at, flight=flight)
+    writer = csv.writer(sys.stdout, lineterminator="\n")
+    writer.writerow(["way_m", "latitude_deg", "longitude_deg", "surface_m", "sigma_m", "ground_m"])
+    for row in rows:
+        numbers = (row.surface_m, row.sigma_m, row.ground_m)
+        writer.writerow(
+            [
+                f"{row.way_m:.3f}",
+                f"{row.latitude_deg:.8f}",
+                f"{row.longitude_deg:.8f}",
+                *("" if math.isnan(number) else f"{number:.3f}" for number in numbers),  # a hole
+            ]
+        )
+
+
+@measure_app.command()
+def contours(
+    site: SiteArgument,
+    out: Annotated[Path, typer.Option(help="GeoJSON file to write.")],
+    interval: Annotated[float, typer.Option(help="Difference in height between lines, m.")] = 1.0,
+    flight: Flight = "",
+) -> None:
+    """Write contour lines of the bare ground.
+
+    Example: sorvolo measure contours field --interval 0.5 --out contours.geojson
+    """
+    from sorvolo.missions.heights.measure import write_contours
+
+    with opened_site(site) as place:
+        count = write_contours(place.folder, out, interval, flight=flight)
+    typer.echo(f"{out}: {counted(count, 'line')}")
+
+
 def make_and_read(
     site: Path,
     flight: str = "",
     cell_m: float | None = None,
     *,
-    has_orthophoto: bool = True,
     catalogues: "Catalogues | None" = None,
 ) -> Mapping[str, Any]:
-    """Make a flight's heights with progress on stderr; their report."""
+    """Make a flight's heights with progress on stderr; return their report."""
     from sorvolo.missions.heights.run import HeightSettings, make_heights
     from sorvolo.store.site.files import HeightFile
 
     flight_id = ""
+    settings = HeightSettings(cell_m=cell_m)
     with ProgressReport(Console(stderr=True)) as progress:
         progress.show("heights")
-        for update in make_heights(
-            site,
-            HeightSettings(cell_m=cell_m, has_orthophoto=has_orthophoto),
-            flight=flight or None,
-            catalogues=catalogues,
-        ):
+        for update in make_heights(site, settings, flight=flight or None, catalogues=catalogues):
             flight_id = update.flight_id
             progress.show(f"heights: {update.stage}, percent", round(100 * update.share), 100)
     return read_json(site / "flights" / flight_id / HeightFile.REPORT)
@@ -133,3 +218,29 @@ def _judged(found: Mapping[str, Any]) -> str:
         f"{found['points']:,} points of the flight's own: {found['median_m']:.2f} m off (median), "
         f"{found['within_2_sigma']:.0%} within 2 sigma of the match{raised}"
     )
+
+
+def _show_volume(found: "MeasuredVolume", console: Console) -> None:
+    measured = found.volume
+    since = f"since {found.earlier}" if found.earlier else "above the ground around the area"
+    table = Table(
+        title=f"Volume of {escape(found.flight)}, {escape(since)}",
+        show_header=False,
+        title_justify="left",
+    )
+    table.add_row("came" if found.earlier else "above", f"{measured.fill_m3:,.1f} m3")
+    table.add_row("taken away" if found.earlier else "below", f"{measured.cut_m3:,.1f} m3")
+    table.add_row(
+        "difference", f"{measured.net_m3:,.1f} m3, accuracy {measured.sigma_m3:,.1f} m3 (1 sigma)"
+    )
+    table.add_row(
+        "area", f"{measured.area_m2:,.1f} m2, {measured.known_share:.0%} of it with heights"
+    )
+    if found.tied is not None:
+        east, north, up = found.tied.shift_m
+        table.add_row(
+            "flights tied",
+            f"moved by {east:.2f}, {north:.2f}, {up:.2f} m (east, north, up); the ground outside the "
+            f"area then differs by {found.tied.spread_m:.2f} m (1 sigma)",
+        )
+    console.print(table)

@@ -1,9 +1,9 @@
-"""`sorvolo history`: the versions of a map, and the map as it was."""
+"""`sorvolo history` and `sorvolo review`: a map's versions, and people's verdicts on its changes."""
 
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.box import SIMPLE_HEAD
@@ -11,13 +11,18 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sorvolo.cli.options import AsJson, Compression, PlaceFormat, PlaceFormatOption
-from sorvolo.cli.places_of_sites import SiteArgument, opened_site
-from sorvolo.cli.shown import site_of
+from sorvolo.cli.options import AsJson, OnlyFlight, PlaceFormat, PlaceFormatOption, SiteArgument
+from sorvolo.cli.printing import place_heading, place_words, site_of
+from sorvolo.cli.sites import opened_site
 from sorvolo.errors import SettingsError
+from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
     from sorvolo.missions.site.history import HistoryEntry
+    from sorvolo.store.site.change_records import StoredChange
+    from sorvolo.survey.flight import Site
+
+_COLOURS = {"confirmed": "green", "rejected": "red"}
 
 
 def history(
@@ -29,10 +34,6 @@ def history(
     export: Annotated[
         Path | None, typer.Option(help="Write the map as it was: FILE.tif, .png or .kmz.")
     ] = None,
-    compress: Annotated[
-        Compression,
-        typer.Option(help="Of a .tif: deflate (without loss) or jpeg (a fraction of the size)."),
-    ] = Compression.DEFLATE,
     coordinates: PlaceFormatOption = PlaceFormat.LATLON,
     as_json: AsJson = False,
 ) -> None:
@@ -42,52 +43,40 @@ def history(
 
     Example: sorvolo history field --at 2026-05-31 --export may.tif
     """
+    from sorvolo.geometry.coordinates import Coordinates, place_text
+    from sorvolo.missions.site.history import export_version, site_history
+    from sorvolo.store.exports.plain import plain_json
+
     if at is not None and export is None:
         raise SettingsError(
             "--at chooses the map to write: give --export FILE.tif, FILE.png or FILE.kmz as well"
         )
     with opened_site(site) as place:
-        if export is None:
-            _list(place.folder, coordinates, as_json=as_json)
-        else:
-            _export(place.folder, at, export, compress, as_json=as_json)
-
-
-def _list(site: Path, coordinates: PlaceFormat, *, as_json: bool) -> None:
-    from sorvolo.missions.site.history import site_history
-    from sorvolo.store.exports.plain import plain_json
-
-    entries = site_history(site)
-    if as_json:
-        typer.echo(json.dumps({"site": str(site), "versions": plain_json(entries)}, indent=1))
-        return
-    _show(entries, Console())
-    if entries:
-        _show_place(site, coordinates, Console())
-
-
-def _export(
-    site: Path, at: str | None, export: Path, compress: Compression, *, as_json: bool
-) -> None:
-    from sorvolo.missions.site.history import export_version, site_history
-    from sorvolo.store.exports.plain import plain_json
-
-    entries = site_history(site)
-    version = export_version(site, at, export, compress=compress.value)
-    if as_json:
-        entry = next(each for each in entries if each.version == version.id)
-        typer.echo(
-            json.dumps(
-                {"site": str(site), "file": str(export), "version": plain_json(entry)}, indent=1
+        folder = str(place.folder)
+        entries = site_history(place.folder)
+        if export is not None:
+            version = export_version(place.folder, at, export)
+            entry = next(entry for entry in entries if entry.version == version.id)
+            words = (
+                f"{export}: version {version.id}, flight {version.flight_id}, {version.created_utc}"
             )
-        )
-    else:
-        typer.echo(
-            f"{export}: version {version.id}, flight {version.flight_id}, {version.created_utc}"
-        )
+            plain = {"site": folder, "file": str(export), "version": plain_json(entry)}
+            typer.echo(json.dumps(plain, indent=1) if as_json else words)
+            return
+        if as_json:
+            typer.echo(json.dumps({"site": folder, "versions": plain_json(entries)}, indent=1))
+            return
+        console = Console()
+        _show_versions(entries, console)
+        if entries and not (of_map := site_of(place.folder)).is_local:
+            origin = of_map.origin
+            written = place_text(
+                origin.latitude_deg, origin.longitude_deg, Coordinates(coordinates.value)
+            )
+            console.print(f"the map's origin lies at {written}", highlight=False)
 
 
-def _show(entries: Sequence["HistoryEntry"], console: Console) -> None:
+def _show_versions(entries: Sequence["HistoryEntry"], console: Console) -> None:
     if not entries:
         console.print("no map yet: sorvolo map makes one")
         return
@@ -110,8 +99,8 @@ def _show(entries: Sequence["HistoryEntry"], console: Console) -> None:
             overflow="fold",
             min_width={"complete (UTC)": 10, "changes": 13, "reviewed": 11, "by": 7}.get(name),
         )
-    for each in entries:
-        table.add_row(*_cells(each))
+    for entry in entries:
+        table.add_row(*_cells(entry))
     console.print(table)
     console.print(
         "tiles: new or changed, of all; MB: written for this version", style="dim", highlight=False
@@ -137,13 +126,127 @@ def _cells(entry: "HistoryEntry") -> tuple[str, ...]:
     )
 
 
-def _show_place(folder: Path, form: PlaceFormat, console: Console) -> None:
-    """Where on the Earth the map is, if anywhere."""
-    from sorvolo.geometry.coordinates import Coordinates, place_text
+def review(
+    site: SiteArgument,
+    ids: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="Changes to judge: their ids, or numbers with --flight.",
+            show_default="list all changes",
+        ),
+    ] = None,
+    confirm: Annotated[bool, typer.Option("--confirm", help="These changes are real.")] = False,
+    reject: Annotated[
+        bool,
+        typer.Option(
+            "--reject", help="These are no changes; later flights will not report them again."
+        ),
+    ] = False,
+    note: Annotated[str, typer.Option(help="Why, in your own words.")] = "",
+    flight: OnlyFlight = None,
+    coordinates: PlaceFormatOption = PlaceFormat.LATLON,
+    as_json: AsJson = False,
+) -> None:
+    """List the changes that flights found, or confirm or reject some.
 
-    site = site_of(folder)
-    if not site.is_local:
-        written = place_text(
-            site.origin.latitude_deg, site.origin.longitude_deg, Coordinates(form.value)
+    Example: sorvolo review field
+
+    Example: sorvolo review field DJI_0043-3 DJI_0043-7 --reject --note "shadows"
+    """
+    from sorvolo.missions.site.review import list_changes, review_changes
+    from sorvolo.survey.findings import Verdict
+
+    if confirm and reject:
+        raise SettingsError("--confirm and --reject contradict each other; give one of them")
+    if ids and not (confirm or reject):
+        raise SettingsError("changes were named, but no verdict: give --confirm or --reject")
+    if not ids and (confirm or reject or note):
+        raise SettingsError("which changes? give the ids that `sorvolo review SITE` lists")
+    with opened_site(site, writes=bool(ids)) as place:
+        if ids:
+            verdict = Verdict.CONFIRMED if confirm else Verdict.REJECTED
+            changes = review_changes(place.folder, ids, verdict, note, flight=flight)
+        else:
+            changes = list_changes(place.folder, flight)
+        place_of = site_of(place.folder)
+        if as_json:
+            rows = [_plain(change, place_of) for change in changes]
+            typer.echo(json.dumps({"site": str(place.folder), "changes": rows}, indent=1))
+        else:
+            _show_changes(changes, place_of, coordinates, Console())
+
+
+def _show_changes(
+    changes: Sequence["StoredChange"], site: "Site", form: PlaceFormat, console: Console
+) -> None:
+    from sorvolo.store.exports.plain import time_words
+
+    if not changes:
+        console.print(
+            "no changes: none were found, or no flight was compared yet (sorvolo compare)"
         )
-        console.print(f"the map's origin lies at {written}", highlight=False)
+        return
+    # 80 letters hold the table, no word is cut
+    table, place = Table(box=SIMPLE_HEAD, padding=0), place_words(site, form)
+    place_name = place_heading(site.is_local, form)
+    for name in (
+        "id",
+        "kind",
+        place_name,
+        f"length {'units' if site.is_local else 'm'}",
+        "score",
+        "first seen (UTC)",
+        "verdict",
+    ):
+        table.add_column(
+            name,
+            no_wrap=name in ("id", "kind", place_name),
+            overflow="fold",
+            min_width={"first seen (UTC)": 10, "verdict": 9}.get(name),
+        )
+    for change in changes:
+        verdict = ""
+        if change.verdict is not None:
+            colour = _COLOURS[change.verdict]
+            verdict = f"[{colour}]{change.verdict.value}[/{colour}]" + (
+                f": {escape(change.note)}" if change.note else ""
+            )
+        table.add_row(
+            escape(change.id),
+            change.kind.value,
+            place(change.centre_m),
+            f"{change.length_m:.2f}",
+            f"{change.score:.2f}",
+            time_words(change.first_seen_ns),
+            verdict,
+        )
+    console.print(table)
+    judged = sum(change.verdict is not None for change in changes)
+    console.print(
+        f"{counted(len(changes), 'change')}, {judged} reviewed; score: 0 to 1, how sure",
+        style="dim",
+    )
+
+
+def _plain(change: "StoredChange", site: "Site") -> dict[str, Any]:
+    from sorvolo.store.exports.plain import utc_text
+
+    latitude, longitude, _ = site.frame.wgs84_from_site(change.centre_m[None])
+    on_earth = (
+        {} if site.is_local else {"latitude": float(latitude[0]), "longitude": float(longitude[0])}
+    )
+    return {
+        "id": change.id,
+        "flight": change.flight_id,
+        "number": change.number,
+        "kind": change.kind.value,
+        "score": change.score,
+        "first_seen": utc_text(change.first_seen_ns),
+        "last_seen": utc_text(change.last_seen_ns),
+        "views": change.views,
+        "east_m": float(change.centre_m[0]),
+        "north_m": float(change.centre_m[1]),
+        **on_earth,
+        "review": None if change.verdict is None else change.verdict.value,
+        "note": change.note,
+    }

@@ -3,30 +3,28 @@
 import json
 import math
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sorvolo.cli.options import Camera, LiveTelemetry
+from sorvolo.cli.options import AsJson, Camera, Inputs, Telemetry
 from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
     from sorvolo.missions.inspect import Inspection
 
 _COLOURS = {"info": "blue", "warning": "yellow", "problem": "red"}
-_MOST_NAMES = 4  # of files in a line
+_MAX_NAMES = 4  # of files in a line
 
 
 def inspect(
-    inputs: Annotated[
-        list[str], typer.Argument(help="Videos, folders of photos, photos, or live sources.")
-    ],
-    telemetry: LiveTelemetry = None,
+    inputs: Inputs,
+    telemetry: Telemetry = None,
     camera: Camera = "",
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON list.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Check a flight before it is mapped: what is there, what is missing, and what to do about it.
 
@@ -66,8 +64,8 @@ def _table_of(inspection: "Inspection") -> Table:
 
 def _rows(inspection: "Inspection") -> list[tuple[str, str]]:
     frames, camera, flight = inspection.frames, inspection.camera, inspection.flight
-    names = ", ".join(inspection.inputs[:_MOST_NAMES])
-    more = len(inspection.inputs) - _MOST_NAMES
+    names = ", ".join(inspection.inputs[:_MAX_NAMES])
+    more = len(inspection.inputs) - _MAX_NAMES
     size = f"{frames.width_px} x {frames.height_px} px, {frames.codec}"
     return [
         (

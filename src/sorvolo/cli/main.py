@@ -14,26 +14,22 @@ from typing import TYPE_CHECKING, Annotated, TextIO
 import typer
 
 from sorvolo import __version__
-from sorvolo.cli.archive import archive_app
+from sorvolo.cli.archive import archive_app, site_app
 from sorvolo.cli.batch import batch
 from sorvolo.cli.calibrate import calibrate
 from sorvolo.cli.compare import compare
-from sorvolo.cli.demo import demo
 from sorvolo.cli.evaluate import evaluate_app
-from sorvolo.cli.exit_codes import FAILED, STOPPED
-from sorvolo.cli.heights import heights
-from sorvolo.cli.history import history
+from sorvolo.cli.heights import heights, measure_app
+from sorvolo.cli.history import history, review
 from sorvolo.cli.inspect import inspect
 from sorvolo.cli.map import map_command
-from sorvolo.cli.measure import measure_app
 from sorvolo.cli.models import models_app
 from sorvolo.cli.plan import plan
+from sorvolo.cli.printing import FAILED, STOPPED
 from sorvolo.cli.reproduce import reproduce
-from sorvolo.cli.review import review
 from sorvolo.cli.search import search_command
 from sorvolo.cli.serve import serve, token
-from sorvolo.cli.simulate import simulate
-from sorvolo.cli.site import site_app
+from sorvolo.cli.simulate import demo, simulate
 from sorvolo.cli.stream import stream
 from sorvolo.cli.telemetry import telemetry_command
 from sorvolo.cli.train import train
@@ -78,8 +74,8 @@ app.add_typer(site_app, name="site")
 
 
 @dataclass
-class _Wishes:
-    """What the options before the command ask for, and the last line of a command that was stopped."""
+class GlobalOptions:
+    """The options before the command, and the last line of a command that was stopped."""
 
     debug: bool
     stop_words: str = "stopped; unfinished work was discarded, everything before it is unchanged"
@@ -90,19 +86,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # before NumPy is loaded: BLAS's threads only wait for each other over our small matrices
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     share_arenas()
-    wishes = _Wishes(debug=os.environ.get("SORVOLO_DEBUG", "") not in ("", "0"))
+    global_options = GlobalOptions(debug=os.environ.get("SORVOLO_DEBUG", "") not in ("", "0"))
     try:
         with _interrupts_repeated(), _warnings_in_one_line():
             app(
-                args=None if arguments is None else list(arguments), prog_name="sorvolo", obj=wishes
+                args=None if arguments is None else list(arguments),
+                prog_name="sorvolo",
+                obj=global_options,
             )
     except SystemExit as stop:
         code = stop.code if isinstance(stop.code, int) else 0 if stop.code is None else FAILED
         if code == STOPPED:
-            _print_line(wishes.stop_words)
+            _print_line(global_options.stop_words)
         return code
     except Exception as error:
-        if wishes.debug:
+        if global_options.debug:
             traceback.print_exc()
         _print_line(f"error: {_words_of(error)}")
         return FAILED

@@ -1,8 +1,8 @@
-"""`sorvolo models`: the detection models that are installed, and others by their hash."""
+"""`sorvolo models`: the detection models that are installed."""
 
 import json
+import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -11,8 +11,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sorvolo.cli.exit_codes import FAILED
-from sorvolo.errors import InputError
+from sorvolo.cli.options import AsJson
+from sorvolo.cli.printing import FAILED
+from sorvolo.errors import InputError, SettingsError
 
 if TYPE_CHECKING:
     from sorvolo.detection.contract import ModelInfo
@@ -27,12 +28,12 @@ that is not this one."""
 
 @models_app.callback()
 def models() -> None:
-    """Manage detection models: list, show, fetch by hash, verify, quantise."""
+    """List, show and verify detection models."""
 
 
 @models_app.command("list")
 def list_models(
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON list.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """List the models that --model accepts: the packaged ones and your own.
 
@@ -85,7 +86,7 @@ def _show_hidden() -> None:
 @models_app.command()
 def show(
     model: Annotated[str, typer.Argument(help="A model's name, or a .onnx file.")] = "default",
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Show a model: its classes, score thresholds and object sizes, licence, card.
 
@@ -139,31 +140,6 @@ def show(
 
 
 @models_app.command()
-def fetch(
-    source: Annotated[
-        str,
-        typer.Argument(help="Web address or file of a model, or its name in $SORVOLO_MODELS_URL."),
-    ],
-    sha256: Annotated[str, typer.Option(help="SHA-256 of the file, from whoever provides it.")],
-    name: Annotated[
-        str, typer.Option(help="Name to install it under.", show_default="the file's name")
-    ] = "",
-) -> None:
-    """Install a model if its hash matches; otherwise nothing changes.
-
-    Without a network, give the path of a file.
-
-    Example: sorvolo models fetch https://example.org/coast.onnx --sha256 9f86d081884c7d65...
-
-    Example without network: sorvolo models fetch /media/usb/coast.onnx --sha256 9f86d081884c7d65...
-    """
-    from sorvolo.missions.model_files import fetch_model
-
-    model = fetch_model(source, sha256, name=name)
-    typer.echo(f"{model.name}: installed in {model.path}; use it with --model {model.name}")
-
-
-@models_app.command()
 def verify(
     model: Annotated[
         str, typer.Argument(help="A model's name, or a .onnx file.", show_default="all installed")
@@ -178,87 +154,32 @@ def verify(
 
     Example of a file: sorvolo models verify coast.onnx --sha256 9f86d081884c7d65...
     """
-    from sorvolo.missions.model_files import parse_sha256
+    from sorvolo.detection.models import InstalledModel, find_model, installed_models
 
     if sha256 and not model:
         raise typer.BadParameter("name the model that has this hash", param_hint="--sha256")
-    chosen = _chosen(model)
-    wanted = parse_sha256(sha256) if sha256 else ""
-    all_good = _verify_each(chosen, wanted)
+    wanted = sha256.strip().lower()
+    if wanted and not re.fullmatch(r"[0-9a-f]{64}", wanted):
+        raise SettingsError(
+            f"--sha256 {sha256!r}: a SHA-256 has 64 hexadecimal digits; ask whoever gives the model"
+        )
+    chosen = installed_models()
+    if model:
+        path = find_model(model)
+        chosen = [known for known in chosen if known.path == path] or [
+            InstalledModel(path.stem, path, False)
+        ]
+    all_good = True
+    for known in chosen:
+        words, is_bad = _verdict(known, wanted)
+        all_good = all_good and not is_bad
+        typer.echo(f"{known.name}: {words}")
     if not chosen:
         typer.echo("no models are installed")
     if not model:
         _show_hidden()
     if not all_good:
         raise typer.Exit(FAILED)
-
-
-def _chosen(model: str) -> Sequence["InstalledModel"]:
-    """The model of this name or file, all that are installed without one."""
-    from sorvolo.detection.models import InstalledModel, find_model, installed_models
-
-    if not model:
-        return installed_models()
-    path = find_model(model)
-    return [each for each in installed_models() if each.path == path] or [
-        InstalledModel(path.stem, path, False)
-    ]
-
-
-def _verify_each(models: Sequence["InstalledModel"], sha256: str) -> bool:
-    """Print the verdict on each model; whether all are good."""
-    all_good = True
-    for each in models:
-        words, is_bad = _verdict(each, sha256)
-        all_good = all_good and not is_bad
-        typer.echo(f"{each.name}: {words}")
-    return all_good
-
-
-@models_app.command()
-def quantise(
-    model: Annotated[str, typer.Argument(help="A model's name, or a .onnx file.")],
-    pictures: Annotated[
-        Path, typer.Option(help="Folder of pictures like those it will see, in all kinds of light.")
-    ],
-    out: Annotated[Path, typer.Option(help="The .onnx file to write.")],
-    most: Annotated[int, typer.Option(min=8, help="Use at most this many pictures.")] = 64,
-    float_parts: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--float",
-            help="Leave a part in float: backbone, neck, proposals, backbone/_blocks.0; in a model of two "
-            "networks aerial/neck. Can be repeated.",
-        ),
-    ] = None,
-    weight_bits: Annotated[
-        int,
-        typer.Option(
-            min=7, max=8, help="7 cannot overflow on CPUs without VNNI, and rounds a little more."
-        ),
-    ] = 8,
-) -> None:
-    """Make a smaller and faster model with 8-bit integers. Measure both before you trust it.
-
-    Needs the package onnx, which the extra `training` installs.
-
-    Example: sorvolo models quantise mine.onnx --pictures flights/ --out mine-int8.onnx
-    """
-    from sorvolo.detection.models import find_model
-    from sorvolo.missions.model_files import quantise_model
-
-    made = quantise_model(
-        find_model(model),
-        pictures,
-        out,
-        most=most,
-        float_parts=float_parts or (),
-        weight_bits=7 if weight_bits == 7 else 8,
-    )
-    typer.echo(
-        f"{out}: {made.convolutions} of {made.of} convolutions in eight bits, {len(made.model) / 1e6:.1f} MB; "
-        "compare both with `sorvolo evaluate detector`"
-    )
 
 
 def _in_words(value: Any) -> str:
@@ -370,7 +291,7 @@ def _verdict(model: "InstalledModel", sha256: str) -> tuple[str, bool]:
         if state is Integrity.CHANGED:
             expected = "the given" if sha256 else "the recorded"
             return (
-                f"CHANGED: its SHA-256 is not {expected} one; do not use it, fetch it again",
+                f"CHANGED: its SHA-256 is not {expected} one; do not use it, get it again",
                 True,
             )
         read_info(model.path)

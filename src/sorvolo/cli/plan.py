@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from sorvolo.cli.options import AsJson, Camera, size_px
+from sorvolo.cli.options import Area, AsJson, Camera, DjiDrone, Model, size_px
 from sorvolo.errors import SettingsError
 
 if TYPE_CHECKING:
@@ -27,24 +27,11 @@ class Purpose(StrEnum):
     IDENTIFICATION = "identification"
 
 
-class Facing(StrEnum):
-    """Which side of a person the camera sees (Table 3.1)."""
-
-    FRONT = "front"
-    BOTTOM = "bottom"
-
-
-FocalLength = Annotated[float, typer.Option(help="Focal length, mm.", show_default="of --camera")]
-PixelSize = Annotated[float, typer.Option(help="Sensor pixel, um.", show_default="of --camera")]
 TaskOption = Annotated[
     Purpose,
     typer.Option(
         help="detection: something is there. recognition: it is a person. identification: who."
     ),
-]
-FacingOption = Annotated[
-    Facing,
-    typer.Option(help="Side of a person that the camera sees: bottom is from straight above."),
 ]
 CriticalDimension = Annotated[
     float,
@@ -58,9 +45,6 @@ FlightHeight = Annotated[
 HighestFlight = Annotated[
     float, typer.Option(help="Highest flight allowed, m: the law's in most countries.")
 ]
-PeopleDetector = Annotated[
-    str, typer.Option(help="Detector that must find people: a name, a file, or none.")
-]
 GroundSpeed = Annotated[float, typer.Option(help="Ground speed, m/s.")]
 ForwardOverlap = Annotated[float, typer.Option(help="Overlap of consecutive pictures, 0 to 0.95.")]
 SideOverlap = Annotated[float, typer.Option(help="Overlap of neighbouring strips, 0 to 0.95.")]
@@ -69,39 +53,27 @@ StripBearing = Annotated[
     typer.Option(help="Direction of the strips, deg from north.", show_default="along the area"),
 ]
 PictureSize = Annotated[str, typer.Option(help="Picture size, such as 1920x1080.")]
-AreaToCover = Annotated[
-    Path | None, typer.Option(help="Area to cover: GeoJSON, KML, KMZ, or a list of corners.")
-]
 WaypointFiles = Annotated[
     list[Path] | None,
     typer.Option(
         help="File to write: .plan (QGroundControl), .kmz (DJI), .geojson or .kml. Can be repeated."
     ),
 ]
-DjiDrone = Annotated[
-    str,
-    typer.Option(
-        help="For a .kmz: fly (DJI Fly), m300, m350, m30, m30t, m3e, m3t, m3m, m3d, m3td."
-    ),
-]
 
 
 def plan(
-    camera: Camera = "",
-    focal_mm: FocalLength = math.nan,
-    pixel_um: PixelSize = math.nan,
+    camera: Camera,
     size: PictureSize = "",
     task: TaskOption = Purpose.RECOGNITION,
-    facing: FacingOption = Facing.BOTTOM,
     critical_m: CriticalDimension = math.nan,
     height: FlightHeight = math.nan,
     max_height: HighestFlight = 120.0,
-    model: PeopleDetector = "default",
+    model: Model = "default",
     speed: GroundSpeed = 5.0,
     overlap: ForwardOverlap = 0.75,
     side_overlap: SideOverlap = 0.65,
     bearing: StripBearing = math.nan,
-    area: AreaToCover = None,
+    area: Area = None,
     out: WaypointFiles = None,
     dji_drone: DjiDrone = "fly",
     as_json: AsJson = False,
@@ -112,27 +84,27 @@ def plan(
 
     Example: sorvolo plan --camera "Mavic 2 Pro" --area field.geojson --out field.plan --out field.kmz
 
-    Example without an area: sorvolo plan --focal-mm 1.7 --pixel-um 6.97 --task detection --facing front
+    Example without an area: sorvolo plan --camera aov=78.8 --size 1920x1080 --task detection
     """
     from sorvolo.capture.areas import read_area
     from sorvolo.geometry.planning import Task
     from sorvolo.missions import plan_flight as planning
 
     settings = planning.PlanSettings(
-        Task(task.value),
-        planning.critical_dimension_m(facing.value, critical_m),
-        height,
-        max_height,
-        model,
-        planning.seen_person_m(facing.value, critical_m),
-        speed,
-        overlap,
-        side_overlap,
-        bearing,
+        task=Task(task.value),
+        height_m=height,
+        max_height_m=max_height,
+        model=model,
+        speed_m_s=speed,
+        forward_overlap=overlap,
+        side_overlap=side_overlap,
+        strip_bearing_deg=bearing,
     )
+    if not math.isnan(critical_m):  # another object than a person
+        settings = replace(settings, critical_m=critical_m, person_m=math.nan)
     if out and area is None:
         raise SettingsError("--out writes waypoints over an area: give --area FILE as well")
-    chosen = planning.camera_to_plan_with(camera, focal_mm, pixel_um, size_px(size))
+    chosen = planning.camera_to_plan_with(camera, size_px(size))
     answers, flight = planning.answer_questions(chosen, settings), None
     if area is not None:
         outline = read_area(area)

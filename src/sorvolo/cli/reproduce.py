@@ -10,8 +10,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sorvolo.cli.exit_codes import TO_CHECK
-from sorvolo.cli.options import size_px
+from sorvolo.cli.options import AsJson
+from sorvolo.cli.printing import TO_CHECK
 from sorvolo.cli.progress import ProgressReport
 from sorvolo.cli.train import Preset
 from sorvolo.errors import SettingsError
@@ -34,11 +34,6 @@ Quick = Annotated[bool, typer.Option("--quick", help="Only a try: one short path
 VideoCount = Annotated[
     int | None, typer.Option(help="At most this many videos of each environment and part.")
 ]
-PathLength = Annotated[
-    float, typer.Option(help="With --simulated: length of each path, m; 0: as in Tables 2.1, 2.3.")
-]
-PictureSize = Annotated[str, typer.Option(help="With --simulated: picture size, such as 1280x720.")]
-ViewRate = Annotated[float, typer.Option(help="Frames compared per second of video.")]
 Okutama = Annotated[
     Path | None, typer.Option(help="Okutama-Action's folder, for its column of Table 4.6.")
 ]
@@ -49,12 +44,6 @@ TrainSteps = Annotated[int, typer.Option(help="Steps of each network of Table 4.
 NetworkPreset = Annotated[
     Preset, typer.Option(help="Network of Table 4.6: fast, accurate, or the thesis's own.")
 ]
-Weights = Annotated[
-    str, typer.Option(help="Weights to start from: auto (ImageNet), none, or a file.")
-]
-Device = Annotated[str, typer.Option(help="Where the networks are trained: auto, cpu or cuda.")]
-Seed = Annotated[int, typer.Option(help="Random seed.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print reproduction.json.")]
 
 
 def reproduce(
@@ -63,16 +52,10 @@ def reproduce(
     simulated: Simulated = False,
     quick: Quick = False,
     videos: VideoCount = None,
-    length: PathLength = 24.0,
-    size: PictureSize = "1280x720",
-    views_per_second: ViewRate = 5.0,
     okutama: Okutama = None,
     npu: Npu = None,
     train_steps: TrainSteps = 400,
     preset: NetworkPreset = Preset.FAST,
-    weights: Weights = "auto",
-    device: Device = "auto",
-    seed: Seed = 1,
     as_json: AsJson = False,
 ) -> None:
     """Repeat the thesis's experiments of chapter 4: Tables 4.1, 4.3 to 4.6 and the figures, beside the printed ones.
@@ -92,13 +75,8 @@ def reproduce(
     )
     from sorvolo.lab.thesis.settings import quick as quick_sizes
 
-    settings = ReproductionSettings(
-        videos,
-        views_per_second,
-        seed=seed,
-        detector=DetectorSettings(train_steps, preset.value, weights, device),
-    )
-    simulation = SimulatedSize(length or None, size_px(size) or (1280, 720))
+    settings = ReproductionSettings(videos, detector=DetectorSettings(train_steps, preset.value))
+    simulation = SimulatedSize()
     if quick:
         settings, simulation = quick_sizes(settings, simulation)
     if simulated == (dataset is not None):

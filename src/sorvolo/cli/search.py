@@ -11,44 +11,36 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sorvolo.cli.exit_codes import TO_CHECK
-from sorvolo.cli.options import AsJson, Camera, GiveUp, LiveTelemetry, wanted_classes
-from sorvolo.cli.places_of_sites import opened_site
-from sorvolo.cli.progress import ProgressReport
-from sorvolo.cli.shown import show_notices_and_warnings, show_path
+from sorvolo.cli.options import (
+    Area,
+    AsJson,
+    Camera,
+    Classes,
+    DjiDrone,
+    GiveUp,
+    Model,
+    Refly,
+    ResultsFolder,
+    SiteOption,
+    Telemetry,
+    wanted_classes,
+)
+from sorvolo.cli.printing import TO_CHECK, show_notices_and_warnings, show_path
+from sorvolo.cli.progress import ProgressReport, show_progress
+from sorvolo.cli.sites import ended_by_signal, opened_site, run_on_site
 from sorvolo.errors import SettingsError
 
 if TYPE_CHECKING:
-    from sorvolo.cli.places_of_sites import OpenedSite
+    from sorvolo.cli.sites import OpenedSite
     from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
 
-
-Inputs = Annotated[
-    list[str],
-    typer.Argument(
-        help="The folder of a map, or s3://BUCKET/NAME; or flights (videos, photos, a live source) to map into --site."
-    ),
-]
-SiteFolder = Annotated[
-    str, typer.Option(help="Folder of the map that flights go into, or s3://BUCKET/NAME.")
-]
 Flights = Annotated[
     list[str] | None,
-    typer.Option(help="Flight to measure. Can be repeated. Without it: all of the map's."),
-]
-SearchedArea = Annotated[
-    Path | None,
-    typer.Option(
-        help="Area that was to be searched: GeoJSON, KML, KMZ. Without it: what was flown."
-    ),
+    typer.Option(help="Flight to measure. Can be repeated.", show_default="all flights of the map"),
 ]
 Segments = Annotated[
     Path | None,
     typer.Option(help="Segments as GeoJSON polygons with the property poa (probability of area)."),
-]
-DetectorName = Annotated[str, typer.Option(help="Detector: a model's name or a file.")]
-PlantedClasses = Annotated[
-    str | None, typer.Option(help="Classes, with commas.", show_default="those it usually reports")
 ]
 Plants = Annotated[
     int, typer.Option(help="People, and cars, to plant: more take longer and are surer.")
@@ -60,41 +52,30 @@ ThroughCrowns = Annotated[
         help="Share of a body that crowns leave free: 0 counts ground under trees as not seen."
     ),
 ]
-Sun = Annotated[
-    str, typer.Option(help="Azimuth,elevation of the sun, deg.", show_default="by time and place")
-]
-ReflyFiles = Annotated[
-    list[Path] | None,
-    typer.Option(
-        help="Waypoints over the holes: .plan, .kmz (DJI), .geojson or .kml. Can be repeated."
-    ),
-]
-DjiDrone = Annotated[str, typer.Option(help="For a .kmz: fly (DJI Fly), m300, m350, m30, m3e ...")]
-ResultsFolder = Annotated[
-    Path | None, typer.Option(help="Folder for results.", show_default="SITE-search")
-]
-Seed = Annotated[int, typer.Option(help="Other plants at other places.")]
 
 
 def search_command(
-    inputs: Inputs,
-    site: SiteFolder = "",
+    inputs: Annotated[
+        list[str],
+        typer.Argument(
+            help="The folder of a map, or s3://BUCKET/NAME; or flights (videos, photos, a live source) to map into --site."
+        ),
+    ],
+    site: SiteOption = "",
     flight: Flights = None,
-    area: SearchedArea = None,
+    area: Area = None,
     poa: Segments = None,
-    model: DetectorName = "default",
-    classes: PlantedClasses = None,
+    model: Model = "default",
+    classes: Classes = None,
     plants: Plants = 80,
     enough: Enough = 0.5,
     through_crowns: ThroughCrowns = 0.0,
-    sun: Sun = "",
-    refly: ReflyFiles = None,
+    refly: Refly = None,
     dji_drone: DjiDrone = "fly",
     out: ResultsFolder = None,
-    telemetry: LiveTelemetry = None,
+    telemetry: Telemetry = None,
     camera: Camera = "",
     give_up: GiveUp = 30.0,
-    seed: Seed = 1,
     as_json: AsJson = False,
 ) -> None:
     """Measure what a search would have found: "had a person lain here, would we have seen them?"
@@ -110,19 +91,15 @@ def search_command(
 
     Example: sorvolo search rtsp://192.168.1.10/live --site field --area search-area.kml --refly holes.kml
     """
+    from sorvolo.missions.search.flights import search_site
     from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
 
-    if not site and (
-        unused := [
-            name for name, value in (("--camera", camera), ("--telemetry", telemetry)) if value
-        ]
-    ):
+    if not site and (camera or telemetry):
+        option = "--camera" if camera else "--telemetry"
         raise SettingsError(
-            f"{unused[0]} is for flights that are mapped now; give --site FOLDER, or leave it out"
+            f"{option} is for flights that are mapped now; give --site FOLDER, or leave it out"
         )
-    settings = SearchSettings(
-        plants, wanted_classes(classes), model, enough, through_crowns, _sun(sun), seed
-    )
+    settings = SearchSettings(plants, wanted_classes(classes), model, enough, through_crowns)
     with opened_site(site or _map_of(inputs), writes=bool(site)) as place:
         outputs = SearchOutputs(
             out or place.results("search"),
@@ -138,7 +115,19 @@ def search_command(
                     "--flight names flights that the map has; flights that are mapped now are measured"
                 )
             _map_all(inputs, place, settings, outputs, telemetry, camera, give_up)
-        report = _measured(place.folder, settings, outputs)
+        report: Mapping[str, Any] = {}
+        measuring = search_site(place.folder, settings, outputs)
+        with ProgressReport(Console(stderr=True)) as progress, closing(measuring):
+            for update in measuring:
+                if isinstance(update, dict):
+                    report = update
+                    continue
+                progress.show(
+                    f"searching planted pictures of {update.flight},",
+                    update.done,
+                    update.total,
+                    f"{update.found} of {update.planted} found" if update.planted else "",
+                )
     if as_json:
         typer.echo(json.dumps({"folder": str(outputs.folder), **report}, indent=1))
     else:
@@ -159,85 +148,49 @@ def _map_all(
     """Map the flights; a live one is measured meanwhile."""
     from sorvolo.capture.live.addresses import is_live_address
     from sorvolo.capture.live.reconnect import LiveSettings
-    from sorvolo.cli.map import map_and_read_reports
     from sorvolo.missions.flight.settings import MapSettings
+    from sorvolo.missions.map.flights import map_flights
     from sorvolo.missions.search.prepare import check_area_of, prepare_search
     from sorvolo.missions.search.while_flying import SearchWhileFlying
 
-    flying = None
-    if live := sum(is_live_address(each) for each in inputs):
+    flying, console = None, Console(stderr=True)
+    if live := sum(is_live_address(address) for address in inputs):
         if live > 1:
             raise SettingsError(
                 f"one live flight is measured while it is on, not {live}; search them one by one"
             )
         flying = SearchWhileFlying(settings, outputs)
         area = flying.area
-        show_path(
-            "page, once the flight is on", outputs.folder / "search.html", Console(stderr=True)
-        )
+        show_path("page, once the flight is on", outputs.folder / "search.html", console)
     else:
-        area = prepare_search(
-            settings, outputs
-        ).area  # mapping takes long: what cannot be used is refused before
+        # mapping takes long: what cannot be used is refused before
+        area = prepare_search(settings, outputs).area
     check_area_of(place.folder, area)
-    map_and_read_reports(
-        list(inputs),
-        place.folder,
-        MapSettings(model=settings.model),
-        telemetry=telemetry,
-        camera=camera or None,
-        live=LiveSettings(keeps_all=True, give_up_s=give_up_s),
-        sent=place.sent,
-        search=flying,
-    )
+    with ended_by_signal(inputs) as until:
+        mapping = map_flights(
+            list(inputs),
+            place.folder,
+            MapSettings(model=settings.model),
+            telemetry=telemetry,
+            camera=camera or None,
+            live=LiveSettings(keeps_all=True, give_up_s=give_up_s),
+            until=until,
+            search=flying,
+        )
+        run_on_site(mapping, place, lambda updates: show_progress(updates, console), "mapped")
 
 
 def _map_of(inputs: Sequence[str]) -> str:
-    """The only input, where it is a map. Raises SettingsError for anything else."""
+    """Return the only input if it is a map; raise SettingsError for anything else."""
     if len(inputs) == 1 and ("://" in inputs[0] or Path(inputs[0]).is_dir()):
         return inputs[0]
-    found = (
-        f"{len(inputs)} inputs"
-        if len(inputs) > 1
-        else (f"{inputs[0]} is a file" if Path(inputs[0]).exists() else f"there is no {inputs[0]}")
-    )
+    if len(inputs) > 1:
+        found = f"{len(inputs)} inputs"
+    else:
+        found = f"{inputs[0]} is a file" if Path(inputs[0]).exists() else f"there is no {inputs[0]}"
     raise SettingsError(
         f"{found}; give the folder of a map, or flights and --site FOLDER to map them into"
     )
-
-
-def _measured(
-    site: Path, settings: "SearchSettings", outputs: "SearchOutputs"
-) -> Mapping[str, Any]:
-    """The report of a measured search, with progress on stderr."""
-    from sorvolo.missions.search.flights import search_site
-
-    report: Mapping[str, Any] = {}
-    with (
-        ProgressReport(Console(stderr=True)) as progress,
-        closing(search_site(site, settings, outputs)) as measuring,
-    ):
-        for each in measuring:
-            if isinstance(each, dict):
-                report = each
-            else:
-                words = f"{each.found} of {each.planted} found" if each.planted else ""
-                progress.show(
-                    f"searching planted pictures of {each.flight},", each.done, each.total, words
-                )
-    return report
-
-
-def _sun(text: str) -> tuple[float, float] | None:
-    if not text:
-        return None
-    try:
-        azimuth, elevation = (float(each) for each in text.split(","))
-    except ValueError as error:
-        raise SettingsError(
-            f"--sun {text!r}: give azimuth,elevation in degrees, such as 215,48"
-        ) from error
-    return azimuth, elevation
 
 
 def _show(
@@ -262,9 +215,10 @@ def _show(
     console.print(table)
     if report["segments"]:
         segments = Table("segment", "POA", "POD", "POS", "left")
-        for each in report["segments"]:
+        for segment in report["segments"]:
             segments.add_row(
-                escape(each["name"]), *(f"{each[key]:.2f}" for key in ("poa", "pod", "pos", "left"))
+                escape(segment["name"]),
+                *(f"{segment[key]:.2f}" for key in ("poa", "pod", "pos", "left")),
             )
         console.print(segments)
     show_notices_and_warnings(report, console)

@@ -15,9 +15,8 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from sorvolo.cli.options import AsJson, CotAuthority, CotCertificate
-from sorvolo.cli.places_of_sites import show_copy
-from sorvolo.cli.watch import Cot
+from sorvolo.cli.options import AsJson, Cot, CotAuthority, CotCertificate
+from sorvolo.cli.sites import show_copy
 from sorvolo.errors import InputError, SettingsError
 
 if TYPE_CHECKING:
@@ -53,46 +52,26 @@ PublicUrl = Annotated[
 BaseMap = Annotated[
     Path | None, typer.Option(help="Base map that pages show below the maps, PMTiles.")
 ]
-Missions = Annotated[int, typer.Option(help="Missions that may run at the same time.")]
-StopWithin = Annotated[
-    float, typer.Option(help="Seconds after which a mission that was stopped is killed.")
-]
 StreamFrom = Annotated[
     list[str] | None,
     typer.Option(
         help="Network whose cameras the station may connect to, such as 192.168.1.0/24. Can be repeated."
     ),
 ]
-FreeFloor = Annotated[
-    float, typer.Option(help="Disk space to leave free, GB; with less, nothing new is accepted.")
-]
-UploadMost = Annotated[float, typer.Option(help="Largest upload, GB.")]
 Opens = Annotated[bool, typer.Option("--open", help="Open the page in a browser.")]
 Webhooks = Annotated[
     list[str] | None,
     typer.Option(
-        "--webhook", help="Web address to post new objects and changes to. Can be repeated."
-    ),
-]
-WebhookSecret = Annotated[
-    str,
-    typer.Option(
-        envvar="SORVOLO_WEBHOOK_SECRET",
-        help="Signs what is posted (HMAC).",
-        show_default="not signed",
+        "--webhook",
+        help="Web address to post new objects and changes to, signed (HMAC) by SORVOLO_WEBHOOK_SECRET if set. "
+        "Can be repeated.",
     ),
 ]
 Mqtt = Annotated[
     str,
     typer.Option(
-        help="MQTT broker: mqtt://HOST:PORT/PREFIX (port, prefix optional), mqtts://USER@HOST."
-    ),
-]
-MqttPassword = Annotated[
-    Path | None,
-    typer.Option(
-        help="File with the password of the MQTT user, readable by you alone.",
-        show_default="SORVOLO_MQTT_PASSWORD",
+        help="MQTT broker: mqtt://HOST:PORT/PREFIX (port, prefix optional), mqtts://USER@HOST; password: "
+        "SORVOLO_MQTT_PASSWORD."
     ),
 ]
 MqttAuthority = Annotated[
@@ -120,17 +99,11 @@ def serve(
     insecure_lan: InsecureLan = False,
     name: Names = None,
     stream_from: StreamFrom = None,
-    free_floor: FreeFloor = 2.0,
-    upload_most: UploadMost = 64.0,
     public_url: PublicUrl = "",
     base_map: BaseMap = None,
-    most_missions: Missions = 4,
-    stop_within: StopWithin = 30.0,
     open_page: Opens = False,
     webhook: Webhooks = None,
-    webhook_secret: WebhookSecret = "",
     mqtt: Mqtt = "",
-    mqtt_password_file: MqttPassword = None,
     mqtt_ca: MqttAuthority = None,
     cot: Cot = "",
     cot_ca: CotAuthority = None,
@@ -153,13 +126,14 @@ def serve(
     from sorvolo.missions.watch.cot_sender import CotTls
     from sorvolo.station.outward import OutwardSettings
     from sorvolo.station.server import run_station
-    from sorvolo.station.settings import StationLimits, StationSettings
+    from sorvolo.station.settings import StationSettings
 
+    # secrets come from the environment: every user of the machine sees arguments
     receivers = OutwardSettings(
         tuple(webhook or ()),
-        webhook_secret,
+        os.environ.get("SORVOLO_WEBHOOK_SECRET", ""),
         mqtt,
-        _mqtt_password(mqtt_password_file) if mqtt else "",
+        os.environ.get("SORVOLO_MQTT_PASSWORD", "") if mqtt else "",
         mqtt_ca,
         cot,
         CotTls(cot_ca, cot_cert),
@@ -174,14 +148,14 @@ def serve(
             insecure_lan,
             tuple(name or ()),
             tuple(stream_from or ()),
-            free_floor,
-            upload_most,
-            public_url,
-            base_map,
-            StationLimits(most_missions=most_missions, stop_within_s=stop_within),
+            public_url=public_url,
+            base_map=base_map,
         )
         run_station(
-            settings, lambda: _announce(settings, opens=open_page), receivers, logs_json=log_json
+            settings,
+            lambda: _announce(settings, opens=open_page),
+            receivers,
+            logs_json=log_json,
         )
 
 
@@ -242,8 +216,8 @@ def token(
         else:
             _show_tokens(
                 [
-                    (each.name, each.role.lower(), each.made_at, each.expires_at)
-                    for each in list_tokens(state)
+                    (known.name, known.role.lower(), known.made_at, known.expires_at)
+                    for known in list_tokens(state)
                 ],
                 as_json=as_json,
             )
@@ -297,25 +271,6 @@ def _show_tokens(rows: list[tuple[str, str, str, str | None]], *, as_json: bool)
     for name, role, made_at, expires_at in rows:
         table.add_row(name, role, made_at[:16], (expires_at or "never")[:16])
     Console().print(table)
-
-
-def _mqtt_password(file: Path | None) -> str:
-    """The password in the file, else in SORVOLO_MQTT_PASSWORD; never an argument, which every user of the machine sees.
-
-    Raises SettingsError for a file that others may read.
-    """
-    if file is None:
-        return os.environ.get("SORVOLO_MQTT_PASSWORD", "")
-    try:
-        if file.stat().st_mode & 0o077:
-            raise SettingsError(
-                f"--mqtt-password-file {file}: others may read it; make it yours: chmod 600 {file}"
-            )
-        return file.read_text(encoding="utf-8").strip()
-    except (OSError, UnicodeDecodeError) as error:
-        raise SettingsError(
-            f"--mqtt-password-file {file}: a file with a password was needed ({error})"
-        ) from error
 
 
 def _demand_folder(root: Path) -> None:

@@ -1,32 +1,33 @@
-"""`sorvolo simulate`: flights over a synthetic site whose truth is known."""
+"""`sorvolo simulate` and `sorvolo demo`: flights over a synthetic site whose truth is known."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 
-from sorvolo.cli.options import AsJsonSteps, size_px
-from sorvolo.cli.progress import ProgressReport
+from sorvolo import __version__
+from sorvolo.cli.compare import read_results, show_results
+from sorvolo.cli.map import show_reports
+from sorvolo.cli.options import AsJson, Seed
+from sorvolo.cli.printing import read_json
+from sorvolo.cli.progress import ProgressReport, show_progress
+from sorvolo.cli.sites import opened_site, run_on_site
 from sorvolo.errors import SettingsError
 from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
     from sorvolo.lab.simulate.site import SimulationProgress
-    from sorvolo.lab.simulation.pictures import PictureSettings
     from sorvolo.lab.simulation.settings import SimulationSettings
 
-SimulationFolder = Annotated[
-    Path, typer.Argument(help="Folder to make; an earlier simulation in it is replaced.")
-]
 PresetName = Annotated[
-    str, typer.Option("--preset", help="What to simulate; --list-presets lists them.")
-]
-SeedOption = Annotated[
-    int | None, typer.Option(help="Random seed; the same seed gives the same flights.")
+    str,
+    typer.Option(
+        "--preset", help="What to simulate: demo, survey, compare ...; an unknown name lists all."
+    ),
 ]
 Ground = Annotated[
     str, typer.Option(help="Ground: dirt, countryside, urban, sand, or an orthophoto's file.")
@@ -37,30 +38,18 @@ GroundResolution = Annotated[
 ReliefHeight = Annotated[
     float | None,
     typer.Option(
-        "--relief", help="Hills, from the lowest to the highest ground, m. Without it: level."
+        "--relief", help="Hills, from the lowest to the highest ground, m.", show_default="level"
     ),
 ]
 FlightCount = Annotated[
     int | None, typer.Option(help="Number of flights; between them things change.")
 ]
-GpsNoise = Annotated[float | None, typer.Option(help="GPS noise of each fix and axis, m rms.")]
-GpsRate = Annotated[
-    float | None, typer.Option(help="GPS fixes a second.", show_default="the format's own")
-]
-ClockOffset = Annotated[float | None, typer.Option(help="Telemetry clock minus video clock, s.")]
 TelemetryFormat = Annotated[
     str, typer.Option(help="Telemetry format: csv, srt, nmea, gpx, all or none.")
 ]
-FaultCount = Annotated[
-    int, typer.Option(help="Number of gaps, jumps, 0/0 fixes and bad checksums each.")
-]
 FlightHeight = Annotated[float | None, typer.Option(help="Flight height above ground, m.")]
-GroundSpeed = Annotated[float | None, typer.Option(help="Ground speed, m/s.")]
 StripLength = Annotated[float | None, typer.Option(help="Length of a strip, m.")]
 StripCount = Annotated[int | None, typer.Option(help="Number of strips.")]
-Tilt = Annotated[float | None, typer.Option(help="Roll and pitch of the drone, deg rms.")]
-FrameRate = Annotated[float | None, typer.Option(help="Video frames a second.")]
-PictureSize = Annotated[str, typer.Option(help="Picture size, such as 1280x720.")]
 AsPhotos = Annotated[
     bool, typer.Option("--photos", help="Write geo-tagged JPEG photos instead of a video.")
 ]
@@ -75,156 +64,94 @@ ThermalShare = Annotated[
 ]
 
 
-def _print_presets(wanted: bool) -> None:
-    from sorvolo.lab.simulation.presets import preset_names
-
-    if wanted:
-        typer.echo("\n".join(preset_names()))
-        raise typer.Exit
-
-
-ListPresets = Annotated[
-    bool,
-    typer.Option(
-        "--list-presets", callback=_print_presets, is_eager=True, help="List the presets and stop."
-    ),
-]
-
-
 def simulate(
-    folder: SimulationFolder,
-    preset_name: PresetName = "demo",
-    seed: SeedOption = None,
+    folder: Annotated[
+        Path, typer.Argument(help="Folder to make; an earlier simulation in it is replaced.")
+    ],
+    preset: PresetName = "",
+    seed: Seed = None,
     ground: Ground = "",
     ground_gsd: GroundResolution = None,
     relief: ReliefHeight = None,
     flights: FlightCount = None,
-    gps_noise: GpsNoise = None,
-    gps_rate: GpsRate = None,
-    clock_offset: ClockOffset = None,
     telemetry: TelemetryFormat = "",
-    faults: FaultCount = 0,
     height: FlightHeight = None,
-    speed: GroundSpeed = None,
     length: StripLength = None,
     strips: StripCount = None,
-    tilt: Tilt = None,
-    fps: FrameRate = None,
-    size: PictureSize = "",
     photos: AsPhotos = False,
     pictures: PictureCount = None,
     thermal: ThermalShare = 0.0,
-    list_presets: ListPresets = False,
-    as_json: AsJsonSteps = False,
+    as_json: AsJson = False,
 ) -> None:
     """Simulate flights: video or photos, telemetry, and the truth about every frame and object.
 
     Example: sorvolo simulate demo-site --preset demo
 
-    Example: sorvolo simulate town --preset survey --ground urban --photos --gps-noise 0.5 --telemetry all
+    Example: sorvolo simulate town --preset survey --ground urban --photos --telemetry all
 
     Example: sorvolo simulate labelled --pictures 500 --thermal 0.3 --seed 7
     """
-    from sorvolo.lab.simulation.presets import preset
+    from sorvolo.lab.simulation.ground import GroundKind
+    from sorvolo.lab.simulation.presets import preset as preset_named
 
-    ground_file = _ground_file(ground)
-    ground_kind = ground if ground_file is None else "orthophoto"
+    ground_file = None if not ground or ground in list(GroundKind) else Path(ground)
+    if ground_file is not None and not ground_file.exists():
+        raise SettingsError(f"--ground {ground}: no such file, and none of {', '.join(GroundKind)}")
+    kind = ground if ground_file is None else "orthophoto"
     if pictures is None and thermal:
         raise SettingsError(
             "--thermal is for single pictures: give their number with --pictures as well"
         )
-    if pictures is not None:
-        _refuse_options_of_flights(
-            {
-                "--preset": preset_name != "demo",
-                "--relief": relief,
-                "--flights": flights,
-                "--gps-noise": gps_noise,
-                "--gps-rate": gps_rate,
-                "--clock-offset": clock_offset,
-                "--telemetry": telemetry,
-                "--speed": speed,
-                "--faults": faults or None,
-                "--length": length,
-                "--strips": strips,
-                "--tilt": tilt,
-                "--fps": fps,
-                "--size": size,
-                "--photos": photos,
-            }
+    if pictures is None:
+        settings = _changed(
+            preset_named(preset or "demo"),
+            {"seed": seed, "flights": flights},
+            scene={"ground": kind or None, "relief_m": relief},
+            path={"height_m": height, "length_m": length, "strips": strips},
+            output={"telemetry": telemetry or None, "photos": photos or None},
         )
-        asked = _picture_settings(pictures, seed, ground_kind, thermal, height)
-        _simulate_pictures(folder, asked, ground_file, ground_gsd, as_json)
+        _simulate_flights(folder, settings, ground_file, ground_gsd, as_json=as_json)
         return
-    settings = _with_options(
-        preset(preset_name),
-        top={"seed": seed, "flights": flights},
-        scene={"ground": ground_kind or None, "relief_m": relief},
-        path={"height_m": height, "speed_m_s": speed, "length_m": length, "strips": strips},
-        motion={"tilt_rms_deg": tilt},
-        imaging={"fps": fps, **_size(size)},
-        sensor=_sensor_options(gps_noise, gps_rate, clock_offset, faults),
-        output={"telemetry": telemetry or None, "photos": photos or None},
-    )
-    _simulate_flights(folder, settings, ground_file, ground_gsd, as_json)
-
-
-def _ground_file(ground: str) -> Path | None:
-    """The orthophoto's file; None where `ground` names a kind of ground, or nothing."""
-    from sorvolo.lab.simulation.ground import GroundKind
-
-    if not ground or ground in list(GroundKind):
-        return None
-    if not Path(ground).exists():
-        raise SettingsError(f"--ground {ground}: no such file, and none of {', '.join(GroundKind)}")
-    return Path(ground)
-
-
-def _refuse_options_of_flights(options: Mapping[str, object]) -> None:
-    """Raises SettingsError where one was given: None, False and no text are options that were not given."""
-    given = [
-        name
-        for name, value in options.items()
-        if value is not None and value is not False and value != ""
-    ]
-    if given:
+    of_flights = {
+        "--preset": preset,
+        "--relief": relief,
+        "--flights": flights,
+        "--telemetry": telemetry,
+        "--length": length,
+        "--strips": strips,
+        "--photos": photos,
+    }
+    if given := [name for name, value in of_flights.items() if value not in (None, False, "")]:
         raise SettingsError(
             f"--pictures makes single pictures, not flights: leave out {', '.join(given)}"
         )
-
-
-def _picture_settings(
-    pictures: int, seed: int | None, ground_kind: str, thermal: float, height_m: float | None
-) -> "PictureSettings":
+    from sorvolo.lab.simulate.pictures import simulate_pictures
     from sorvolo.lab.simulation.pictures import PictureSettings
 
-    settings = PictureSettings(pictures, 1 if seed is None else seed, ground_kind, thermal)
-    return settings if height_m is None else replace(settings, height_m=(height_m, height_m))
-
-
-def _simulate_pictures(
-    folder: Path,
-    settings: "PictureSettings",
-    ground_file: Path | None,
-    ground_gsd: float | None,
-    as_json: bool,
-) -> None:
-    from sorvolo.lab.simulate.pictures import simulate_pictures
-
+    asked = PictureSettings(pictures, 1 if seed is None else seed, kind, thermal)
+    if height is not None:
+        asked = replace(asked, height_m=(height, height))
     last = None
-    console = Console()
     with ProgressReport(Console(stderr=True), stays=True) as progress:
-        for last in simulate_pictures(folder, settings, ground_file, ground_gsd):
-            progress.show("simulating pictures", last.pictures_done, settings.pictures)
+        for last in simulate_pictures(folder, asked, ground_file, ground_gsd):
+            progress.show("simulating pictures", last.pictures_done, asked.pictures)
     if last is not None and as_json:
         typer.echo(json.dumps(asdict(last)))
     elif last is not None:
-        pictures, boxes = counted(last.pictures_done, "picture"), counted(last.boxes, "box")
-        console.print(
-            f"{pictures} with {boxes} in {last.seconds:.0f} s: {folder}",
-            highlight=False,
-            soft_wrap=True,
+        words = f"{counted(last.pictures_done, 'picture')} with {counted(last.boxes, 'box')}"
+        Console().print(
+            f"{words} in {last.seconds:.0f} s: {folder}", highlight=False, soft_wrap=True
         )
+
+
+def _changed(
+    settings: "SimulationSettings", top: dict[str, Any], **parts: dict[str, Any]
+) -> "SimulationSettings":
+    """Return the settings with every option that was given; None was not."""
+    for name, options in parts.items():
+        given = {key: value for key, value in options.items() if value is not None}
+        settings = replace(settings, **{name: replace(getattr(settings, name), **given)})
+    return replace(settings, **{key: value for key, value in top.items() if value is not None})
 
 
 def _simulate_flights(
@@ -232,59 +159,123 @@ def _simulate_flights(
     settings: "SimulationSettings",
     ground_file: Path | None,
     ground_gsd: float | None,
+    *,
     as_json: bool,
 ) -> None:
     from sorvolo.lab.simulate.site import simulate_site
 
     steps = simulate_site(folder, settings, ground_file, ground_gsd)
-    if not as_json:
-        _show(steps, folder)
+    if as_json:
+        for step in steps:
+            if step.stage != "frames" or step.frames_done == step.frames_total:
+                typer.echo(json.dumps(asdict(step)))
         return
-    for step in steps:
-        if step.stage != "frames" or step.frames_done == step.frames_total:
-            typer.echo(json.dumps(asdict(step)))
+    console = Console()
+    last = _show_progress(steps, stays=True)
+    if last is not None:
+        console.print(
+            f"{counted(last.frames_done, 'frame')} in {last.seconds:.0f} s: {folder}\n"
+            f"the truth is in {folder / 'truth'}; the camera is in {folder / 'camera.xml'}",
+            highlight=False,
+            soft_wrap=True,
+        )
 
 
-def _sensor_options(
-    gps_noise_m: float | None, gps_rate_hz: float | None, clock_offset_s: float | None, faults: int
-) -> dict[str, object]:
-    """The fields of SensorSettings; None for an option that was not given."""
-    kinds = ("gaps", "jumps", "zero_fixes", "bad_checksums") if faults else ()
-    return {
-        "noise_m": None if gps_noise_m is None else (gps_noise_m,) * 3,
-        "rate_hz": gps_rate_hz,
-        "clock_offset_s": clock_offset_s,
-        **dict.fromkeys(kinds, faults),
-    }
-
-
-def _with_options(
-    settings: "SimulationSettings", top: dict[str, object], **parts: dict[str, object]
-) -> "SimulationSettings":
-    """The settings with every option that was given; None was not."""
-    for name, options in parts.items():
-        given = {key: value for key, value in options.items() if value is not None}
-        settings = replace(settings, **{name: replace(getattr(settings, name), **given)})
-    return replace(settings, **{key: value for key, value in top.items() if value is not None})  # type: ignore[arg-type]
-
-
-def _size(text: str) -> dict[str, object]:
-    size = size_px(text)
-    return {} if size is None else {"width_px": size[0], "height_px": size[1]}
-
-
-def _show(steps: Iterator["SimulationProgress"], folder: Path) -> None:
-    console, last = Console(), None
-    with ProgressReport(Console(stderr=True), stays=True) as progress:
+def _show_progress(
+    steps: "Iterator[SimulationProgress]", *, stays: bool = False
+) -> "SimulationProgress | None":
+    """Take all steps, showing progress; return the last."""
+    last = None
+    with ProgressReport(Console(stderr=True), stays=stays) as progress:
+        progress.show("simulating the site")
         for last in steps:
             if last.stage == "frames":
                 progress.show(
                     f"simulating {last.flight}, frame", last.frames_done, last.frames_total
                 )
-    if last is not None:
-        made = counted(last.frames_done, "frame")
-        console.print(f"{made} in {last.seconds:.0f} s: {folder}", highlight=False, soft_wrap=True)
-        truth, camera = folder / "truth", folder / "camera.xml"
+    return last
+
+
+def demo(
+    folder: Annotated[
+        Path, typer.Argument(help="Folder to make; an earlier demo in it is replaced.")
+    ] = Path("demo-site"),
+) -> None:
+    """Try everything: simulate two flights, map the first, compare the second, and check both against the truth.
+
+    Example: sorvolo demo
+    """
+    from sorvolo.lab.evaluation.changes import evaluate_changes
+    from sorvolo.lab.evaluation.mosaic import evaluate_mosaic
+    from sorvolo.lab.simulate.site import simulate_site
+    from sorvolo.lab.simulation.presets import preset
+    from sorvolo.missions.compare.flights import compare_flights
+    from sorvolo.missions.map.flights import map_flights
+
+    simulation, site = folder / "simulation", folder / "site"
+    console, errors = Console(), Console(stderr=True)
+    settings, camera = preset("demo"), str(simulation / "camera.xml")
+    if _is_simulated(simulation, settings):
         console.print(
-            f"the truth is in {truth}; the camera is in {camera}", highlight=False, soft_wrap=True
+            f"using the flights of an earlier demo: {simulation}", soft_wrap=True, highlight=False
         )
+    else:
+        console.print(f"simulating two flights: {simulation}", soft_wrap=True, highlight=False)
+        _show_progress(simulate_site(simulation, settings))
+    console.print("mapping the first flight")
+    with opened_site(str(site), writes=True) as place:
+        mapping = map_flights([simulation / "flight1" / "flight1.mp4"], site, camera=camera)
+        folders = run_on_site(
+            mapping, place, lambda updates: show_progress(updates, errors), "mapped"
+        )
+        show_reports([read_json(made / "report.json") for made in folders], site, console)
+        for truth in evaluate_mosaic(site, truth=simulation).truth[:1]:
+            corners = truth.corners
+            if not corners.absolute.count:  # no frame was matched
+                continue
+            console.print(
+                f"Checked against the truth: the frames lie {corners.absolute.rms_m:.2f} m off (rms). GPS noise alone "
+                f"would cost {corners.floor.rms_m:.2f} m; relative to each other they lie {corners.shape.rms_m:.3f} m off."
+            )
+        console.print("comparing the second flight with the map")
+        comparing = compare_flights([simulation / "flight2" / "flight2.mp4"], site, camera=camera)
+        show_results(read_results(comparing, place), site, console)
+    for measured in evaluate_changes(site, simulation):
+        if measured.events is not None:
+            events = measured.events
+            console.print(
+                f"Checked against the truth: {events.found} of {events.must_find} changes found, "
+                f"{counted(events.false, 'false change')} reported."
+            )
+    for line in _next_steps(folder, site):
+        console.print(line, soft_wrap=True, highlight=False, markup=False)
+
+
+def _next_steps(folder: Path, site: Path) -> list[str]:
+    """What to do with the demo's site; the last lines state where a browser shows it."""
+    from sorvolo.station.settings import StationSettings
+
+    return [
+        "Next, review the changes, or map a flight of your own:",
+        f"  sorvolo review {site}",
+        f"  sorvolo history {site}",
+        "  sorvolo map MY_VIDEO.MP4 --site my-site",
+        f"Or see both flights in a browser, at {StationSettings(folder).address}:",
+        f"  sorvolo serve {folder} --open",
+    ]
+
+
+def _is_simulated(folder: Path, settings: "SimulationSettings") -> bool:
+    """Whether an earlier run of this version left the very flights that are wanted."""
+    from sorvolo.lab.simulate.simulation_folder import MARK
+    from sorvolo.store.exports.plain import plain_json
+
+    try:
+        mark = json.loads((folder / MARK).read_text(encoding="utf-8"))
+        same = (
+            mark["settings"] == plain_json(asdict(settings))
+            and mark["versions"]["sorvolo"] == __version__
+        )
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+    return bool(same) and (folder / "flight1" / "flight1.mp4").is_file()

@@ -3,40 +3,28 @@
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.markup import escape
 
-from sorvolo.cli.options import AsJson, Camera, CotAuthority, CotCertificate
-from sorvolo.cli.places_of_sites import OpenedSite, opened_site
-from sorvolo.cli.shown import show_path
+from sorvolo.cli.options import (
+    AsJson,
+    Camera,
+    Cot,
+    CotAuthority,
+    CotCertificate,
+    Flight,
+    ResultsFolder,
+    SiteOption,
+    Telemetry,
+)
+from sorvolo.cli.printing import show_path
+from sorvolo.cli.progress import show_progress
+from sorvolo.cli.sites import OpenedSite, opened_site, run_on_site
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.survey.wording import counted
-
-if TYPE_CHECKING:
-    from sorvolo.capture.source import Source
-    from sorvolo.missions.telemetry.doctor import CotReceiver
-    from sorvolo.missions.watch.cot_sender import CotTls
-
-_Site = Annotated[
-    str,
-    typer.Option(
-        help="Folder of the map that the flight is in or is mapped into first, or s3://BUCKET/NAME."
-    ),
-]
-_Flight = Annotated[str, typer.Option(help="Flight of the map.", show_default="its only one")]
-_Log = Annotated[str, typer.Option(help="The flight's log if it is not beside the video.")]
-_Cot = Annotated[
-    str,
-    typer.Option(
-        help="Send the track to a TAK server or team: udp://host:port, tcp://host:port, tls://host:port."
-    ),
-]
-_Out = Annotated[
-    Path | None, typer.Option(help="Folder for results.", show_default="SITE-telemetry/FLIGHT")
-]
 
 
 def telemetry_command(
@@ -46,12 +34,12 @@ def telemetry_command(
             help="A flight (video, folder of photos), with --site; or a map's folder, or s3://BUCKET/NAME."
         ),
     ],
-    site: _Site = "",
-    flight: _Flight = "",
-    telemetry: _Log = "",
+    site: SiteOption = "",
+    flight: Flight = "",
+    telemetry: Telemetry = None,
     camera: Camera = "",
-    out: _Out = None,
-    cot: _Cot = "",
+    out: ResultsFolder = None,
+    cot: Cot = "",
     cot_ca: CotAuthority = None,
     cot_cert: CotCertificate = None,
     as_json: AsJson = False,
@@ -65,17 +53,26 @@ def telemetry_command(
 
     Example: sorvolo telemetry field --flight DJI_0042 --cot udp://239.2.3.1:6969
     """
-    from sorvolo.missions.telemetry.doctor import chosen_flight, correct_telemetry
-    from sorvolo.missions.watch.cot_sender import CotTls
+    from sorvolo.missions.telemetry.doctor import (
+        CotReceiver,
+        chosen_flight,
+        correct_telemetry,
+    )
+    from sorvolo.missions.watch.cot_sender import CotTls, check_host, cot_place
 
     _check_source(source, site, has_own_options=bool(telemetry or camera))
     tls = CotTls(cot_ca, cot_cert)
     if tls != CotTls() and not cot.startswith("tls://"):
         raise SettingsError("--cot-ca and --cot-cert are for --cot tls://host:port")
-    receiver = _receiver(cot, tls) if cot else None
+    receiver = None
+    if cot:  # checked before minutes of work
+        receiver = CotReceiver(cot_place(cot), tls)
+        check_host(receiver.place)
+        tls.context()
     with opened_site(site or source, writes=bool(site)) as place:
-        of_source = _map_if_new(Path(source), place, flight, telemetry, camera) if site else flight
-        chosen = chosen_flight(place.folder, of_source)
+        if site:
+            flight = _map_if_new(Path(source), place, flight, telemetry or None, camera or None)
+        chosen = chosen_flight(place.folder, flight)
         target = out or place.results("telemetry") / chosen
         report = correct_telemetry(
             place.folder,
@@ -86,10 +83,6 @@ def telemetry_command(
             camera=camera or None,
             cot=receiver,
         )
-    _print(report, target, as_json=as_json)
-
-
-def _print(report: Mapping[str, Any], target: Path, *, as_json: bool) -> None:
     if as_json:
         typer.echo(json.dumps({"folder": str(target), **report}, indent=1))
     else:
@@ -97,8 +90,10 @@ def _print(report: Mapping[str, Any], target: Path, *, as_json: bool) -> None:
 
 
 def _check_source(source: str, site: str, *, has_own_options: bool) -> None:
-    """Raise InputError or SettingsError unless it is a flight with --site, or a map without; `has_own_options`: given
-    with it was what belongs to a flight."""
+    """Raise InputError or SettingsError unless `source` is a flight with --site, or a map without.
+
+    `has_own_options` is whether --telemetry or --camera was given.
+    """
     from sorvolo.store.site.catalogue_place import is_site
 
     ways = (
@@ -128,17 +123,6 @@ def _check_source(source: str, site: str, *, has_own_options: bool) -> None:
         )
 
 
-def _receiver(address: str, tls: "CotTls") -> "CotReceiver":
-    """Who gets the track; checked before minutes of work."""
-    from sorvolo.missions.telemetry.doctor import CotReceiver
-    from sorvolo.missions.watch.cot_sender import check_host, cot_place
-
-    receiver = CotReceiver(cot_place(address), tls)
-    check_host(receiver.place)
-    receiver.tls.context()
-    return receiver
-
-
 def _show(report: Mapping[str, Any], target: Path, console: Console) -> None:
     words = f"Telemetry of {escape(report['flight'])}, {counted(report['frames'], 'frame')}"
     console.print(words, style="bold", highlight=False)
@@ -155,15 +139,17 @@ def _show(report: Mapping[str, Any], target: Path, console: Console) -> None:
         show_path("kept" if report["diagnosed_before"] else "written", target / name, console)
 
 
-def _map_if_new(source: Path, place: OpenedSite, wanted: str, telemetry: str, camera: str) -> str:
-    """Map the flight where the site does not have it yet, under any name; its name there, `wanted` if that is given.
+def _map_if_new(
+    source: Path, place: OpenedSite, wanted: str, telemetry: str | None, camera: str | None
+) -> str:
+    """Map the flight if the site has it under no name; return its name there, or `wanted` if that is given.
 
     Raises InputError where the site has no flight of the wanted name, and for a new flight without fixes.
     """
     from sorvolo.capture.source import opened_sources
-    from sorvolo.cli.map import map_and_read_reports
     from sorvolo.missions.flight.settings import MapSettings
     from sorvolo.missions.flight.setup import known_flights
+    from sorvolo.missions.map.flights import map_flights
     from sorvolo.missions.telemetry.doctor import mapped_flights
 
     mapped = mapped_flights(place.folder)
@@ -174,31 +160,22 @@ def _map_if_new(source: Path, place: OpenedSite, wanted: str, telemetry: str, ca
                 f"and {source} is mapped into it"
             )
         return wanted
-    with opened_sources(
-        [source], telemetry or None, camera or None, known_flights(place.folder)
-    ) as sources:
-        name = next(
-            (each for each, mark in mapped.items() if mark == sources[0].fingerprint),
-            sources[0].name,
-        )
-        if name not in mapped:
-            _check_fixes(sources[0], source)
-    if name not in mapped:
-        map_and_read_reports(
-            [source],
-            place.folder,
-            MapSettings(model="none"),
-            telemetry=telemetry or None,
-            camera=camera or None,
-            sent=place.sent,
-        )
+    known = known_flights(place.folder)
+    with opened_sources([source], telemetry, camera, known) as (flight, *_):
+        for name, fingerprint in mapped.items():
+            if fingerprint == flight.fingerprint:
+                return name
+        if flight.name in mapped:
+            return flight.name
+        if not flight.telemetry.has_fixes:
+            raise InputError(
+                f"{source}: no telemetry with positions was found in it or beside it, and there is nothing to correct "
+                "without: give its log with --telemetry FILE"
+            )
+        name = flight.name
+    mapping = map_flights(
+        [source], place.folder, MapSettings(model="none"), telemetry=telemetry, camera=camera
+    )
+    console = Console(stderr=True)
+    run_on_site(mapping, place, lambda updates: show_progress(updates, console), "mapped")
     return name
-
-
-def _check_fixes(flight: "Source", source: Path) -> None:
-    """Raise InputError for a flight that would be mapped in vain: without fixes there is nothing to correct."""
-    if not flight.telemetry.has_fixes:
-        raise InputError(
-            f"{source}: no telemetry with positions was found in it or beside it, and there is nothing to correct "
-            "without: give its log with --telemetry FILE"
-        )

@@ -96,7 +96,7 @@ def installed_model(name: str) -> InstalledModel:
             return each
     raise InputError(
         f"there is no model {name!r}; installed are: {_searching()} (own ones lie in {models_folder()}); give one of "
-        "them, a .onnx file, or fetch one with `sorvolo models fetch`"
+        "them or a .onnx file"
     )
 
 

@@ -31,14 +31,14 @@ class Looked:
     height_px: int
 
 
-def parse_board(text: str, square_mm: float) -> Board:
+def parse_board(text: str) -> Board:
     """The board of "9x6", counted in inner corners. Raises SettingsError for anything else."""
     columns, _, rows = text.lower().partition("x")
     if not (columns.isdecimal() and rows.isdecimal()):
         raise SettingsError(
             f"--board {text!r}: give the inner corners a row and a column, such as 9x6"
         )
-    return Board(int(columns), int(rows), square_mm)
+    return Board(int(columns), int(rows))
 
 
 def find_views(inputs: Sequence[Path], board: Board) -> Iterator[Looked]:

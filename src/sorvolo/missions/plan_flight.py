@@ -15,12 +15,10 @@ from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.planning import (
     BOTTOM_CRITICAL_M,
-    FRONT_CRITICAL_M,
     LEGAL_CEILING_M,
     FlightPlan,
     StripSettings,
     Task,
-    focal_px_from_mm,
     footprint_size_m,
     maximum_height_m,
     minimum_frame_rate,
@@ -54,8 +52,7 @@ class ReflySettings:
 class PlanSettings:
     """What the flight is for. A NaN `height_m` means: as high as task, detector and `max_height_m` allow.
 
-    `critical_m` is the object's smallest decisive dimension as the camera sees it; for people Table 3.1 takes
-    `FRONT_CRITICAL_M` for a camera that faces them (or people lying) and `BOTTOM_CRITICAL_M` from above.
+    `critical_m` is the object's smallest decisive dimension as the camera sees it: a person's from above by default.
     `person_m` is the longest side of a person that the camera sees, which the detector `model` must make out; NaN, or
     the model "none", where no detector has to. Raises SettingsError for a height above `max_height_m`.
     """
@@ -113,33 +110,16 @@ class FlightAnswers:
     strip_spacing_m: float
 
 
-def camera_to_plan_with(
-    option: str, focal_mm: float, pixel_um: float, size_px: tuple[int, int] | None
-) -> CameraModel:
-    """The camera from `--camera`, or from a focal length (mm) and pixel size (um); neither is a clear error.
+def camera_to_plan_with(option: str, size_px: tuple[int, int] | None = None) -> CameraModel:
+    """Return the camera that `--camera` names.
 
     Without `size_px` a preset plans with its full photo, anything else with `DEFAULT_SIZE_PX`.
     """
-    preset = next(iter(find_presets(option)), None) if option else None
+    preset = next(iter(find_presets(option)), None)
     width_px, height_px = size_px or (
         (preset.width_px, preset.height_px) if preset else DEFAULT_SIZE_PX
     )
-    if option and not (math.isnan(focal_mm) and math.isnan(pixel_um)):
-        raise SettingsError(
-            "--camera and --focal-mm/--pixel-um both describe the camera; give one of them"
-        )
-    if option:
-        return camera_from_option(option, width_px, height_px)
-    if math.isnan(focal_mm) or math.isnan(pixel_um):
-        raise SettingsError(
-            "which camera? give --camera (a file, a preset such as 'Mavic 2 Pro', or aov=78.8), or both "
-            "--focal-mm and --pixel-um"
-        )
-    focal_px = focal_px_from_mm(focal_mm, pixel_um)
-    camera = Camera(
-        width_px, height_px, focal_px, focal_px, (width_px - 1) / 2, (height_px - 1) / 2
-    )
-    return CameraModel(camera, f"{focal_mm:g} mm lens, {pixel_um:g} um pixels", 0.01)
+    return camera_from_option(option, width_px, height_px)
 
 
 def answer_questions(model: CameraModel, settings: PlanSettings) -> FlightAnswers:
@@ -216,20 +196,6 @@ def fly_again(
     for path in files:
         write_plan(path, plan, area, dji_drone=dji_drone)
     return plan
-
-
-def critical_dimension_m(facing: str, critical_m: float) -> float:
-    """The critical dimension as given, else a person's for a camera `facing` front or bottom (Table 3.1)."""
-    if not math.isnan(critical_m):
-        return critical_m
-    return {"front": FRONT_CRITICAL_M, "bottom": BOTTOM_CRITICAL_M}[facing]
-
-
-def seen_person_m(facing: str, critical_m: float) -> float:
-    """The longest side of a person that a camera `facing` front or bottom sees; NaN where `critical_m` is another
-    object's."""
-    length_m, _, standing_m = TYPICAL_SIZE_M["person"]
-    return {"front": standing_m, "bottom": length_m}[facing] if math.isnan(critical_m) else math.nan
 
 
 def _detector_bound(focal_px: float, settings: PlanSettings) -> dict[str, float]:

@@ -58,8 +58,7 @@ def mqtt_place(url: str, password: str = "") -> MqttPlace:
 def _check_password(in_address: str | None, password: str, user: str) -> None:
     if in_address is not None:
         raise SettingsError(
-            "--mqtt: everybody on this machine could read a password in the address; give it in SORVOLO_MQTT_PASSWORD, "
-            "or in a file of your own with --mqtt-password-file"
+            "--mqtt: everybody on this machine could read a password in the address; give it in SORVOLO_MQTT_PASSWORD"
         )
     if password and not user:
         raise SettingsError(f"--mqtt: a password without a user's name; {_WANTED}")

@@ -60,8 +60,7 @@ class StationSettings:
     `host` and `port` are where it listens; `tls_cert` and `tls_key` PEM files. `names` are further host names under
     which browsers reach it, `public_url` the address of a TLS proxy on this machine that passes requests on to it.
     `stream_ranges` are networks (CIDR) that a stream may be called from although they are private. `free_floor_gb` is
-    the disk space below which nothing new is taken in, `upload_most_gb` the largest upload. `base_map` is a PMTiles
-    file that pages show below the maps.
+    the disk space below which nothing new is taken in. `base_map` is a PMTiles file that pages show below the maps.
     """
 
     root: Path
@@ -73,7 +72,6 @@ class StationSettings:
     names: tuple[str, ...] = ()
     stream_ranges: tuple[str, ...] = ()
     free_floor_gb: float = 2.0  # of the disk, which stay free
-    upload_most_gb: float = 64.0  # of one upload
     public_url: str = ""
     base_map: Path | None = None
     limits: StationLimits = StationLimits()
@@ -84,8 +82,8 @@ class StationSettings:
         )  # missions run in folders of their own
         if not 0 < self.port < 65536:
             raise SettingsError(f"--port {self.port}: a port from 1 to 65535 was needed")
-        if not (self.free_floor_gb >= 0 and self.upload_most_gb > 0):
-            raise SettingsError("--free-floor and --upload-most are gigabytes: not below 0")
+        if not self.free_floor_gb >= 0:
+            raise SettingsError(f"free_floor_gb is not below 0, got {self.free_floor_gb}")
         _check_certificate(self.tls_cert, self.tls_key)
         for text in self.stream_ranges:
             _check_range(text)

@@ -10,7 +10,7 @@ from sorvolo.station.problems import Problem
 from sorvolo.station.runs import Runs
 from sorvolo.station.security import needs
 from sorvolo.station.tokens import Holder, Role
-from sorvolo.station.uploads import Upload, Uploads
+from sorvolo.station.uploads import MAX_UPLOAD_BYTES, Upload, Uploads
 
 _VERSION = "1.0.0"
 _KIND = "application/offset+octet-stream"
@@ -31,7 +31,7 @@ def upload_routes(uploads: Uploads, runs: Runs) -> APIRouter:
             {
                 "Tus-Version": _VERSION,
                 "Tus-Extension": "creation,termination",
-                "Tus-Max-Size": str(uploads.most_bytes),
+                "Tus-Max-Size": str(MAX_UPLOAD_BYTES),
             },
         )
 

@@ -42,6 +42,9 @@ TEXT_ENDINGS = (
 )
 """Files that are taken as telemetry, cameras and areas."""
 
+MAX_UPLOAD_BYTES = 64_000_000_000
+"""The largest upload: an hour of 4K video, or some 5,000 photos."""
+
 _ARCHIVE_ENDINGS = (".zip",)
 _MOST_TEXT_BYTES = 256_000_000  # of telemetry: half of what a reader takes
 _PART, _INFO, _FILES = "part", "info.json", "files"
@@ -95,11 +98,6 @@ class Uploads:
             ):
                 self._begin_check(each)
 
-    @property
-    def most_bytes(self) -> int:
-        """The largest upload."""
-        return int(self._settings.upload_most_gb * 1e9)
-
     def all(self) -> list[Upload]:
         """Every upload, oldest first."""
         found = []
@@ -118,9 +116,12 @@ class Uploads:
         """Begin an upload. Raises Problem: 400, 413 too large, 415 of no known kind, 507 without room."""
         name = _checked_name(_metadata(metadata).get("filename", ""))
         made = Upload(secrets.token_hex(12), name, length, utc_now(), who)
-        if not 0 < length <= self.most_bytes or (made.kind == "text" and length > _MOST_TEXT_BYTES):
+        if not 0 < length <= MAX_UPLOAD_BYTES or (
+            made.kind == "text" and length > _MOST_TEXT_BYTES
+        ):
             raise Problem(
-                413, f"{length} bytes: 1 to {self.most_bytes} are taken, of text {_MOST_TEXT_BYTES}"
+                413,
+                f"{length} bytes: 1 to {MAX_UPLOAD_BYTES} are taken, of text {_MOST_TEXT_BYTES}",
             )
         self.demand_room(length)
         most = self._settings.limits.most_uploads
@@ -261,7 +262,7 @@ class Uploads:
         error, facts = checked_apart(
             part if part.exists() else target,
             target,
-            self.most_bytes,
+            MAX_UPLOAD_BYTES,
             keep_free_bytes,
             self._child.run,
         )

@@ -1,6 +1,5 @@
 """Measure detectors on labelled pictures, each by itself and side by side: Table 4.6 of the thesis and more."""
 
-import re
 import time
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -11,7 +10,7 @@ from sorvolo.capture.photos import read_picture
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import find_model
 from sorvolo.detection.session import read_info
-from sorvolo.errors import InputError, SettingsError
+from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import BoxesPx, ImageRGB
 from sorvolo.lab.datasets import read_datasets
 from sorvolo.lab.evaluation.detection_metrics import Mistake, judged_classes
@@ -94,23 +93,15 @@ def read_sets(
     ignore: Iterable[str] = (),
     unlabelled: Iterable[str] = (),
     group_pattern: str | None = None,
-    videos: str = "",
     held_out: float = 0.0,
     seed: int = 1,
     known: Iterable[str] = (),
 ) -> tuple[LabelledSet, ...]:
     """The labelled sets in these files and folders, all read with the same options (those of `read_datasets`).
 
-    `videos` is a regular expression: only pictures whose video or flight it fits (from its start) are kept. With
-    `held_out` only the share that a training with this share and seed holds out. Raises InputError and SettingsError as
-    `read_datasets`, InputError for a set of which none is kept, SettingsError for a broken expression and a share that
-    cannot be.
+    With `held_out` only the share that a training with this share and seed holds out. Raises InputError and
+    SettingsError as `read_datasets`, SettingsError for a share that cannot be.
     """
-    try:
-        kept = re.compile(videos)
-    except re.error as error:
-        raise SettingsError(f"--videos {videos!r} is no regular expression: {error}") from error
-    sets = []
     read = read_datasets(
         places,
         form=form,
@@ -120,16 +111,7 @@ def read_sets(
         group_pattern=group_pattern,
         known=known,
     )
-    for place, whole in zip(places, read):
-        fitting = [each for each in whole.pictures if kept.match(each.group)]
-        chosen = replace(whole.only(fitting), notices=whole.notices)
-        if not len(chosen):
-            groups = sorted({each.group for each in whole.pictures})
-            raise InputError(
-                f"{place}: no video or flight fits {videos!r}; there are {', '.join(groups[:8])}"
-            )
-        sets.append(_held_out(chosen, held_out, seed) if held_out else chosen)
-    return tuple(sets)
+    return tuple(_held_out(part, held_out, seed) if held_out else part for part in read)
 
 
 def known_classes(arms: Iterable[Iterable[str]]) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ COMPARISONS: dict[str, tuple[Literal["thesis", "robust"], tuple[str, ...]]] = {
     "thesis, thresholds from the light": ("thesis", ("T_gray=light", "T_H=light")),
     "robust": ("robust", ()),
 }
-"""The ways in which pictures are compared, by their titles: the method and its `--thesis` values."""
+"""The ways in which pictures are compared, by their titles: the method and its values."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class SimulatedSize:
 
     def __post_init__(self) -> None:
         if self.length_m is not None and not 4 <= self.length_m <= 1000:
-            raise SettingsError(f"--length must lie in 4 to 1000 m, got {self.length_m:g}")
+            raise SettingsError(f"length_m must lie in 4 to 1000 m, got {self.length_m:g}")
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class ReproductionSettings:
             raise SettingsError(f"--videos must be 1 or more, got {self.videos}")
         if not 0.05 <= self.views_per_second <= 240:
             raise SettingsError(
-                f"--views-per-second must lie in 0.05 to 240, got {self.views_per_second:g}"
+                f"views_per_second must lie in 0.05 to 240, got {self.views_per_second:g}"
             )
 
 

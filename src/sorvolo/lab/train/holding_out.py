@@ -15,7 +15,7 @@ def hold_out(
 ) -> tuple[LabelledSet, LabelledSet, list[str]]:
     """What is learnt from, what is held out, and notices about that; whole videos wherever there are enough.
 
-    Both `sorvolo train --val SHARE` and `sorvolo evaluate detector --held-out SHARE` take it from here. Raises
+    `sorvolo train --val SHARE` and `read_sets` take it from here. Raises
     SettingsError for a share outside 0 to below 1.
     """
     if not 0 <= share < 1:

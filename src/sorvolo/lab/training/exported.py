@@ -153,7 +153,7 @@ def _demand_fitting(name: str, layer: nn.Conv2d | nn.Linear, found: Sequence[Ten
 
 def _unfitting(reason: str) -> InputError:
     return InputError(
-        f"the model file does not fit the network: {reason}; give a float32 model of the same preset, --rpn and number "
+        f"the model file does not fit the network: {reason}; give a float32 model of the same preset, rpn and number "
         "of classes"
     )
 

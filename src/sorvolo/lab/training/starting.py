@@ -37,7 +37,7 @@ def device_of(wanted: str) -> str:
         raise SettingsError(f"device must be auto, cpu or cuda, got {wanted!r}")
     if kind == "cuda" and not torch.cuda.is_available():
         raise SettingsError(
-            f"device {wanted} asked for, but this torch sees no GPU; use --device cpu"
+            f"device {wanted} asked for, but this torch sees no GPU; use the device cpu"
         )
     return wanted
 

@@ -40,7 +40,7 @@ def memory_budget_bytes(
         return int(min(1e6 * settings.enough_mb, settings.share * available_bytes()))
     if not memory_mb >= settings.least_mb:
         raise SettingsError(
-            f"--memory must be at least {settings.least_mb:g} MB, got {memory_mb:g}"
+            f"memory_mb must be at least {settings.least_mb:g} MB, got {memory_mb:g}"
         )
     return int(memory_mb * 1e6)
 

@@ -71,7 +71,7 @@ class MapSettings:
             raise SettingsError(f"method must be planar or thesis, got {self.method!r}")
         if self.method != "thesis" and self.thesis != RoiStitchingSettings():
             raise SettingsError(
-                "--transform and --thesis belong to the thesis's method: give --method thesis as well"
+                "the settings `thesis` belong to the thesis's method: choose the method thesis as well"
             )
 
 

@@ -102,17 +102,13 @@ def measure_profile(
         return [ProfilePoint(*(float(each) for each in row)) for row in rows]
 
 
-def write_contours(
-    site: Path, path: Path, interval_m: float, *, flight: str = "", of_surface: bool = False
-) -> int:
-    """Write contour lines of the bare ground (or of the surface) as GeoJSON; how many lines there are."""
+def write_contours(site: Path, path: Path, interval_m: float, *, flight: str = "") -> int:
+    """Write contour lines of the bare ground as GeoJSON; return how many lines there are."""
     if not 0.01 <= interval_m <= 1000:
         raise SettingsError(f"--interval {interval_m}: give metres, 0.01 to 1000")
     with Archive.open(site, write=False) as archive:
         flight_id = flight or newest_flight(archive)
-        field = read_field(
-            archive, flight_id, HeightFile.SURFACE if of_surface else HeightFile.GROUND
-        )
+        field = read_field(archive, flight_id, HeightFile.GROUND)
         described = archive.site()
         features = [_line(line, level, described) for level, line in contours(field, interval_m)]
         atomic_write_bytes(

@@ -296,7 +296,7 @@ def _warnings(searched: Searched, settings: SearchSettings, *, is_over: bool) ->
         ]
         if not flight.has_shadows and not flight.is_thermal:
             warnings.append(
-                f"{flight.name}: its clock has no date, so the sun is unknown and plants throw no shadow; give --sun"
+                f"{flight.name}: its clock has no date, so the sun is unknown and plants throw no shadow"
             )
     if any(not each.has_heights and not each.is_thermal for each in searched.flights):
         warnings.append(

@@ -38,7 +38,7 @@ class SearchSettings:
                 f"--plants must lie in 10 to 5000, got {self.plants}: fewer measure nothing"
             )
         if self.seed < 0:
-            raise SettingsError(f"--seed must be 0 or more, got {self.seed}")
+            raise SettingsError(f"the seed must be 0 or more, got {self.seed}")
         for name, value in (("--enough", self.enough), ("--through-crowns", self.through_crowns)):
             if not 0 <= value <= 1:
                 raise SettingsError(f"{name} must lie in 0 to 1, got {value}")
@@ -46,7 +46,7 @@ class SearchSettings:
             0 <= self.sun_deg[0] <= 360 and -90 <= self.sun_deg[1] <= 90
         ):
             raise SettingsError(
-                f"--sun: azimuth in 0 to 360 and elevation in -90 to 90 degrees, got {self.sun_deg}"
+                f"the sun: azimuth in 0 to 360 and elevation in -90 to 90 degrees, got {self.sun_deg}"
             )
 
 

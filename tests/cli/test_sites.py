@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from sorvolo.cli import places_of_sites
-from sorvolo.cli.places_of_sites import OpenedSite
+from sorvolo.cli import sites
+from sorvolo.cli.sites import OpenedSite
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ def test_a_flight_is_sent_when_the_next_one_begins_however_late(
         return "report"
 
     monkeypatch.setattr("sorvolo.missions.site.working_copy.send_site", send)
-    monkeypatch.setattr(places_of_sites, "show_copy", lambda work, task: list(work))
+    monkeypatch.setattr(sites, "show_copy", lambda work, task: list(work))
     passed = OpenedSite(Path("copy"), "s3://archive/site").sent(mission())
     while True:
         try:

@@ -1,0 +1,77 @@
+"""What several commands print and read: exit codes, files, notices, warnings, places."""
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.markup import escape
+
+from sorvolo.cli.options import PlaceFormat
+from sorvolo.errors import StoreError
+
+if TYPE_CHECKING:
+    from sorvolo.geometry.arrays import Floats
+    from sorvolo.survey.flight import Site
+
+FAILED = 1
+"""Exit code: an error, or a part of the work failed."""
+
+TO_CHECK = 3
+"""Exit code: done, but check the result before use; the first line states why."""
+
+STOPPED = 130
+"""Exit code: stopped by Ctrl-C, as shells count it."""
+
+
+def show_path(name: str, path: Path, console: Console) -> None:
+    """Print where a file is."""
+    # in one piece, however long: people copy it
+    console.print(f"{name:>8}  {escape(str(path))}", soft_wrap=True, highlight=False)
+
+
+def show_notices_and_warnings(report: Mapping[str, Any], console: Console) -> None:
+    """Print a report's notices, then its warnings."""
+    for notice in report["notices"]:
+        console.print(f"[blue]note[/blue]     {escape(notice['text'])}", highlight=False)
+    for warning in report["warnings"]:
+        console.print(f"[yellow]warning[/yellow]  {escape(warning)}", highlight=False)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return a document of a flight; raise StoreError if it cannot be read."""
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError) as error:
+        raise StoreError(
+            f"{path} cannot be read ({error}); run the command on this flight again"
+        ) from error
+
+
+def site_of(folder: Path) -> "Site":
+    """Return the site in a folder; raise StoreError if there is none."""
+    from sorvolo.store.site.archive import Archive
+
+    with Archive.open(folder, write=False) as archive:
+        return archive.site()
+
+
+def place_heading(site_is_local: bool, form: PlaceFormat) -> str:
+    """Return the heading of a column of places."""
+    from sorvolo.geometry.coordinates import Coordinates
+
+    return "east, north" if site_is_local else Coordinates(form.value).heading
+
+
+def place_words(site: "Site", form: PlaceFormat) -> "Callable[[Floats], str]":
+    """Return a function that writes a place of the site, (2,) or (3,) east, north (up) metres."""
+    from sorvolo.geometry.coordinates import Coordinates, place_text
+
+    def words(point_m: "Floats") -> str:
+        if site.is_local:
+            return f"{point_m[0]:+.1f}, {point_m[1]:+.1f}"
+        latitude, longitude, _ = site.frame.wgs84_from_site(point_m[None])
+        return place_text(float(latitude[0]), float(longitude[0]), Coordinates(form.value))
+
+    return words
