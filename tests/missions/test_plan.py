@@ -356,7 +356,6 @@ def test_the_table_marks_heights_that_are_too_great(field_file):
         ["--camera", "aov=70", "--speed", "0"],
         ["--camera", "aov=70", "--height", "-3"],
         ["--camera", "aov=70", "--critical-m", "0"],
-        [],
     ],
 )
 def test_options_that_cannot_be_are_one_clear_error(arguments):

@@ -121,7 +121,12 @@ def simulate(
         "--strips": strips,
         "--photos": photos,
     }
-    if given := [name for name, value in of_flights.items() if value not in (None, False, "")]:
+    # 0 is a value that was given
+    if given := [
+        name
+        for name, value in of_flights.items()
+        if value is not None and value is not False and value != ""
+    ]:
         raise SettingsError(
             f"--pictures makes single pictures, not flights: leave out {', '.join(given)}"
         )
