@@ -16,14 +16,13 @@ import pytest
 from truth_detector import Knowing
 
 from small_flights import simulate_into, small_flight
-from sorvolo.change.classes import object_at, seen_at
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.camera import Camera
 from sorvolo.lab.evaluation.changes import evaluate_changes
 from sorvolo.lab.evaluation.objects import evaluate_objects
 from sorvolo.lab.simulation.settings import OutputSettings
-from sorvolo.missions.compare.change_classes import ChangeClasses
+from sorvolo.missions.compare.classes import ChangeClasses, object_at, seen_at
 from sorvolo.missions.compare.flights import compare_flights
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.map_objects import ObjectFinder, open_detector

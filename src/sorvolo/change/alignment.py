@@ -10,7 +10,7 @@ import numpy as np
 
 from sorvolo.change.local_fit import LocalFit, fit_locally
 from sorvolo.change.map_search import MapSearch
-from sorvolo.change.reference import HeldWindow, ReferenceMap, normalised, resized
+from sorvolo.change.reference import HeldWindow, ReferenceMap, normalised
 from sorvolo.errors import GeometryError
 from sorvolo.geometry.arrays import (
     Floats,
@@ -27,6 +27,7 @@ from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.homography import (
     apply_homography,
     pose_from_homography,
+    resized,
     site_from_image_homography,
 )
 from sorvolo.geometry.pose import Pose

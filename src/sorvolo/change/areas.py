@@ -16,6 +16,7 @@ from sorvolo.change.ground import GroundSums
 from sorvolo.change.light import BLACK_LEVEL
 from sorvolo.change.outlines import mask_of, measures, outline_of, place_sigma_m
 from sorvolo.geometry.arrays import Bytes, Floats32, ImageRGB, Mask, Matrix3, PointsM
+from sorvolo.geometry.homography import resized
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Patch
 
 _OCTAVES = np.log2(np.arange(256, dtype=np.float32) + np.float32(BLACK_LEVEL))  # of each grey level
@@ -75,15 +76,13 @@ def area_signs(view: ComparedView, leans: Mask | None = None) -> AreaSigns:
     surface = _colour(after)
     brighter = _centred(_blurred(levels[1] - levels[0], _COLOUR_PX), known)
     colour = _centred(_blurred(surface - _colour(before), _COLOUR_PX), known)
-    x, y = width / size[0], height / size[1]
-    view_from_signs = np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]])
     return AreaSigns(
         likeness,
         _without_sky(colour, brighter),
         detail,
         surface,
         known,
-        view_from_signs,
+        resized(width / size[0], height / size[1]),
     )
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sorvolo.change.ground import CellWindow, window_around
+from sorvolo.change.ground import CHUNK, CellWindow, chunk_parts, window_around
 from sorvolo.change.planting import (
     CONTRASTS,
     Planted,
@@ -20,13 +20,12 @@ from sorvolo.change.planting import (
     texture,
 )
 from sorvolo.geometry.arrays import Bytes, Floats, ImageRGB, Ints32, Mask, PointsM
-from sorvolo.geometry.homography import apply_homography
+from sorvolo.geometry.homography import apply_homography, resized
 from sorvolo.geometry.polygons import union_of_boxes
 from sorvolo.registration.features import sharpness
 from sorvolo.survey.coverage import CoveredGround, Gap
 from sorvolo.survey.findings import ComparedView
 
-_CHUNK = 64  # cells, along a side of a stored piece
 _MOST_REASONS = 250  # a byte holds which one
 
 
@@ -45,12 +44,12 @@ _STEPS_M = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0)  # in which 
 
 class _Chunk:
     def __init__(self) -> None:
-        self.clean = np.zeros((_CHUNK, _CHUNK), np.uint16)
-        self.gaps = {gap: np.zeros((_CHUNK, _CHUNK), np.uint16) for gap in _COUNTED}
-        self.differs = np.zeros((_CHUNK, _CHUNK), np.uint16)  # of the clean views
-        self.rejected = np.zeros((_CHUNK, _CHUNK), np.uint8)  # which reason; 0 none
-        self.texture = np.zeros((_CHUNK, _CHUNK), np.float32)  # summed over the clean views
-        self.finest = np.full((_CHUNK, _CHUNK), np.inf, np.float32)  # m of a pixel
+        self.clean = np.zeros((CHUNK, CHUNK), np.uint16)
+        self.gaps = {gap: np.zeros((CHUNK, CHUNK), np.uint16) for gap in _COUNTED}
+        self.differs = np.zeros((CHUNK, CHUNK), np.uint16)  # of the clean views
+        self.rejected = np.zeros((CHUNK, CHUNK), np.uint8)  # which reason; 0 none
+        self.texture = np.zeros((CHUNK, CHUNK), np.float32)  # summed over the clean views
+        self.finest = np.full((CHUNK, CHUNK), np.inf, np.float32)  # m of a pixel
 
 
 _COUNTED = (Gap.NO_MAP, Gap.DARK, Gap.LEANING, Gap.BLURRED)
@@ -88,7 +87,7 @@ class GroundCoverage:
         laid = cv2.warpPerspective(marks, cell_from_image, size, flags=cv2.INTER_NEAREST)
         changed = cv2.warpPerspective(view.changed, cell_from_image, size, flags=cv2.INTER_NEAREST)
         rough = texture(view)
-        image_from_rough = _resized(width / rough.shape[1], height / rough.shape[0])
+        image_from_rough = resized(width / rough.shape[1], height / rough.shape[0])
         rough_laid = cv2.warpPerspective(
             rough,
             cell_from_image @ image_from_rough,
@@ -144,8 +143,8 @@ class GroundCoverage:
             explained = self._explained(changes_m, column, row)
             labels = self._labels(chunk, explained, plain, faint)
             for label, x0, x1, y in _runs(labels):
-                west, north = (column * _CHUNK + x0) * cell_m, -(row * _CHUNK + y) * cell_m
-                east = (column * _CHUNK + x1) * cell_m
+                west, north = (column * CHUNK + x0) * cell_m, -(row * CHUNK + y) * cell_m
+                east = (column * CHUNK + x1) * cell_m
                 runs.setdefault(label, []).append((west, north - cell_m, east, north))
         parts = [self._part(label, np.array(boxes)) for label, boxes in runs.items()]
         return sorted(parts, key=lambda each: (each.gap is not None, str(each.gap), -each.area_m2))
@@ -166,11 +165,11 @@ class GroundCoverage:
 
     def _explained(self, changes_m: Sequence[PointsM], column: int, row: int) -> Mask:
         """(rows, columns) which cells of a chunk lie in a reported change, or beside it."""
-        cells = np.zeros((_CHUNK, _CHUNK), np.uint8)
+        cells = np.zeros((CHUNK, CHUNK), np.uint8)
         wide = 1 + 2 * round(_WIDENS)
         for outline_m in changes_m:
-            at = outline_m * [1, -1] / _CELL_M - [column * _CHUNK, row * _CHUNK] - 0.5
-            if (at.max(axis=0) > -wide).all() and (at.min(axis=0) < _CHUNK + wide).all():
+            at = outline_m * [1, -1] / _CELL_M - [column * CHUNK, row * CHUNK] - 0.5
+            if (at.max(axis=0) > -wide).all() and (at.min(axis=0) < CHUNK + wide).all():
                 corners = np.rint(at).astype(np.int32)
                 cv2.fillPoly(cells, [corners], 1)
                 cv2.polylines(cells, [corners], isClosed=True, color=1, thickness=wide)
@@ -261,20 +260,8 @@ class GroundCoverage:
         self, window: CellWindow
     ) -> Iterator[tuple[_Chunk, tuple[slice, slice], tuple[slice, slice]]]:
         """Chunks, what of them lies in a window, and where that is in the window's raster."""
-        for row in range(window.y0 // _CHUNK, -(-window.y1 // _CHUNK)):
-            y0, y1 = max(window.y0, row * _CHUNK), min(window.y1, (row + 1) * _CHUNK)
-            for column in range(window.x0 // _CHUNK, -(-window.x1 // _CHUNK)):
-                x0, x1 = max(window.x0, column * _CHUNK), min(window.x1, (column + 1) * _CHUNK)
-                chunk = self._chunks.setdefault((column, row), _Chunk())
-                inside = np.s_[
-                    y0 - row * _CHUNK : y1 - row * _CHUNK,
-                    x0 - column * _CHUNK : x1 - column * _CHUNK,
-                ]
-                yield (
-                    chunk,
-                    inside,
-                    np.s_[y0 - window.y0 : y1 - window.y0, x0 - window.x0 : x1 - window.x0],
-                )
+        for key, inside, part in chunk_parts(window):
+            yield self._chunks.setdefault(key, _Chunk()), inside, part
 
 
 def coverage_summary(
@@ -342,7 +329,3 @@ def _mean_grey(image: ImageRGB, side_px: int) -> Bytes:
     return np.asarray(
         cv2.blur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (side_px, side_px)), np.uint8
     )
-
-
-def _resized(x: float, y: float) -> Floats:
-    return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]])

@@ -22,10 +22,10 @@ from sorvolo.geometry.arrays import (
     Matrix3,
     PointsM,
 )
-from sorvolo.geometry.homography import apply_homography
+from sorvolo.geometry.homography import apply_homography, resized
 from sorvolo.survey.findings import ComparedView, Patch, Shade
 
-_CHUNK = 64  # cells, along a side of a stored piece
+CHUNK = 64  # cells, along a side of a stored piece
 _VOTES: Bytes = np.array([bin(bits).count("1") for bits in range(256)], np.uint8)
 
 
@@ -237,12 +237,8 @@ def lay(view: ComparedView, cell_m: float, ignored: Mask, held: Mask, legs: Labe
         if held[index]:
             in_held[part] = 255
     window = _window_of(view, cell_m)
-    image_from_small = np.array(
-        [[shrink, 0, (shrink - 1) / 2], [0, shrink, (shrink - 1) / 2], [0, 0, 1.0]]
-    )
-    cell_from_small = (
-        np.linalg.inv(window.site_from_cell(cell_m)) @ view.site_from_image @ image_from_small
-    )
+    cell_from_image = np.linalg.inv(window.site_from_cell(cell_m)) @ view.site_from_image
+    cell_from_small = cell_from_image @ resized(shrink, shrink)
     size = window.shape[::-1]
 
     def laid(image: ImageGray, how: int) -> ImageGray:
@@ -320,10 +316,10 @@ class CellEvidence:
 
 class _Chunk:
     def __init__(self, seen: int) -> None:
-        self.history = np.zeros((_CHUNK, _CHUNK), np.uint8)
-        self.seen = np.full((_CHUNK, _CHUNK), seen, np.uint16)
-        self.changed = np.zeros((_CHUNK, _CHUNK), np.uint16)
-        self.owner = np.zeros((_CHUNK, _CHUNK), np.int32)
+        self.history = np.zeros((CHUNK, CHUNK), np.uint8)
+        self.seen = np.full((CHUNK, CHUNK), seen, np.uint16)
+        self.changed = np.zeros((CHUNK, CHUNK), np.uint16)
+        self.owner = np.zeros((CHUNK, CHUNK), np.int32)
 
 
 class CellGrid:
@@ -342,34 +338,31 @@ class CellGrid:
 
     def record(self, laid: LaidView, counts: bool) -> CellEvidence:
         """Shift one view into the cells' histories; the counts over all views take it in if it `counts`."""
-        found = _no_evidence(laid.window)
-        for key, inside, part in _pieces(laid.window):
+        for key, inside, part in chunk_parts(laid.window):
             flagged, seen = laid.flagged[part], laid.seen[part]
             chunk = self._chunks.get(key)
             if chunk is None:
                 if not flagged.any():
-                    if counts and flagged.size == _CHUNK * _CHUNK and seen.all():
+                    if counts and flagged.size == CHUNK * CHUNK and seen.all():
                         self._quiet[key] = self._quiet.get(key, 0) + 1
                     continue
-                chunk = self._new_chunk(key)
+                if len(self._chunks) >= self._most_chunks:
+                    self._chunks.popitem(last=False)
+                chunk = self._chunks[key] = _Chunk(min(self._quiet.pop(key, 0), 60_000))
             self._chunks.move_to_end(key)
             history = chunk.history[inside]
             shifted = ((history << np.uint8(1)) | flagged.view(np.uint8)) & self._kept_bits
             np.copyto(history, shifted, where=seen)
             if counts:
-                ever = chunk.seen[inside]
-                np.minimum(ever + seen, 60_000, out=ever)
-                often = chunk.changed[inside]
-                np.minimum(often + flagged, 60_000, out=often)
-            found.votes[part] = _VOTES[history]
-            found.seen[part], found.changed[part] = chunk.seen[inside], chunk.changed[inside]
-            found.owner[part] = chunk.owner[inside]
-        return found
+                for ever, now in ((chunk.seen, seen), (chunk.changed, flagged)):
+                    np.minimum(ever[inside] + now, 60_000, out=ever[inside])
+        return self.read(laid.window)
 
     def read(self, window: CellWindow) -> CellEvidence:
         """What the cells of a window hold now."""
-        found = _no_evidence(window)
-        for key, inside, part in _pieces(window):
+        types = (np.uint8, np.uint16, np.uint16, np.int32)
+        found = CellEvidence(*(np.zeros(window.shape, kind) for kind in types))
+        for key, inside, part in chunk_parts(window):
             chunk = self._chunks.get(key)
             if chunk is not None:
                 found.votes[part] = _VOTES[chunk.history[inside]]
@@ -379,41 +372,25 @@ class CellGrid:
 
     def own(self, window: CellWindow, cells: Mask, number: int) -> None:
         """Give cells of a window to a change."""
-        for key, inside, part in _pieces(window):
+        for key, inside, part in chunk_parts(window):
             chunk = self._chunks.get(key)
             if chunk is not None:
                 chunk.owner[inside][cells[part]] = number
 
-    def _new_chunk(self, key: tuple[int, int]) -> _Chunk:
-        if len(self._chunks) >= self._most_chunks:
-            self._chunks.popitem(last=False)
-        chunk = self._chunks[key] = _Chunk(min(self._quiet.pop(key, 0), 60_000))
-        return chunk
 
-
-def _no_evidence(window: CellWindow) -> CellEvidence:
-    shape = window.shape
-    return CellEvidence(
-        np.zeros(shape, np.uint8),
-        np.zeros(shape, np.uint16),
-        np.zeros(shape, np.uint16),
-        np.zeros(shape, np.int32),
-    )
-
-
-def _pieces(
+def chunk_parts(
     window: CellWindow,
 ) -> Iterator[tuple[tuple[int, int], tuple[slice, slice], tuple[slice, slice]]]:
     """Chunk, its part inside the window, and where that part lies in a raster of the window."""
-    for row in range(window.y0 // _CHUNK, -(-window.y1 // _CHUNK)):
-        y0, y1 = max(window.y0, row * _CHUNK), min(window.y1, (row + 1) * _CHUNK)
+    for row in range(window.y0 // CHUNK, -(-window.y1 // CHUNK)):
+        y0, y1 = max(window.y0, row * CHUNK), min(window.y1, (row + 1) * CHUNK)
         rows, rows_here = (
-            slice(y0 - row * _CHUNK, y1 - row * _CHUNK),
+            slice(y0 - row * CHUNK, y1 - row * CHUNK),
             slice(y0 - window.y0, y1 - window.y0),
         )
-        for column in range(window.x0 // _CHUNK, -(-window.x1 // _CHUNK)):
-            x0, x1 = max(window.x0, column * _CHUNK), min(window.x1, (column + 1) * _CHUNK)
-            inside = (rows, slice(x0 - column * _CHUNK, x1 - column * _CHUNK))
+        for column in range(window.x0 // CHUNK, -(-window.x1 // CHUNK)):
+            x0, x1 = max(window.x0, column * CHUNK), min(window.x1, (column + 1) * CHUNK)
+            inside = (rows, slice(x0 - column * CHUNK, x1 - column * CHUNK))
             yield (column, row), inside, (rows_here, slice(x0 - window.x0, x1 - window.x0))
 
 

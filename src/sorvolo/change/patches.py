@@ -7,7 +7,7 @@ import numpy as np
 
 from sorvolo.change.outlines import mask_of
 from sorvolo.geometry.arrays import Bytes, Floats, ImageGray, ImageRGB, ImageRGBA, Matrix3, PointsM
-from sorvolo.geometry.homography import apply_homography
+from sorvolo.geometry.homography import apply_homography, resized
 from sorvolo.survey.findings import ComparedView, Patch
 
 _LEAST_MARGIN_M = (
@@ -121,9 +121,7 @@ def cut(view: ComparedView, window: PatchWindow) -> Cut:
     before, after = view.reference, view.image
     if shrink > 1:
         before, after, valid = (_shrunk(each, shrink) for each in (before, after, valid))
-        patch_from_image = patch_from_image @ np.array(
-            [[shrink, 0, (shrink - 1) / 2], [0, shrink, (shrink - 1) / 2], [0, 0, 1.0]]
-        )
+        patch_from_image = patch_from_image @ resized(shrink, shrink)
     known = (
         cv2.warpPerspective(valid, patch_from_image, window.size_px, flags=cv2.INTER_LINEAR) >= 250
     )

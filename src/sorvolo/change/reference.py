@@ -11,7 +11,7 @@ import numpy as np
 from sorvolo.errors import GeometryError
 from sorvolo.geometry.arrays import ImageGray, ImageRGB, ImageRGBA, Mask, Matrix3, PointsPx
 from sorvolo.geometry.grid import Grid, TileIndex
-from sorvolo.geometry.homography import apply_homography
+from sorvolo.geometry.homography import apply_homography, resized
 from sorvolo.registration.features import (
     FeatureSettings,
     gray_from_rgb,
@@ -311,11 +311,6 @@ def level_for(grid_from_image: Matrix3, width_px: int, height_px: int) -> int:
     x, y, z = grid_from_image @ centre
     linear = grid_from_image[:2, :2] / z - np.outer([x, y], grid_from_image[2, :2]) / z**2
     return int(np.clip(np.rint(0.5 * np.log2(max(abs(np.linalg.det(linear)), 1e-12))), 0, 8))
-
-
-def resized(x: float, y: float) -> Matrix3:
-    """(3, 3) from pixels to those of the picture made x and y times as large: to = (from + 1/2) x - 1/2."""
-    return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]])
 
 
 def _level_from_grid(level: int) -> Matrix3:

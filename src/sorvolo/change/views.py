@@ -40,7 +40,7 @@ from sorvolo.geometry.arrays import (
 )
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
-from sorvolo.geometry.homography import apply_homography, pose_from_homography
+from sorvolo.geometry.homography import apply_homography, pose_from_homography, resized
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose
 from sorvolo.registration.lens import Undistorter
@@ -59,9 +59,7 @@ class FramePixels:
         self.full, self.small = full, small
         self._maps: tuple[MatLike, MatLike] | None = None
         sx, sy = small.width_px / full.width_px, small.height_px / full.height_px
-        self.small_from_full: Matrix3 = np.array(
-            [[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1.0]]
-        )
+        self.small_from_full: Matrix3 = resized(sx, sy)
         """(3, 3) from undistorted pixels of the full size."""
 
     def outline_m(self, site_from_image: Matrix3) -> PointsM:

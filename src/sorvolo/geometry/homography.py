@@ -91,3 +91,8 @@ def pose_from_homography(site_from_image: Matrix3, camera: Camera) -> Pose | Non
     if centre_m[2] <= 0 or camera_from_site[2, 2] > -0.1:
         return None
     return Pose(camera_from_site.T, centre_m)
+
+
+def resized(x: float, y: float) -> Matrix3:
+    """(3, 3) from pixels to those of the picture made x and y times as large: to = (from + 1/2) x - 1/2."""
+    return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]])

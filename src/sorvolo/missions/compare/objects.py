@@ -6,7 +6,7 @@ from typing import Any
 from sorvolo.capture.source import LiveSource
 from sorvolo.change.reconcile import SearchedGround, on_one_date
 from sorvolo.change.views import ViewMaker, ViewOutcome
-from sorvolo.missions.compare.change_classes import ChangeClasses
+from sorvolo.missions.compare.classes import ChangeClasses
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.map_objects import ObjectFinder, search_summary, why_not_searched
 from sorvolo.missions.flight.result_cache import ResultCache
