@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from enum import Enum
-from functools import cached_property, partial
+from functools import cache, partial
 
 import cv2
 import numpy as np
@@ -72,6 +72,8 @@ _SEARCHED_MISSES = 8  # frames in a row that fit nowhere: of later ones every fi
 _CONFIRMS_REST = 0.42  # of a local fit: less confirms a place in doubt; other ground had 0.53 once
 _SETTLED_PX = 1.2  # a fit that leaves more is followed by a local one
 _MOST_FEATURES = 60_000  # of the whole map, to look for a frame whose place is not known at all
+# the same words for all frames beside the map, for reports count them
+_BESIDE = f"less than {_LEAST_KNOWN:.0%} of it lies on the map"
 _LINKS = LinkSettings(FeatureSettings(orb_count=900), min_inliers=20, max_pairs=150)
 
 
@@ -158,35 +160,19 @@ class AlignStep:
 @dataclass(frozen=True, eq=False)
 class _Frame:
     """A frame that is laid over the map: as taken, its gray at the size at which frames are aligned, the same with its
-    contrast normalised, and what telemetry has of it."""
+    contrast normalised, what telemetry has of it, and its camera's pose by telemetry, None where that has no place.
+
+    `inside` gives site_from_image by telemetry, None where less than the least share of that lies on known ground.
+    """
 
     image: ImageRGB
     camera: Camera
     gray: ImageGray
     even: Keyframe
     prior: CameraPrior
-
-
-@dataclass(frozen=True, eq=False)
-class _Moved:
-    """A place after local fits: `left` is what no camera explains of them, in the frame's own pixels, `size_m` how far
-    they moved it in all (median)."""
-
-    place: Place
-    left: LocalFit | None
-    size_m: float
-
-
-class _Share:
-    """The share of a frame that lies on known ground by telemetry, counted when it is first asked for."""
-
-    def __init__(self, count: Callable[[], float]) -> None:
-        self._count = count
-
-    @cached_property
-    def known(self) -> float:
-        """From 0 to 1."""
-        return self._count()
+    time_ns: int
+    by_telemetry: Pose | None
+    inside: Callable[[], Matrix3 | None]
 
 
 class Aligner:
@@ -219,21 +205,19 @@ class Aligner:
         small_camera = camera.resized(*size)
         new = self._keyframe(small_camera, normalise_contrast(gray))
         by_telemetry = self._telemetry_pose(prior)
-        telemetry_homography = (
-            None if by_telemetry is None else _homography_of(small_camera, by_telemetry)
-        )
-        share = _Share(
-            lambda: (
-                1.0
-                if telemetry_homography is None
-                else self._share_known(telemetry_homography, small_camera)
-            )
-        )
+        ground = None if by_telemetry is None else _homography_of(small_camera, by_telemetry)
 
-        def telemetry_inside() -> Matrix3 | None:
-            return telemetry_homography if share.known >= _LEAST_KNOWN else None
+        @cache
+        def share_known() -> float:
+            if ground is None:
+                return 1.0
+            seen = self._seen(ground, small_camera)
+            return 0.0 if seen is None else float(seen[1].mean())
 
-        frame = _Frame(image, camera, gray, new, prior)
+        def inside() -> Matrix3 | None:
+            return ground if share_known() >= _LEAST_KNOWN else None
+
+        frame = _Frame(image, camera, gray, new, prior, time_ns, by_telemetry, inside)
         placed: Place | NotAligned
         is_cautious = caution is Caution.ALWAYS or (
             caution is Caution.AT_FIRST and not self._is_found
@@ -241,32 +225,36 @@ class Aligner:
         if place is not None:
             placed = _as_known(place, camera, small_camera)
         elif is_cautious:
-            placed = self._surely(new, prior, time_ns, telemetry_inside)
+            # cheap, and beyond doubt; misses of frames that come again do not count
+            misses = self._misses
+            placed = self._by_homographies(frame, is_cheap=True)
+            self._misses = misses
+            if isinstance(placed, Place) and self._is_doubtful(placed, prior):
+                placed = NotAligned("its place is in doubt", placed.residual_px)
         else:
-            placed = self._by_homographies(new, prior, time_ns, telemetry_inside)
-            if self._is_doubtful(placed, prior) and self._may_search():
-                placed = (
-                    self._by_search(frame, by_telemetry, is_inside=telemetry_inside() is not None)
-                    or placed
-                )
+            placed = self._by_homographies(frame)
+            # a flight that fits nowhere is searched for every fifth frame
+            may_search = self._misses < _SEARCHED_MISSES or self._misses % 5 == 1
+            if self._is_doubtful(placed, prior) and may_search:
+                placed = self._by_search(frame) or placed
         if isinstance(placed, NotAligned):
-            is_outside = share.known < _LEAST_KNOWN
-            reason = self._beside() if is_outside else placed.reason
+            is_outside = share_known() < _LEAST_KNOWN
+            reason = _BESIDE if is_outside else placed.reason
             self.step = AlignStep(None, self._misses, self._reference.windows)
             return NotAligned(
                 reason, placed.residual_px / scale, is_outside, is_cautious and not is_outside
             )
-        moved = self._settled(frame, placed)
-        self._remember(time_ns, moved.place, prior, new)
-        self.step = AlignStep(moved.place, self._misses, self._reference.windows)
+        moved, left, size_m = self._settled(frame, placed)
+        self._remember(time_ns, moved, prior, new)
+        self.step = AlignStep(moved, self._misses, self._reference.windows)
         small_from_full = resized(size[0] / image.shape[1], size[1] / image.shape[0])
         return Aligned(
-            moved.place.site_from_image @ small_from_full,
-            moved.place.pose.translation_m,
+            moved.site_from_image @ small_from_full,
+            moved.pose.translation_m,
             placed.residual_px / scale,
             placed.followed,
-            moved.left,
-            moved.size_m,
+            left,
+            size_m,
             with_flight=place is not None,
         )
 
@@ -292,50 +280,14 @@ class Aligner:
             cv2.resize(gray_from_rgb(image), size, interpolation=cv2.INTER_AREA), np.uint8
         )
 
-    def _surely(
-        self,
-        new: Keyframe,
-        prior: CameraPrior,
-        time_ns: int,
-        telemetry_inside: Callable[[], Matrix3 | None],
-    ) -> Place | NotAligned:
-        """The frame placed by what is cheap, beyond doubt; misses of frames that come again do not count."""
-        misses = self._misses
-        placed = self._by_homographies(new, prior, time_ns, telemetry_inside, is_cheap=True)
-        self._misses = misses
-        if isinstance(placed, Place) and self._is_doubtful(placed, prior):
-            return NotAligned("its place is in doubt", placed.residual_px)
-        return placed
-
-    def _by_homographies(
-        self,
-        new: Keyframe,
-        prior: CameraPrior,
-        time_ns: int,
-        telemetry_inside: Callable[[], Matrix3 | None],
-        *,
-        is_cheap: bool = False,
-    ) -> Place | NotAligned:
+    def _by_homographies(self, frame: _Frame, *, is_cheap: bool = False) -> Place | NotAligned:
         """The frame placed by the first guess that its points confirm to a part of a pixel, or why none is."""
         nearest = NotAligned("its features are found nowhere in the map where it could be", np.nan)
-        for guess, followed in self._guesses(
-            new, prior, time_ns, telemetry_inside, is_cheap=is_cheap
-        ):
-            found = self._fit(
-                new,
-                guess,
-                _DOUBTFUL_PX if followed else _MOST_RESIDUAL_PX,
-            )
-            if isinstance(found, NotAligned):
-                nearest = _nearer(nearest, found)
-                continue
-            pose = pose_from_homography(found[0], new.camera)
-            if pose is not None:
-                return Place(found[0], pose, found[1], followed, np.inf if found[2] else 0.0)
-            nearest = _nearer(
-                nearest,
-                NotAligned("the fit is none that a camera above the ground could have", np.nan),
-            )
+        for guess, followed in self._guesses(frame, is_cheap=is_cheap):
+            found = self._fit(frame.even, guess, followed=followed)
+            if isinstance(found, Place):
+                return found
+            nearest = _nearer(nearest, found)
         return nearest
 
     def _is_doubtful(self, placed: Place | NotAligned, prior: CameraPrior) -> bool:
@@ -344,20 +296,14 @@ class Aligner:
             return True
         return not placed.followed and (placed.ratio == 0 or self.search.is_odd(placed.pose, prior))
 
-    def _may_search(self) -> bool:
-        """Whether the dear search is worth its time: a flight that fits nowhere is asked every fifth frame."""
-        return self._misses < _SEARCHED_MISSES or self._misses % 5 == 1
-
-    def _by_search(
-        self, frame: "_Frame", by_telemetry: Pose | None, *, is_inside: bool
-    ) -> Place | None:
+    def _by_search(self, frame: _Frame) -> Place | None:
         """The frame placed by learned features, telemetry and its neighbours; what these leave in doubt, or what lies
         far from where telemetry was right so far, a local fit must confirm. Without telemetry's place the search begins
         at the last frame's."""
-        if by_telemetry is None and self._fits and not frame.prior.knows_place:
+        if frame.by_telemetry is None and self._fits and not frame.prior.knows_place:
             start = self._fits[-1].pose
-        elif by_telemetry is not None and is_inside:
-            start = by_telemetry
+        elif frame.by_telemetry is not None and frame.inside() is not None:
+            start = frame.by_telemetry
         else:
             return None
         found = self.search.find(frame.gray, frame.even.gray, frame.even.camera, frame.prior, start)
@@ -371,30 +317,27 @@ class Aligner:
         local = self._local(frame, place)
         return place if local is not None and local.rest <= _CONFIRMS_REST else None
 
-    def _settled(self, frame: "_Frame", placed: Place) -> "_Moved":
-        """The place moved as a camera by what a local fit finds where the last fit leaves much, and what is left."""
-        moved = _Moved(placed, None, 0.0)
+    def _settled(self, frame: _Frame, placed: Place) -> tuple[Place, LocalFit | None, float]:
+        """The place moved as a camera by local fits where the last fit leaves much; what no camera explains of them, in
+        the frame's own pixels, and how far they moved it in all (median, m)."""
+        place, left, size_m = placed, None, 0.0
         if placed.residual_px <= _SETTLED_PX and (placed.followed or np.isinf(placed.ratio)):
-            return moved
+            return place, left, size_m
+        fine = _fine(frame.camera)
         for _ in range(_ROUNDS):
-            local = self._local(frame, moved.place)
+            local = self._local(frame, place)
             if local is None:
                 break
-            fine = _fine(frame.camera, _MOVING_SIDE_PX)
-            size_m = float(local.median_px * moved.place.pose.translation_m[2] / fine.fx_px)
-            place, left = _as_camera(moved.place, local, fine, _small_from(fine, frame.even.camera))
-            moved = _Moved(
-                place,
-                left.resized(frame.camera.width_px / fine.width_px),
-                max(size_m, moved.size_m),
-            )
-            if size_m < _FAR_M:
+            moved_m = float(local.median_px * place.pose.translation_m[2] / fine.fx_px)
+            place, rest = _as_camera(place, local, fine, _small_from(fine, frame.even.camera))
+            left, size_m = rest.resized(frame.camera.width_px / fine.width_px), max(moved_m, size_m)
+            if moved_m < _FAR_M:
                 break
-        return moved
+        return place, left, size_m
 
     def _local(self, frame: "_Frame", placed: Place) -> LocalFit | None:
         """The local fit of a frame at its place, in pixels of the `_fine` camera."""
-        fine = _fine(frame.camera, _MOVING_SIDE_PX)
+        fine = _fine(frame.camera)
         size = fine.width_px, fine.height_px
         seen = self._seen(placed.site_from_image @ _small_from(fine, frame.even.camera), fine)
         if seen is None:
@@ -418,52 +361,37 @@ class Aligner:
                 up_m = last_up_m
         return Pose(prior.rotation, np.array([*prior.position_m[:2], max(up_m, 0.5)]))
 
-    def _guesses(
-        self,
-        new: Keyframe,
-        prior: CameraPrior,
-        time_ns: int,
-        telemetry_inside: Callable[[], Matrix3 | None],
-        *,
-        is_cheap: bool,
-    ) -> Iterator[tuple[Matrix3, bool]]:
-        """site_from_image good to a few pixels, the cheapest first; telemetry is asked where the past is no help."""
-        predicted = self._predicted(new.camera, prior, time_ns)
+    def _guesses(self, frame: _Frame, *, is_cheap: bool) -> Iterator[tuple[Matrix3, bool]]:
+        """The ladder: site_from_image good to a few pixels, the cheapest first, and whether the last fit predicted it.
+
+        Telemetry is asked where the past is no help. The dear rungs come every fifth time: a video's next frame may be
+        found by its telemetry again.
+        """
+        new, prior = frame.even, frame.prior
+        predicted = self._predicted(new.camera, prior, frame.time_ns)
         if predicted is not None:
             yield self._shifted(new, predicted), True
-        by_telemetry = telemetry_inside()
+        by_telemetry = frame.inside()
         features = orb_features(new.gray, _LINKS.features)
         self._misses += 1
-        for attempt in self._tries(
-            new, features, prior, predicted, by_telemetry, is_cheap=is_cheap
-        ):
-            found = attempt()
+        rungs: list[Callable[[], Matrix3 | None]] = [
+            partial(self._by_features, new, features, near, prior, is_free=False)
+            for near in (predicted, by_telemetry)
+            if near is not None
+        ]
+        if by_telemetry is not None:  # a compass may be off by any angle
+            rungs.append(
+                partial(self._by_features, new, features, by_telemetry, prior, is_free=True)
+            )
+        if not is_cheap and self._misses % 5 == 1:
+            if by_telemetry is not None:
+                rungs.append(partial(self._by_sift, new, by_telemetry))
+            if by_telemetry is not None or not prior.knows_place:
+                rungs.append(partial(self._anywhere, features))
+        for rung in rungs:
+            found = rung()
             if found is not None:
                 yield found, False
-
-    def _tries(
-        self,
-        new: Keyframe,
-        features: Features,
-        prior: CameraPrior,
-        predicted: Matrix3 | None,
-        by_telemetry: Matrix3 | None,
-        *,
-        is_cheap: bool,
-    ) -> Iterator[Callable[[], Matrix3 | None]]:
-        """What may find a frame by its features, the cheapest first: around each place that it could have, then
-        anywhere. The dear searches come every fifth time: a video's next frame may be found by its telemetry again."""
-        for near in (predicted, by_telemetry):
-            if near is not None:
-                yield partial(self._by_features, new, features, near, prior, is_free=False)
-        if by_telemetry is not None:  # a compass may be off by any angle
-            yield partial(self._by_features, new, features, by_telemetry, prior, is_free=True)
-        if is_cheap or self._misses % 5 != 1:
-            return
-        if by_telemetry is not None:
-            yield partial(self._by_sift, new, by_telemetry)
-        if by_telemetry is not None or not prior.knows_place:
-            yield partial(self._anywhere, features)
 
     def _predicted(self, camera: Camera, prior: CameraPrior, time_ns: int) -> Matrix3 | None:
         """The last fit moved on at the flight's velocity, turned as telemetry has the camera turned."""
@@ -631,38 +559,28 @@ class Aligner:
             return None
         return site_from_image @ np.linalg.inv(fitted[0])
 
-    def _beside(self) -> str:
-        """The reason of frames beside the map: the same words for all, for reports count them."""
-        return f"less than {_LEAST_KNOWN:.0%} of it lies on the map"
-
-    def _share_known(self, site_from_image: Matrix3, camera: Camera) -> float:
-        seen = self._seen(site_from_image, camera)
-        return 0.0 if seen is None else float(seen[1].mean())
-
-    def _fit(
-        self, new: Keyframe, guess: Matrix3, most_residual_px: float
-    ) -> tuple[Matrix3, float, bool] | NotAligned:
-        """site_from_image to a part of a pixel, its residual, and whether points all over the frame hold it; or why
-        not."""
+    def _fit(self, new: Keyframe, guess: Matrix3, *, followed: bool) -> Place | NotAligned:
+        """The place that a guess leads to, to a part of a pixel, or why there is none."""
         seen = self._seen(guess, new.camera)
         if seen is None:
             return NotAligned("it would look at the horizon", np.nan)
-        share = float(seen[1].mean())
-        if share < _LEAST_KNOWN:
-            return NotAligned(self._beside(), np.nan)
+        if float(seen[1].mean()) < _LEAST_KNOWN:
+            return NotAligned(_BESIDE, np.nan)
         old = self._keyframe(new.camera, normalised(*seen))
-        links = _LINKS
-        found = refine(new, old, np.eye(3), links, LinkCache(links.features, 2))
+        found = refine(new, old, np.eye(3), _LINKS, LinkCache(_LINKS.features, 2))
         if not isinstance(found, Link):
             return NotAligned(f"it does not fit the map: {found}", np.nan)
         residual_px = float(found.sigma_px * 1.1774)  # a Rayleigh distribution's median
-        if residual_px > most_residual_px:
+        if residual_px > (_DOUBTFUL_PX if followed else _MOST_RESIDUAL_PX):
             return NotAligned("its points fit the map badly", residual_px)
-        fit: Matrix3 = guess @ np.linalg.inv(found.new_from_old)
         is_held = residual_px <= _DOUBTFUL_PX and (
             _spread_of(found.new_px, seen[1], _CELLS) >= _LEAST_SPREAD
         )
-        return _stiffened(fit, found, guess, new.camera), residual_px, is_held
+        fit = _stiffened(guess @ np.linalg.inv(found.new_from_old), found, guess, new.camera)
+        pose = pose_from_homography(fit, new.camera)
+        if pose is None:
+            return NotAligned("the fit is none that a camera above the ground could have", np.nan)
+        return Place(fit, pose, residual_px, followed, np.inf if is_held else 0.0)
 
 
 def _as_known(known: FlightPlace, full: Camera, camera: Camera) -> Place | NotAligned:
@@ -734,9 +652,9 @@ def _stiffened(
     return site_from_image if worse else stiff
 
 
-def _fine(camera: Camera, side_px: int) -> Camera:
+def _fine(camera: Camera) -> Camera:
     """The camera at the size at which local fits are made."""
-    share = min(1.0, side_px / max(camera.width_px, camera.height_px))
+    share = min(1.0, _MOVING_SIDE_PX / max(camera.width_px, camera.height_px))
     return camera.resized(round(camera.width_px * share), round(camera.height_px * share))
 
 
