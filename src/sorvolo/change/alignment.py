@@ -520,18 +520,17 @@ class Aligner:
             grid_from_image = np.array(
                 [[scale, 0.0, centre_px[0]], [0.0, scale, centre_px[1]], [0.0, 0.0, 1.0]]
             )
-            site_from_grid = self._site_from_grid(centre_px)
+            grid_from_site = self._site_grid.grid_from_site_affine(np.zeros(2), 50.0)
+            near_m = apply_homography(np.linalg.inv(grid_from_site), centre_px[None])[0]
+            site_from_grid = np.asarray(
+                np.linalg.inv(self._site_grid.grid_from_site_affine(near_m, 50.0))
+            )
             found = self._matched(
                 features, old, grid_from_image, 0.0, site_from_grid @ grid_from_image
             )
             if found is not None:
                 return found
         return None
-
-    def _site_from_grid(self, centre_px: PointsPx) -> Matrix3:
-        grid_from_site = self._site_grid.grid_from_site_affine(np.zeros(2), 50.0)
-        near_m = apply_homography(np.linalg.inv(grid_from_site), centre_px[None])[0]
-        return np.asarray(np.linalg.inv(self._site_grid.grid_from_site_affine(near_m, 50.0)))
 
     def _matched(
         self,

@@ -524,17 +524,18 @@ class Seeds:
             seed.pictures.show(view, *window.box_m(self._cell_m), self._m_per_px)
             self._ask(seed, view, kept_view)
             self._seeds.append(seed)
-        self._forget()
+        # Let the oldest go where there are too many: a large site has hundreds that only its
+        # first photos show.
+        sizes = [each.pictures.size_px for each in self._seeds]
+        while len(sizes) > self._most_seeds and sum(sizes) > self._most_seeds_px:
+            del sizes[0], self._seeds[0]
+
+    def _ask(self, seed: Candidate, view: ComparedView, kept_view: KeptView) -> None:
+        seed.ask(kept_view, self._grid.read(seed.cells).changed > 0, self._cell_m)
 
     def _ask(self, seed: Candidate, view: ComparedView, kept_view: KeptView) -> None:
         if seed.ask(kept_view, self._grid.read(seed.cells).changed > 0, self._cell_m):
             seed.sights.show(view, *seed.cells.box_m(self._cell_m), self._m_per_px)
-
-    def _forget(self) -> None:
-        """Let the oldest go where there are too many: a large site has hundreds that only its first photos show."""
-        sizes = [each.pictures.size_px for each in self._seeds]
-        while len(sizes) > self._most_seeds and sum(sizes) > self._most_seeds_px:
-            del sizes[0], self._seeds[0]
 
     def _new(self, laid: LaidView, weak: Mask) -> list[CellWindow]:
         """The windows of large enough `weak` pieces, the surest first."""

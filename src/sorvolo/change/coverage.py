@@ -140,7 +140,16 @@ class GroundCoverage:
         runs: dict[tuple[int, int, int], list[tuple[float, float, float, float]]] = {}
         cell_m = _CELL_M
         for (column, row), chunk in self._chunks.items():
-            explained = self._explained(changes_m, column, row)
+            # (rows, columns) which cells of a chunk lie in a reported change, or beside it.
+            cells = np.zeros((CHUNK, CHUNK), np.uint8)
+            wide = 1 + 2 * round(_WIDENS)
+            for outline_m in changes_m:
+                at = outline_m * [1, -1] / _CELL_M - [column * CHUNK, row * CHUNK] - 0.5
+                if (at.max(axis=0) > -wide).all() and (at.min(axis=0) < CHUNK + wide).all():
+                    corners = np.rint(at).astype(np.int32)
+                    cv2.fillPoly(cells, [corners], 1)
+                    cv2.polylines(cells, [corners], isClosed=True, color=1, thickness=wide)
+            explained = np.asarray(cells > 0)
             labels = self._labels(chunk, explained, plain, faint)
             for label, x0, x1, y in _runs(labels):
                 west, north = (column * CHUNK + x0) * cell_m, -(row * CHUNK + y) * cell_m
@@ -162,18 +171,6 @@ class GroundCoverage:
         gap = list(Gap)[kind]
         why = self._reasons[first - 1] if gap is Gap.REJECTED else ""
         return CoveredGround(polygons, area_m2, gap, why, np.nan, np.nan)
-
-    def _explained(self, changes_m: Sequence[PointsM], column: int, row: int) -> Mask:
-        """(rows, columns) which cells of a chunk lie in a reported change, or beside it."""
-        cells = np.zeros((CHUNK, CHUNK), np.uint8)
-        wide = 1 + 2 * round(_WIDENS)
-        for outline_m in changes_m:
-            at = outline_m * [1, -1] / _CELL_M - [column * CHUNK, row * CHUNK] - 0.5
-            if (at.max(axis=0) > -wide).all() and (at.min(axis=0) < CHUNK + wide).all():
-                corners = np.rint(at).astype(np.int32)
-                cv2.fillPoly(cells, [corners], 1)
-                cv2.polylines(cells, [corners], isClosed=True, color=1, thickness=wide)
-        return np.asarray(cells > 0)
 
     def _labels(
         self, chunk: _Chunk, explained: Mask, plain: Sensitivity, faint: Sensitivity

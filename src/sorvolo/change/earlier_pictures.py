@@ -142,7 +142,12 @@ class EarlierPictures:
         other_from_picture = np.linalg.inv(site_from_other) @ site_from_picture
         if (other_from_picture @ np.array([*middle, 1.0]))[2] == 0:
             return None
-        scale = _scale(other_from_picture, middle)
+        # Pixels of a per pixel of b around a point of b.
+        around = np.array([middle, (middle[0] + 8, middle[1]), (middle[0], middle[1] + 8)])
+        moved: PointsM = apply_homography(other_from_picture, around)
+        steps = (moved[1:] - moved[0]) / 8
+        area = abs(float(steps[0, 0] * steps[1, 1] - steps[0, 1] * steps[1, 0]))
+        scale = area**0.5 if np.isfinite(area) and area > 0 else 1.0
         while scale < 0.6:  # a mere interpolation would skip pixels
             picture = _known_inside(np.asarray(cv2.pyrDown(picture), np.uint8))
             site_from_picture = site_from_picture @ np.diag([2.0, 2.0, 1.0])
@@ -223,12 +228,3 @@ def _known_inside(rgba: ImageRGBA) -> ImageRGBA:
     rgba[..., 3] = 0
     rgba[edge:-edge, edge:-edge, 3] = 255
     return rgba
-
-
-def _scale(a_from_b: Matrix3, at_px: tuple[float, float]) -> float:
-    """Pixels of a per pixel of b around a point of b."""
-    around = np.array([at_px, (at_px[0] + 8, at_px[1]), (at_px[0], at_px[1] + 8)])
-    moved: PointsM = apply_homography(a_from_b, around)
-    steps = (moved[1:] - moved[0]) / 8
-    area = abs(float(steps[0, 0] * steps[1, 1] - steps[0, 1] * steps[1, 0]))
-    return area**0.5 if np.isfinite(area) and area > 0 else 1.0

@@ -150,7 +150,9 @@ class EvidenceMap:
         """Take in one view; the changes that it makes certain enough to be announced, each once in a flight."""
         if self._is_repeat(view):
             return ()
-        most_pictures = self._pictures_for(view)
+        # How many pictures there is time for since the last view.
+        waited_s = np.inf if self._last is None else (view.time_ns - self._last[1]) * 1e-9
+        most_pictures = pictures_for(waited_s)
         self._last = (view.index, view.time_ns, view.camera_m)
         kept_view, moving = self._lay(view)
         evidence = self._grid.record(kept_view.laid, kept_view.counts)
@@ -235,11 +237,6 @@ class EvidenceMap:
         has_moved = np.linalg.norm(view.camera_m - camera_m) >= least_m
         is_too_soon = (view.time_ns - time_ns) * 1e-9 < _LEAST_VIEWS_APART_S
         return view.index == index or (is_too_soon and not bool(has_moved))
-
-    def _pictures_for(self, view: ComparedView) -> int:
-        """How many pictures there is time for since the last view."""
-        waited_s = np.inf if self._last is None else (view.time_ns - self._last[1]) * 1e-9
-        return pictures_for(waited_s)
 
     def _lay(self, view: ComparedView) -> tuple[KeptView, MovingBlobs]:
         """The view as cells, without what moves, and what moves in it."""

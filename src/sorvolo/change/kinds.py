@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from cv2.typing import MatLike
 
 from sorvolo.geometry.arrays import Bytes, Floats, Floats32, ImageRGB, ImageRGBA, Labels, Mask
 from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
@@ -64,7 +63,8 @@ class _Region(NamedTuple):
         """The region of a mask (h, w); None of nothing."""
         if not changed.any():
             return None
-        reach = _reach_px(changed)
+        # How far around a changed region the ground is looked at.
+        reach = int(np.clip(0.35 * np.sqrt(np.count_nonzero(changed)), 4, 40))
         part = _near(changed, reach + 8)
         changed = changed[part]
         marked = changed.astype(np.uint8)
@@ -82,7 +82,8 @@ def _signs(picture: ImageRGBA, region: "_Region | None") -> Floats:
     inside, around, rim = (each & known for each in (region.changed, region.around, region.rim))
     if not inside.any() or not around.any():
         return np.zeros(_SIGNS)
-    lab8 = _lab(cv2.blur(_rgb(picture), (3, 3)))
+    rgb = cv2.blur(_rgb(picture), (3, 3))
+    lab8 = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB), np.uint8)
     middle, spread = _middle_and_spread(lab8, around)
     lab = lab8.astype(np.float32)
     far = np.minimum(_length((lab[inside] - middle) / spread), 12.0)
@@ -110,19 +111,10 @@ def _rgb(picture: ImageRGBA) -> ImageRGB:
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGBA2RGB), np.uint8)
 
 
-def _lab(rgb: MatLike) -> Bytes:
-    return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB), np.uint8)
-
-
 def _middle_and_spread(lab: Bytes, around: Mask) -> tuple[Floats32, Floats32]:
     """The median (3,) of the ground's colours `around` in a picture (h, w, 3), and how far they stray from it, (3,)."""
     middle, deviation = middle_and_deviation(lab, around)
     return middle, np.float32(SIGMA_PER_MEDIAN_DEVIATION) * deviation + np.float32(3)
-
-
-def _reach_px(changed: Mask) -> int:
-    """How far around a changed region the ground is looked at."""
-    return int(np.clip(0.35 * np.sqrt(np.count_nonzero(changed)), 4, 40))
 
 
 def _near(changed: Mask, margin_px: int) -> tuple[slice, slice]:

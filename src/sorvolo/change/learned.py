@@ -48,7 +48,8 @@ def learned_difference(
     total = np.zeros((height, width), np.float32)
     features = features or learned_features
     for one, other in zip(features(reference), features(query), strict=True):
-        stride = _stride(one, width)
+        # Pixels of a picture of this width along a cell of a layer.
+        stride = (width + -width % _WHOLE_PX) // one.shape[2]
         rows, columns = -(-height // stride), -(-width // stride)
         held = cv2.resize(
             _padded(seen.view(np.uint8), stride), (columns, rows), interpolation=cv2.INTER_NEAREST
@@ -81,11 +82,6 @@ def learned_features(image: Image) -> list[Floats32]:
     )
     planes = np.ascontiguousarray(padded[..., ::-1].transpose(2, 0, 1))
     return [each[0] for each in _network().run(list(_LAYERS), {"image": planes[None]})]
-
-
-def _stride(layer: Floats32, width: int) -> int:
-    """Pixels of a picture of this width along a cell of a layer."""
-    return (width + -width % _WHOLE_PX) // layer.shape[2]
 
 
 def _padded(image: Bytes, stride: int) -> Bytes:

@@ -107,7 +107,8 @@ class _Pieces:
         held = np.bincount(self._own, minlength=self.count)
         self._is_held, self._number = held > 0, np.maximum(held, 1)
         self._middle, self._steps = middle, _steps(middle, self._places)
-        self._depth = self._mean(self._steps)
+        # (count,) means of values (N,) over the pixels of each piece.
+        self._depth = np.asarray(np.bincount(self._own, self._steps, self.count) / self._number)
 
     def are_shadows(self) -> Mask:
         """Which (count,) are no more than a part of the picture, and end all at once.
@@ -150,10 +151,6 @@ class _Pieces:
         same = np.zeros(self.count, bool)
         same[kept] = alike.max(axis=0) > _LEAST_ALIKE + _ALIKE_OF_FEW / np.sqrt(number)
         return same
-
-    def _mean(self, values: Floats) -> Floats:
-        """(count,) means of values (N,) over the pixels of each piece."""
-        return np.asarray(np.bincount(self._own, values, self.count) / self._number)
 
 
 def _places(image: MatLike) -> Labels:

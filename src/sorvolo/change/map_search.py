@@ -180,7 +180,23 @@ class MapSearch:
 
     def _tries(self, sought: _Sought, features: Features) -> Iterator[Found]:
         """The places that a frame could have, beside its neighbours first."""
-        beside = self._beside(sought)
+        # Pairs of the frame's points and the ground where placed neighbours show them.
+        pairs, own = _NO_PAIRS, None
+        for near in self._neighbours(sought):
+            own = orb_features(sought.even, self._features) if own is None else own
+            if id(near) not in self._orb:
+                alive = {id(each) for each in self._placed}
+                self._orb = {key: each for key, each in self._orb.items() if key in alive}
+                self._orb[id(near)] = orb_features(near.even, self._features)
+            old = self._orb[id(near)]
+            both = match(own, old, None, 0.0)
+            fitted = fit_homography(own.points_px[both[:, 0]], old.points_px[both[:, 1]], 3.0)
+            if fitted is None or fitted[1].sum() < 2 * _LEAST_PAIRS:
+                continue
+            agree = np.flatnonzero(fitted[1])[:: max(1, int(fitted[1].sum()) // 40)]
+            ground_m = apply_homography(near.site_from_image, old.points_px[both[agree, 1]])
+            pairs = pairs.joined(_Pairs(own.points_px[both[agree, 0]], ground_m))
+        beside = pairs
         found = self._near_neighbours(sought, features, beside) if len(beside) else None
         if found is not None:
             yield found
@@ -345,21 +361,6 @@ class MapSearch:
         found = known_only(found, known, _RIM_PX)
         return site_from_image, Features(LEARNED, found.points_px - spare, found.descriptors)
 
-    def _beside(self, sought: _Sought) -> _Pairs:
-        """Pairs of the frame's points and the ground where placed neighbours show them."""
-        pairs, own = _NO_PAIRS, None
-        for near in self._neighbours(sought):
-            own = orb_features(sought.even, self._features) if own is None else own
-            old = self._orb_of(near)
-            both = match(own, old, None, 0.0)
-            fitted = fit_homography(own.points_px[both[:, 0]], old.points_px[both[:, 1]], 3.0)
-            if fitted is None or fitted[1].sum() < 2 * _LEAST_PAIRS:
-                continue
-            agree = np.flatnonzero(fitted[1])[:: max(1, int(fitted[1].sum()) // 40)]
-            ground_m = apply_homography(near.site_from_image, old.points_px[both[agree, 1]])
-            pairs = pairs.joined(_Pairs(own.points_px[both[agree, 0]], ground_m))
-        return pairs
-
     def _neighbours(self, sought: _Sought) -> Iterator[_Placed]:
         """The nearest placed frames that may show some of the same ground."""
         if not self._placed:
@@ -374,10 +375,3 @@ class MapSearch:
         for index in np.argsort(away_m, kind="stable")[:_NEIGHBOURS]:
             if away_m[index] < reach_m:
                 yield self._placed[index]
-
-    def _orb_of(self, placed: _Placed) -> Features:
-        if id(placed) not in self._orb:
-            alive = {id(each) for each in self._placed}
-            self._orb = {key: each for key, each in self._orb.items() if key in alive}
-            self._orb[id(placed)] = orb_features(placed.even, self._features)
-        return self._orb[id(placed)]

@@ -10,7 +10,7 @@ import numpy as np
 from sorvolo.change.blobs import Blob, blobs_of, standing_outline_m
 from sorvolo.change.outlines import aside_of, measures, place_sigma_m
 from sorvolo.change.patches import PatchWindow, cut, patch_of
-from sorvolo.geometry.arrays import Floats, Labels, Mask, PointsM
+from sorvolo.geometry.arrays import Floats, Labels, Mask
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView
 from sorvolo.survey.objects import Sighting
 from sorvolo.tracking.tracker import Tracker, TrackerSettings
@@ -275,7 +275,13 @@ class BlobTracker:
             footprint_m=None if sees_horizon else view.outline_m,
             appearance=np.hstack([np.cos(colours), np.sin(colours)]),
         )
-        self._join(update.merged)
+        for gone, kept in update.merged.items():
+            younger = self._tracks.pop(gone, None)
+            older = self._tracks.get(kept)
+            if younger is not None:
+                self._tracks[kept] = (
+                    replace(younger, number=kept) if older is None else older.joined(younger)
+                )
         is_moving, held = np.zeros(len(view.boxes), bool), np.zeros(len(view.boxes), bool)
         legs = np.zeros(len(view.boxes), np.int64)
         shown: dict[int, BlobTrack] = {}
@@ -292,15 +298,6 @@ class BlobTracker:
         self._forget(oldest_ns)
         movers = tuple(each for each in shown.values() if each.moves_now)
         return MovingBlobs(is_moving, held, legs, movers, update.merged)
-
-    def _join(self, merged: Mapping[int, int]) -> None:
-        for gone, kept in merged.items():
-            younger = self._tracks.pop(gone, None)
-            older = self._tracks.get(kept)
-            if younger is not None:
-                self._tracks[kept] = (
-                    replace(younger, number=kept) if older is None else older.joined(younger)
-                )
 
     def _prolonged(self, number: int, point: TrackPoint, oldest_ns: int) -> BlobTrack:
         """The track with one more point, judged anew."""
@@ -452,7 +449,8 @@ class Movers:
         m_per_px = view.m_per_px
         outline_m = standing_outline_m(view, track.last.blob)
         if outline_m is None:
-            outline_m = _square(track.last.blob.place_m, self._cell_m)
+            place_m = track.last.blob.place_m
+            outline_m = place_m + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * self._cell_m / 2
         window = PatchWindow.around(
             outline_m.min(axis=0), outline_m.max(axis=0), self._m_per_px, 512
         )
@@ -474,7 +472,3 @@ class Movers:
             track.velocity_m_s,
             announced_ns=view.time_ns,
         )
-
-
-def _square(place_m: Floats, side_m: float) -> PointsM:
-    return place_m + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * side_m / 2

@@ -40,7 +40,12 @@ class Relief:
         cell_m = 1 / np.sqrt(abs(np.linalg.det(self.cells_from_site[:2, :2])))
         step_m = max(float(cell_m), highest / _MOST_STEPS)
         for up_m in np.arange(highest, 0, -step_m):
-            stands = self._at(_raised(ground_m, camera_m, float(up_m)))
+            places_m = _raised(ground_m, camera_m, float(up_m))
+            affine = self.cells_from_site
+            x, y = ((places_m @ row[:2] + row[2]).astype(np.float32) for row in affine[:2])
+            stands = np.asarray(
+                cv2.remap(self.above_m, x, y, cv2.INTER_LINEAR, borderValue=0.0), np.float32
+            )
             meets = (stands >= up_m) & (found == 0)
             # between this step and the last the ray came to the surface
             found[meets] = np.minimum(stands[meets], up_m + step_m)
@@ -77,13 +82,6 @@ class Relief:
             .astype(np.float32)
         )
         return at[..., 0], at[..., 1], sees
-
-    def _at(self, places_m: PointsM) -> Floats32:
-        affine = self.cells_from_site
-        x, y = ((places_m @ row[:2] + row[2]).astype(np.float32) for row in affine[:2])
-        return np.asarray(
-            cv2.remap(self.above_m, x, y, cv2.INTER_LINEAR, borderValue=0.0), np.float32
-        )
 
 
 def _grounds(site_from_image: Matrix3, size: tuple[int, int], asked: tuple[int, int]) -> PointsM:
