@@ -13,11 +13,11 @@ from sorvolo.change.areas import (
     leaning,
     level_of,
     segments,
-    with_areas,
 )
 from sorvolo.change.ground import GroundPictures
 from sorvolo.change.outlines import overlap
 from sorvolo.change.patches import PatchWindow, cut
+from sorvolo.change.reconcile import with_areas
 from sorvolo.lab.simulation.ground import GroundKind, paint_ground
 from sorvolo.lab.simulation.ground_painting import Area
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Patch

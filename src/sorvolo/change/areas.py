@@ -5,7 +5,7 @@ season and cameras do on this flight. An area is connected ground of other struc
 much more than that, in the views on the whole and in most of them alone.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import cv2
@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from sorvolo.change.ground import GroundSums
 from sorvolo.change.light import BLACK_LEVEL
-from sorvolo.change.outlines import mask_of, measures, outline_of, place_sigma_m
-from sorvolo.geometry.arrays import Bytes, Floats32, ImageRGB, Mask, Matrix3, PointsM
+from sorvolo.change.outlines import measures, outline_of, place_sigma_m
+from sorvolo.geometry.arrays import Bytes, Floats32, ImageRGB, Mask, Matrix3
 from sorvolo.geometry.homography import resized
-from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Patch
+from sorvolo.survey.findings import Change, ChangeKind, ComparedView
 
 _OCTAVES = np.log2(np.arange(256, dtype=np.float32) + np.float32(BLACK_LEVEL))  # of each grey level
 _SKY = np.array(
@@ -412,12 +412,6 @@ _PICTURE_PX = 8  # pixels of an area's pictures, along a cell's side
 _MOST_CELLS = 4_000_000  # of the raster, which bounds its memory: views beyond are left out
 
 
-# When a change is a part of an area, or an area only changes.
-_INSIDE = 0.7  # share of a change within an area: it is a part of it ...
-_STANDS_OUT = 1.5  # ... unless it differs by so many spreads of the ground around
-_EXPLAINED = 0.5  # share of an area within things: it is nothing more than they
-
-
 class AreaMap:
     """The areas of one flight while its views come in. Only `add` changes it."""
 
@@ -516,60 +510,3 @@ def _differs(signs: AreaSigns, own_units: float) -> Floats32:
         )
     differs = np.hypot(length / colour, (signs.detail - middle) / detail) > own_units
     return (differs & signs.known & (signs.likeness < _AREA_OTHER)).astype(np.float32)
-
-
-def with_areas(
-    changes: Sequence[Change],
-    areas: Sequence[Change],
-    lies_apart: Callable[[PointsM], bool] = lambda _: False,
-) -> list[Change]:
-    """Changes and areas, each piece of ground reported once.
-
-    A change that is a part of an area is left out, unless it is a thing that stands out from the ground around it on
-    either date, or whose outline, (N, 2), `lies_apart` by evidence of another kind. An area that things explain for the
-    most part is left out itself.
-    """
-    parts = [
-        each
-        for each in changes
-        if each.kind is not ChangeKind.MOVING
-        and any(_inside(each, area.outline_m) > _INSIDE for area in areas)
-        and not _is_thing(each.patch, _STANDS_OUT)
-    ]
-    things = [each for each in changes if each not in parts]
-    still = [each for each in things if each.kind is not ChangeKind.MOVING]
-    kept = [area for area in areas if _explained(area, still) < _EXPLAINED]
-    return things + [each for each in parts if lies_apart(each.outline_m)] + kept
-
-
-def _explained(area: Change, things: Sequence[Change]) -> float:
-    """The share of an area that lies within things."""
-    shape, site_from_patch = area.patch.changed.shape, area.patch.site_from_patch
-    own, theirs = mask_of(area.outline_m, site_from_patch, shape), np.zeros(shape, bool)
-    for each in things:
-        theirs |= mask_of(each.outline_m, site_from_patch, shape)
-    return float((own & theirs).sum() / max(1, own.sum()))
-
-
-def _inside(change: Change, outline_m: PointsM) -> float:
-    """The share of a change that lies within an outline, (N, 2)."""
-    shape, site_from_patch = change.patch.changed.shape, change.patch.site_from_patch
-    own, theirs = (mask_of(each, site_from_patch, shape) for each in (change.outline_m, outline_m))
-    return float((own & theirs).sum() / max(1, own.sum()))
-
-
-def _is_thing(patch: Patch, stands_out: float) -> bool:
-    """Whether what changed differs from the ground around it by more than that ground varies, before or after."""
-    reach = max(3, round(0.15 * max(patch.changed.shape)))
-    near = cv2.dilate(patch.changed.astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) > 0
-    for picture in (patch.before, patch.after):
-        known = picture[..., 3] > 0
-        ring, own = near & ~patch.changed & known, patch.changed & known
-        if np.count_nonzero(ring) < 20 or not own.any():
-            continue
-        levels = np.log2(picture[..., :3].astype(np.float32) + 8.0)
-        spread = levels[ring].std(axis=0) + 0.1
-        contrast = np.median(levels[own], axis=0) - np.median(levels[ring], axis=0)
-        if float(np.abs(contrast / spread).max()) > stands_out:
-            return True
-    return False

@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-from sorvolo.change.areas import AreaMap, with_areas
+from sorvolo.change.areas import AreaMap
 from sorvolo.change.evidence import EvidenceMap, EvidenceSettings
 from sorvolo.change.gathered import GatheredThings
+from sorvolo.change.reconcile import reconcile
 from sorvolo.change.views import ViewMaker
-from sorvolo.geometry.arrays import Mask
+from sorvolo.geometry.arrays import Floats, Mask
 from sorvolo.geometry.sun import slide_of
 from sorvolo.missions.compare.extension import NIGHT
 from sorvolo.missions.flight.settings import CompareSettings
@@ -80,12 +81,8 @@ class FlightChanges:
         first = evidence.next_number
         # in the dark the ground has neither its structure nor its colour
         areas = () if self._views.brightness < NIGHT else self._areas.conclude(self._flight, first)
-        if gathered is None:
-            return with_areas(things, areas)
-        found = with_areas(things, areas, lies_apart=gathered.lies_apart)
         self._numbers = itertools.count(first + len(areas))
-        found = gathered.conclude(self._flight, self._numbers, found)
-        return [each for each in found if not self._is_moved_shadow(each, gathered)]
+        return reconcile(things, areas, gathered, self._flight, self._numbers, self._slides)
 
     def of_objects(
         self, changes: Sequence[Change], objects: Sequence[tuple[ChangeKind, MapObject]]
@@ -108,15 +105,13 @@ class FlightChanges:
         """What became of all candidates, for the report; None if no view was compared."""
         return None if self._evidence is None else self._evidence.outcomes()
 
-    def _is_moved_shadow(self, change: Change, gathered: GatheredThings) -> bool:
-        """Whether a change is the shadow of what stays, by where the sun stood on both dates."""
+    def _slides(self, change: Change) -> tuple[Floats, Floats] | None:
+        """How far off a point 1 m up threw its shadow, before and after a change that may be one."""
         earlier = self._views.earlier_pictures
         before_ns = None if earlier is None else earlier.time_ns(change.outline_m)
         if before_ns is None or change.kind is ChangeKind.MOVING:
-            return False
+            return None
         before, after = (
             slide_of(sun_over(self._site, each)) for each in (before_ns, change.first_seen_ns)
         )
-        if before is None or after is None:
-            return False
-        return gathered.is_moved_shadow(change.outline_m, before, after)
+        return None if before is None or after is None else (before, after)
