@@ -531,9 +531,6 @@ class Seeds:
             del sizes[0], self._seeds[0]
 
     def _ask(self, seed: Candidate, view: ComparedView, kept_view: KeptView) -> None:
-        seed.ask(kept_view, self._grid.read(seed.cells).changed > 0, self._cell_m)
-
-    def _ask(self, seed: Candidate, view: ComparedView, kept_view: KeptView) -> None:
         if seed.ask(kept_view, self._grid.read(seed.cells).changed > 0, self._cell_m):
             seed.sights.show(view, *seed.cells.box_m(self._cell_m), self._m_per_px)
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
+from sorvolo.capture.source import LiveSource, Source
 from sorvolo.change.areas import AreaMap
 from sorvolo.change.evidence import EvidenceMap, EvidenceSettings
 from sorvolo.change.gathered import GatheredThings
@@ -21,20 +22,43 @@ from sorvolo.survey.findings import Change, ChangeKind, ComparedView
 from sorvolo.survey.flight import Site
 from sorvolo.survey.map_objects import MapObject
 
+# longest side of a compared picture; a video's frames come faster, and show a place more often
+_VIDEO_PX, _PHOTO_PX = 1280, 1600
+_FINER = 2.0  # times a photo's and the map's own pixels, at most: half of the pixels are compared
+_OVERLAP = 0.8  # of a video's frames of which learned differences are gathered, as photos overlap
+_FINE_M_PER_PX = 0.07  # a car has 60 px: finer gains nothing, and large smooth ground loses
+
 
 @dataclass(frozen=True)
-class Gathering:
-    """Which views learned differences are gathered of: all, or those that overlap by no more than `overlap`; they are
-    looked at `larger` times as large."""
+class ComparePlan:
+    """At which scale a flight's frames are compared, and of which of them learned differences are gathered."""
 
-    overlap: float | None = None
-    larger: float = 1.0
+    side_px: int  # longest side of a compared picture
+    finer: float  # times as fine as frame and map a compared picture may be
+    gathers: bool  # learned differences: where the map shows things with few pixels
+    overlap: float | None  # of the frames that they are gathered of; None: of all
+    larger: float  # times as large as they are compared, frames are looked at for them
+
+    @classmethod
+    def of(cls, source: Source, map_m_per_px: float, settings: CompareSettings) -> "ComparePlan":
+        """Plan a comparison; a stream leaves no time for learned differences."""
+        is_photos = source.kind == "photos"
+        fine = 1.0
+        if settings.method != "thesis":
+            fine = min(max(map_m_per_px / _FINE_M_PER_PX, 1.0), _FINER)
+        return cls(
+            settings.side_px or (_VIDEO_PX if source.kind == "video" else _PHOTO_PX),
+            fine if is_photos else 1.0,
+            fine > 1.0 and (is_photos or not isinstance(source, LiveSource)),
+            None if is_photos else _OVERLAP,
+            1.0 if is_photos else fine,
+        )
 
 
 class FlightChanges:
     """The changes of a flight. `add` takes a view in, `conclude` follows the last one.
 
-    `gathering`: over a map whose things have few pixels, learned differences are gathered too.
+    `plan` says whether learned differences are gathered too.
     """
 
     def __init__(
@@ -43,14 +67,13 @@ class FlightChanges:
         views: ViewMaker,
         site: Site,
         settings: CompareSettings,
-        gathering: Gathering | None,
+        plan: ComparePlan,
     ) -> None:
         self._flight, self._views, self._site, self._settings = flight, views, site, settings
         self._evidence: EvidenceMap | None = None
         self._areas = AreaMap()
-        self._gathered = None if gathering is None else GatheredThings(gathering.larger)
-        overlap = None if gathering is None else gathering.overlap
-        self._selection = StretchSelection(overlap or 0.0, keep_all=overlap is None)
+        self._gathered = GatheredThings(plan.larger) if plan.gathers else None
+        self._selection = StretchSelection(plan.overlap or 0.0, keep_all=plan.overlap is None)
         self._numbers = itertools.count(
             1
         )  # of the changes' ids that are still free, after `conclude`

@@ -8,7 +8,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from sorvolo.capture.source import LiveSource
 from sorvolo.change.alignment import Caution, FlightPlace
 from sorvolo.change.earlier_pictures import EarlierPicture, EarlierPictures, with_known_pixels
 from sorvolo.change.flight_on_map import FlightFit, FlightOnMap
@@ -25,7 +24,7 @@ from sorvolo.geometry.summary import median_of_known
 from sorvolo.heights.field import standing
 from sorvolo.missions.compare.area_heights import with_height_changes
 from sorvolo.missions.compare.extension import MapExtension
-from sorvolo.missions.compare.flight_changes import FlightChanges, Gathering
+from sorvolo.missions.compare.flight_changes import ComparePlan, FlightChanges
 from sorvolo.missions.compare.objects import ComparisonObjects
 from sorvolo.missions.compare.report import (
     ViewCounts,
@@ -57,20 +56,8 @@ from sorvolo.survey.findings import Change, ComparedView, Verdict, ViewStatus
 from sorvolo.survey.flight import LostFrame, Notice, PosedFrame
 from sorvolo.survey.mosaic import FrameView, PlacedFrame, Status
 
-# How large frames are compared where nothing else is asked for; how much of earlier pictures is
-# kept at hand.
-# longest side; a video's frames come faster than photos, and show a place more often
-_VIDEO_PX = 1280
-_PHOTO_PX = 1600  # photos are fewer and show more ground
-# times a photo's and the map's own pixels, at most: the robust method sees half of them
-_FINER = 2.0
-# of a video's frames of which learned differences are gathered, as photos overlap
-_VIDEO_OVERLAP = 0.8
-_FINE_M_PER_PX = 0.07  # a car has 60 px: finer gains nothing, and large smooth ground loses
-_CACHE_BYTES = 128 * 2**20
-
-VIEW, VIEW_AGAIN = "view", "view again"
-"""Stages of a comparison's results."""
+VIEW, VIEW_AGAIN = "view", "view again"  # stages of a comparison in the cache
+_CACHE_BYTES = 128 * 2**20  # of earlier pictures at hand
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +121,11 @@ class CompareRun:
         )
         self._views = view_maker(setup, archive, settings, base_version)
         self._changes = FlightChanges(
-            source.name, self._views, archive.site(), settings, _gathering(setup, archive, settings)
+            source.name,
+            self._views,
+            archive.site(),
+            settings,
+            ComparePlan.of(source, archive.site_grid().grid.m_per_px, settings),
         )
         self._rejected = [
             KnownPlace(each.outline_m, each.kind)
@@ -426,31 +417,15 @@ class CompareRun:
         }
 
 
-def _finer(archive: Archive, settings: CompareSettings) -> float:
-    """How many times as fine as the map its ground is looked at: 1 where things have pixels enough, or by method
-    thesis. Over coarser maps learned features are compared as well."""
-    m_per_px = archive.site_grid().grid.m_per_px
-    return 1.0 if settings.method == "thesis" else min(max(m_per_px / _FINE_M_PER_PX, 1.0), _FINER)
-
-
-def _gathering(setup: FlightSetup, archive: Archive, settings: CompareSettings) -> Gathering | None:
-    """Of which views learned differences are gathered; a stream leaves no time for them."""
-    finer = _finer(archive, settings)
-    if finer <= 1.0:
-        return None
-    if setup.source.kind == "photos":
-        return Gathering()
-    return None if isinstance(setup.source, LiveSource) else Gathering(_VIDEO_OVERLAP, finer)
-
-
 def view_maker(
     setup: FlightSetup, archive: Archive, settings: CompareSettings, base_version: int
 ) -> ViewMaker:
     """What compares a flight's frames with a version of the map of a site."""
     source, site_grid = setup.source, archive.site_grid()
-    side_px = settings.side_px or (_VIDEO_PX if source.kind == "video" else _PHOTO_PX)
-    finer = _finer(archive, settings) if source.kind == "photos" else 1.0
-    flight = FlightCamera(source.camera.camera, setup.usual_height_m, side_px, setup.utc_ns, finer)
+    plan = ComparePlan.of(source, site_grid.grid.m_per_px, settings)
+    flight = FlightCamera(
+        source.camera.camera, setup.usual_height_m, plan.side_px, setup.utc_ns, plan.finer
+    )
     reference = ReferenceMap(archive.tiles(base_version), site_grid.grid)
     if settings.method == "thesis":
         return ViewMaker(flight, reference, site_grid, settings.thesis, None)
