@@ -111,7 +111,15 @@ def find_board(name: str, image: ImageRGB, board: Board) -> BoardView | NoBoard:
         return NoBoard(name)
     corners_px = (corners.reshape(-1, 2).astype(np.float64) + 0.5) / scale - 0.5
     # on drawn boards the search alone is 0.10-0.16 px rms off, refined 0.03 px
-    corners_px = _refined(gray, corners_px, board)
+    grid = corners_px.reshape(board.rows, board.columns, 2)
+    step_px = min(np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1))
+    window = int(np.clip(0.3 * step_px, 2, 15))
+    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 0.01)
+    points = corners_px.astype(np.float32).reshape(-1, 1, 2)
+    corners_px = np.asarray(
+        cv2.cornerSubPix(gray, points, (window, window), (-1, -1), stop).reshape(-1, 2),
+        dtype=np.float64,
+    )
     sharpness = cv2.estimateChessboardSharpness(
         gray, size, corners_px.astype(np.float32).reshape(-1, 1, 2)
     )
@@ -157,7 +165,8 @@ def calibrate(
         dropped += [used[index].name for index in bad]
         used = [view for index, view in enumerate(used) if index not in bad]
         fit = _fit(used, board, width_px, height_px)
-    spread_deg = _tilt_spread_deg(fit.rotation_vectors_rad)
+    normals = np.array([cv2.Rodrigues(vector)[0][:, 2] for vector in fit.rotation_vectors_rad])
+    spread_deg = float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1.0, 1.0))).max())
     _need(
         spread_deg >= LEAST_TILT_SPREAD_DEG,
         f"the boards are tilted by no more than {spread_deg:.1f} deg against each other, "
@@ -229,11 +238,6 @@ def _outliers(view_errors_px: Floats) -> list[int]:
     ]
 
 
-def _tilt_spread_deg(rotation_vectors_rad: Floats) -> float:
-    normals = np.array([cv2.Rodrigues(vector)[0][:, 2] for vector in rotation_vectors_rad])
-    return float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1.0, 1.0))).max())
-
-
 def _coverage(views: Sequence[BoardView], board: Board, width_px: int, height_px: int) -> float:
     """The part of the picture that lies inside the corners of at least one board."""
     scale = 200 / max(width_px, height_px)
@@ -249,18 +253,6 @@ def _distance_px(a: BoardView, b: BoardView) -> float:
     """Mean way of the corners from one view to the other; the same board may be found upside down."""
     orders = (b.corners_px, b.corners_px[::-1])
     return min(float(np.linalg.norm(a.corners_px - order, axis=1).mean()) for order in orders)
-
-
-def _refined(gray: ImageGray, corners_px: PointsPx, board: Board) -> PointsPx:
-    grid = corners_px.reshape(board.rows, board.columns, 2)
-    step_px = min(np.linalg.norm(np.diff(grid, axis=axis), axis=2).min() for axis in (0, 1))
-    window = int(np.clip(0.3 * step_px, 2, 15))
-    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 0.01)
-    points = corners_px.astype(np.float32).reshape(-1, 1, 2)
-    return np.asarray(
-        cv2.cornerSubPix(gray, points, (window, window), (-1, -1), stop).reshape(-1, 2),
-        dtype=np.float64,
-    )
 
 
 def _need(is_met: bool, found: str) -> None:

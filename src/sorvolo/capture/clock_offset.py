@@ -178,7 +178,18 @@ def _offset_sigma_s(
     some = np.unique(np.linspace(0, len(rows) - 1, settings.most_frames).round().astype(int))
     rows, velocity_m_s = rows[some], velocity_m_s[some]
     at_s, places, misses = times_s[rows], places_m[rows], (fixes_m - places_m)[rows].T.ravel()
-    similar = _similarity_rows(places)
+    # (2N, 4) how N places, all their easts before their norths, move with a similarity of their
+    # plane.
+    east, north = (places - places.mean(axis=0)).T
+    one, zero = np.ones(len(places)), np.zeros(len(places))
+    similar = np.column_stack(
+        [
+            np.concatenate([one, zero]),
+            np.concatenate([zero, one]),
+            np.concatenate([east, north]),
+            np.concatenate([-north, east]),
+        ]
+    )
     taken_up, *_ = np.linalg.lstsq(similar, velocity_m_s.T.ravel(), rcond=None)
     motion = (
         velocity_m_s.T.ravel() - similar @ taken_up
@@ -201,20 +212,6 @@ def _offset_sigma_s(
             )
     weights = np.exp(np.array(likelihoods) - max(likelihoods))
     return float(np.sqrt(np.average(variances, weights=weights)))
-
-
-def _similarity_rows(places_m: PointsM) -> Floats:
-    """(2N, 4) how N places, all their easts before their norths, move with a similarity of their plane."""
-    east, north = (places_m - places_m.mean(axis=0)).T
-    one, zero = np.ones(len(places_m)), np.zeros(len(places_m))
-    return np.column_stack(
-        [
-            np.concatenate([one, zero]),
-            np.concatenate([zero, one]),
-            np.concatenate([east, north]),
-            np.concatenate([-north, east]),
-        ]
-    )
 
 
 def _restricted_likelihood(alike: Floats, model: Floats, misses: Floats) -> tuple[float, float]:

@@ -239,7 +239,17 @@ def camera_from_nodes(
 
     A calibration of another size serves when the shape is the same; `origin` states it.
     """
-    _refuse_other_lens_models(file_name, nodes)
+    model = nodes.get("distortionmodel", nodes.get("cameramodel", "pinhole"))
+    fisheye = nodes.get("fisheyemodel", nodes.get("fisheye", 0.0))
+    is_other = isinstance(model, str) and any(
+        word in model.lower() for word in ("fisheye", "equidistant", "rational", "omni", "double")
+    )
+    if is_other or fisheye not in (0.0, "false", "False", ""):
+        raise InputError(
+            f"{file_name}: a {model if is_other else 'fisheye'} lens model; the five-coefficient one (k1 "
+            "k2 p1 p2 k3) "
+            "is needed: calibrate again without the fisheye or rational option"
+        )
     matrix = _matrix(file_name, nodes)
     distortion, order_words = _distortion(file_name, nodes)
     words = f"calibration {file_name}, {order_words}"
@@ -258,25 +268,14 @@ def camera_from_nodes(
     except GeometryError as error:
         raise InputError(f"{file_name}: {error}") from error
     check_lens(file_name, camera)
-    sigma = _sigma(nodes)
+    stated = nodes.get("focalsigma")
+    sigma = (
+        float(stated) if isinstance(stated, float) and 1e-4 < stated <= 0.5 else _CALIBRATED_SIGMA
+    )
     if size != (width_px, height_px):
         words += f", resized from {size[0]}x{size[1]}"
         camera, sigma = camera.resized(width_px, height_px), max(sigma, _RESIZED_SIGMA)
     return CameraModel(camera, words, sigma)
-
-
-def _refuse_other_lens_models(file_name: str, nodes: Mapping[str, Node]) -> None:
-    model = nodes.get("distortionmodel", nodes.get("cameramodel", "pinhole"))
-    fisheye = nodes.get("fisheyemodel", nodes.get("fisheye", 0.0))
-    is_other = isinstance(model, str) and any(
-        word in model.lower() for word in ("fisheye", "equidistant", "rational", "omni", "double")
-    )
-    if is_other or fisheye not in (0.0, "false", "False", ""):
-        raise InputError(
-            f"{file_name}: a {model if is_other else 'fisheye'} lens model; the five-coefficient one (k1 "
-            "k2 p1 p2 k3) "
-            "is needed: calibrate again without the fisheye or rational option"
-        )
 
 
 def _matrix(file_name: str, nodes: Mapping[str, Node]) -> Matrix3:
@@ -436,13 +435,6 @@ def check_lens(file_name: str, camera: Camera) -> None:
             "coefficients' "
             "order"
         )
-
-
-def _sigma(nodes: Mapping[str, Node]) -> float:
-    stated = nodes.get("focalsigma")
-    return (
-        float(stated) if isinstance(stated, float) and 1e-4 < stated <= 0.5 else _CALIBRATED_SIGMA
-    )
 
 
 def _first(nodes: Mapping[str, Node], keys: tuple[str, ...]) -> Node | None:

@@ -136,7 +136,13 @@ def open_sources(
     names = _distinct_names(
         [*(path.resolve() for path in videos), *(album.place for album in albums)]
     )
-    _demand_one_flight(telemetry, len(names) + len(addresses))
+    # Raises InputError where telemetry was given for more than one flight.
+    flights = len(names) + len(addresses)
+    if telemetry is not None and flights > 1:
+        raise InputError(
+            f"one telemetry file for {flights} flights; map the flights one by one, or put each telemetry file beside "
+            "its video under the same name"
+        )
     log = _telemetry_file(telemetry, is_live=bool(addresses))
     sources: list[VideoSource | PhotoSource | LiveSource] = [
         *(_open_video(path, name, log, camera) for path, name in zip(videos, names)),
@@ -150,25 +156,10 @@ def open_sources(
         ),
     ]
     _give_names(sources, known)
-    _use_better_cameras(sources, better_camera)
-    return list(sources)
-
-
-def _demand_one_flight(telemetry: Path | str | None, flights: int) -> None:
-    """Raises InputError where telemetry was given for more than one flight."""
-    if telemetry is not None and flights > 1:
-        raise InputError(
-            f"one telemetry file for {flights} flights; map the flights one by one, or put each telemetry file beside "
-            "its video under the same name"
-        )
-
-
-def _use_better_cameras(
-    sources: Sequence[VideoSource | PhotoSource | LiveSource], better: BetterCamera | None
-) -> None:
-    if better is not None:
+    if better_camera is not None:
         for each in sources:
-            each.camera = better(each.camera)
+            each.camera = better_camera(each.camera)
+    return list(sources)
 
 
 def _recorded(inputs: Sequence[Path | str]) -> list[Path]:

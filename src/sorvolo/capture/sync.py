@@ -344,16 +344,8 @@ def shifted(track: Track, offset_s: float) -> Track:
     """
     if track.interval_s:
         return replace(track, sample_s=track.sample_s - offset_s)
-    velocities_m_s, spread_m_s = _velocities(track)
-    return replace(
-        track,
-        east_north_m=track.east_north_m + offset_s * velocities_m_s,
-        horizontal_sigma_m=np.hypot(track.horizontal_sigma_m, offset_s * spread_m_s),
-    )
-
-
-def _velocities(track: Track) -> tuple[PointsM, Floats]:
-    """Velocity at each fix, (N, 2) m/s, the mean of the legs before and after it; and half their difference, (N,)."""
+    # Velocity at each fix, (N, 2) m/s, the mean of the legs before and after it; and half their
+    # difference, (N,).
     known = np.flatnonzero(np.isfinite(track.east_north_m[:, 0]))
     velocities, spread = np.zeros_like(track.east_north_m), np.zeros(len(track.east_north_m))
     if len(known) >= 2:
@@ -363,7 +355,12 @@ def _velocities(track: Track) -> tuple[PointsM, Floats]:
             (before + after) / 2,
             np.linalg.norm(after - before, axis=1) / 2,
         )
-    return velocities, spread
+    velocities_m_s, spread_m_s = velocities, spread
+    return replace(
+        track,
+        east_north_m=track.east_north_m + offset_s * velocities_m_s,
+        horizontal_sigma_m=np.hypot(track.horizontal_sigma_m, offset_s * spread_m_s),
+    )
 
 
 def site_origin(telemetry: Telemetry) -> Geodetic | None:

@@ -217,7 +217,10 @@ def _packets(
         for packet in container.demux(stream):
             if packet.size == 0:
                 continue  # PyAV's sign of the end
-            _check(packet)
+            if packet.pts is None:
+                raise UnevenStreamError("pictures of the stream have no time stamps")
+            if packet.is_corrupt or packet.is_discard:
+                raise UnevenStreamError("the stream is damaged, or edited")
             key_pts = packet.pts if packet.is_keyframe else key_pts
             if key_pts is None:
                 raise UnevenStreamError("the video does not begin with a key frame")
@@ -228,13 +231,6 @@ def _packets(
             yield packet
     except (av.FFmpegError, IndexError) as error:
         raise UnevenStreamError("the stream is damaged") from error
-
-
-def _check(packet: "_Packet") -> None:
-    if packet.pts is None:
-        raise UnevenStreamError("pictures of the stream have no time stamps")
-    if packet.is_corrupt or packet.is_discard:
-        raise UnevenStreamError("the stream is damaged, or edited")
 
 
 def _pts(packet: "_Packet") -> int:

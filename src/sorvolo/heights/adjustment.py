@@ -54,7 +54,8 @@ class Scene:
 
     def residuals_px(self) -> Floats:
         """(M, 2) predicted minus seen, px; NaN behind a camera."""
-        local = self._local()
+        offset = self.points_m[self.point] - self.centres_m[self.view]
+        local = np.einsum("mji,mj->mi", self.rotations[self.view], offset)
         with np.errstate(divide="ignore", invalid="ignore"):
             image = np.where(local[:, 2:] > 1e-6, local[:, :2] / local[:, 2:], np.nan)
         return self.focal_px[self.view, None] * (np.exp(self.shared[0]) * image - self.corrected())
@@ -75,10 +76,6 @@ class Scene:
             point=point,
             seen=self.seen[observations],
         )
-
-    def _local(self) -> Floats:
-        offset = self.points_m[self.point] - self.centres_m[self.view]
-        return np.einsum("mji,mj->mi", self.rotations[self.view], offset)
 
 
 def through_lens(seen: Floats, shared: Floats) -> Floats:

@@ -344,7 +344,10 @@ def _solved(
     residual = scene.residuals_px()
     with np.errstate(invalid="ignore"):
         off = (scene.centres_m - priors.fixes_m)[held]
-    weighed = _as_it_fits(residual, settings.adjustment)
+    # The pictures weighed as they fit (their residuals' median), which is better than the
+    # settings assume.
+    fit_px = SIGMA_PER_MEDIAN_DEVIATION * float(np.nanmedian(np.abs(residual)))
+    weighed = replace(settings.adjustment, sigma_px=max(fit_px, settings.adjustment.least_sigma_px))
     sigma = SmoothSigma.fitted(scene.points_m[:, :2], height_deviations(scene, priors, weighed))
     return Cameras3D(
         moved,
@@ -368,9 +371,3 @@ def _found(camera: Camera, scale: float, shift: Floats) -> Camera:
         cx_px=float(camera.cx_px - camera.fx_px * shift[0]),
         cy_px=float(camera.cy_px - camera.fy_px * shift[1]),
     )
-
-
-def _as_it_fits(residual_px: Floats, settings: AdjustmentSettings) -> AdjustmentSettings:
-    """The pictures weighed as they fit (their residuals' median), which is better than the settings assume."""
-    fit_px = SIGMA_PER_MEDIAN_DEVIATION * float(np.nanmedian(np.abs(residual_px)))
-    return replace(settings, sigma_px=max(fit_px, settings.least_sigma_px))

@@ -82,7 +82,13 @@ def sweep_surface(
     points in space that bound the heights to look for; `camera_sigma` is what heights err by the cameras.
     """
     heights_m = np.array([view.site_from_camera.translation_m[2] for view in views])
-    everywhere = _bounds(points_m, float(np.median(heights_m)))
+    # The heights to look for: those of the points, and beyond them, for crowns have few points,
+    # or none.
+    camera_m = float(np.median(heights_m))
+    low, high = np.percentile(points_m[:, 2], [0.5, 99.5])
+    ground = float(np.median(points_m[:, 2]))
+    reach = camera_m - ground
+    everywhere = Bounds(float(low - 0.05 * reach), float(max(high, ground + 0.4 * reach)), ground)
     side = _tile_cells(lattice.cell_m, views, settings)
     wide = lattice.coarser(settings.coarser)
     coarse = _coarse(wide, views, pictures, everywhere, settings)
@@ -154,14 +160,6 @@ def _seen_through(
     return np.repeat(np.repeat(found, times, axis=0), times, axis=1)[
         : lattice.height, : lattice.width
     ]
-
-
-def _bounds(points_m: PointsM, camera_m: float) -> Bounds:
-    """The heights to look for: those of the points, and beyond them, for crowns have few points, or none."""
-    low, high = np.percentile(points_m[:, 2], [0.5, 99.5])
-    ground = float(np.median(points_m[:, 2]))
-    reach = camera_m - ground
-    return Bounds(float(low - 0.05 * reach), float(max(high, ground + 0.4 * reach)), ground)
 
 
 def _coarse(

@@ -165,7 +165,13 @@ def sweep(
     seen_by = np.sum(seen, axis=0).astype(np.float32)
     total = smoothed(_cost(agreement, settings.smoothing), settings.smoothing)
     up_m, score = _best(total, agreement, levels)
-    deviation = _deviation(total, up_m, levels, settings)
+    # (H, W) the root mean square distance of the other levels from a height, each by its
+    # probability.
+    chance = np.exp(
+        (total.min(axis=1, keepdims=True) - total) / (8 * settings.smoothing.temperature)
+    )
+    away = levels[None, :, None].astype(np.float32) - up_m[:, None]
+    deviation = np.asarray(np.sqrt((chance * away**2).sum(axis=1) / chance.sum(axis=1)), np.float32)
     up_m[~(score >= settings.least_score)] = (
         np.nan
     )  # no two photos see the height that fits, or they do not agree
@@ -307,7 +313,17 @@ class _Laid:
         self._size = picture.shape[1], picture.shape[0]
         piece = self._crop_to(picture, bounds, settings)
         away_m = others_m - view.site_from_camera.translation_m
-        angles = self._angles(away_m, lattice, bounds.usual_m)
+        # (N,) in which direction of the picture, in steps, things move with their height against
+        # other photos.
+        cells_from_site = np.linalg.inv(lattice.site_from_cells)[:2, :2]
+        middle = np.array([(lattice.width - 1) / 2, (lattice.height - 1) / 2])
+        ends = np.concatenate([[middle], middle + _unit(away_m[:, :2] @ cells_from_site.T)])
+        seen = (
+            np.column_stack([ends, np.ones(len(ends))]) @ self._picture_from_cells(bounds.usual_m).T
+        )
+        places = seen[:, :2] / np.maximum(np.abs(seen[:, 2:]), 1e-9)
+        moved = places[1:] - places[0]
+        angles = np.asarray(np.rint(np.arctan2(moved[:, 1], moved[:, 0]) / _ANGLE_RAD) % _ANGLES)
         others = (away_m != 0).any(axis=1)
         channels, which = np.unique(angles[others], return_inverse=True)
         self._contrast = [
@@ -361,7 +377,14 @@ class _Laid:
 
         Beyond its border it would see the border, not the ground.
         """
-        lines = self._lines(levels_m, side)
+        # (L, 4, 3) a photo's sides on level planes: positive on the inner side, where the
+        # picture's depth is.
+        inset = 0.5 * (side * self._px_per_cell + self._apron)
+        (w, h), planes = self._size, self._level + levels_m[:, None, None] * self._up
+        x, y, z = planes[:, 0], planes[:, 1], planes[:, 2]
+        lines = np.stack(
+            [x - inset * z, (w - 1 - inset) * z - x, y - inset * z, (h - 1 - inset) * z - y], axis=1
+        )
         inside = lines @ self._corners >= 0
         everywhere, nowhere = inside.all(axis=(1, 2)), ~inside.any(axis=2).all(axis=1)
         for number, up_m in enumerate(levels_m.tolist()):
@@ -385,15 +408,6 @@ class _Laid:
         for line in lines:
             known &= line[0] * columns + (line[1] * rows + line[2]) >= 0
         return known
-
-    def _lines(self, levels_m: Floats, side: int) -> Floats:
-        """(L, 4, 3) a photo's sides on level planes: positive on the inner side, where the picture's depth is."""
-        inset = 0.5 * (side * self._px_per_cell + self._apron)
-        (w, h), planes = self._size, self._level + levels_m[:, None, None] * self._up
-        x, y, z = planes[:, 0], planes[:, 1], planes[:, 2]
-        return np.stack(
-            [x - inset * z, (w - 1 - inset) * z - x, y - inset * z, (h - 1 - inset) * z - y], axis=1
-        )
 
     def shows(self, up_m: Floats32, side: int) -> Mask:
         """(H, W) where a patch lies in the photo as a whole at each cell's own height, (H, W); nowhere for NaN."""
@@ -429,16 +443,6 @@ class _Laid:
             high = np.clip(np.ceil(places.max(axis=0)) + apron + 1, low + 1, high).astype(int)
         self._from_picture = np.array([[1.0, 0, -low[0]], [0, 1, -low[1]], [0, 0, 1]])
         return picture[low[1] : high[1], low[0] : high[0]].astype(np.float32)
-
-    def _angles(self, away_m: PointsM, lattice: Lattice, up_m: float) -> Floats:
-        """(N,) in which direction of the picture, in steps, things move with their height against other photos."""
-        cells_from_site = np.linalg.inv(lattice.site_from_cells)[:2, :2]
-        middle = np.array([(lattice.width - 1) / 2, (lattice.height - 1) / 2])
-        ends = np.concatenate([[middle], middle + _unit(away_m[:, :2] @ cells_from_site.T)])
-        seen = np.column_stack([ends, np.ones(len(ends))]) @ self._picture_from_cells(up_m).T
-        places = seen[:, :2] / np.maximum(np.abs(seen[:, 2:]), 1e-9)
-        moved = places[1:] - places[0]
-        return np.asarray(np.rint(np.arctan2(moved[:, 1], moved[:, 0]) / _ANGLE_RAD) % _ANGLES)
 
 
 def _unit(vectors: Floats) -> Floats:
@@ -602,14 +606,3 @@ def _best(total: Floats32, agreement: Floats32, levels: Floats) -> tuple[Floats3
     is_edge = best != around
     up_m[is_edge] = levels[best[is_edge]]
     return up_m.astype(np.float32), score
-
-
-def _deviation(
-    total: Floats32, up_m: Floats32, levels: Floats, settings: SweepSettings
-) -> Floats32:
-    """(H, W) the root mean square distance of the other levels from a height, each by its probability."""
-    chance = np.exp(
-        (total.min(axis=1, keepdims=True) - total) / (8 * settings.smoothing.temperature)
-    )
-    away = levels[None, :, None].astype(np.float32) - up_m[:, None]
-    return np.asarray(np.sqrt((chance * away**2).sum(axis=1) / chance.sum(axis=1)), np.float32)

@@ -359,7 +359,11 @@ def _normal_equations(problem: _Problem, nodes: Nodes, shared: Floats) -> Normal
     if len(problem.ground.node):
         _add_ground(into, nodes, problem.ground, shared, problem.position, problem.robust_sigmas)
     _add_telemetry(into, nodes, shared, problem.position, problem.robust_sigmas)
-    _add_shared_priors(into, shared, problem.shared_sigma)
+    held = problem.shared_sigma <= 0
+    prior = np.where(held, 1e12, 1 / np.maximum(problem.shared_sigma, 1e-12) ** 2)
+    into.add_shared(np.diag(prior), np.where(held, 0.0, -prior * shared))
+    into.hold_shared(held)
+    into.cost += float(np.where(held, 0.0, prior * shared**2).sum())
     return into
 
 
@@ -404,14 +408,6 @@ def _add_ground(
         np.concatenate([rows.by_camera, rows.by_shared], axis=-1) / rows.sigma_px[:, None, None]
     )
     into.add(jacobian * root[..., None], residual * root, (position[ground.node],))
-
-
-def _add_shared_priors(into: NormalEquations, shared: Floats, shared_sigma: Floats) -> None:
-    held = shared_sigma <= 0
-    prior = np.where(held, 1e12, 1 / np.maximum(shared_sigma, 1e-12) ** 2)
-    into.add_shared(np.diag(prior), np.where(held, 0.0, -prior * shared))
-    into.hold_shared(held)
-    into.cost += float(np.where(held, 0.0, prior * shared**2).sum())
 
 
 def _add_telemetry(

@@ -113,7 +113,14 @@ def tie_control(
     while True:
         mapper.tie_to_ground(seen.of(used), is_datum=problem.is_datum)
         misses, scatter = seen.misses(mapper.ground_places_m(seen.ties))
-        expected_m = _expected_m(mapper, seen, problem, settings)
+        # How far a point that is right may miss, one sigma: its survey's error and that of its
+        # marks.
+        heights_m = [mapper.pose(each).translation_m[2] for each in seen.ties.keyframe_ids.tolist()]
+        expected_m = float(
+            np.hypot(
+                settings.sigma_m, settings.mark_px * np.median(heights_m) / problem.camera.fx_px
+            )
+        )
         wrong = _wrong_point(seen, misses, used, expected_m, settings)
         if wrong is None or len(used) == LEAST_CONTROL:
             break
@@ -274,16 +281,6 @@ def _places_m(control: GroundControl, frame: LocalFrame) -> PointsM:
     known = np.isfinite(height)
     up_m = np.where(known, height - (np.median(height[known]) if known.any() else 0.0), 0.0)
     return np.column_stack([frame.site_from_wgs84(latitude, longitude, level)[:, :2], up_m])
-
-
-def _expected_m(
-    mapper: PlanarMapper, seen: _Seen, problem: ControlProblem, settings: ControlSettings
-) -> float:
-    """How far a point that is right may miss, one sigma: its survey's error and that of its marks."""
-    heights_m = [mapper.pose(each).translation_m[2] for each in seen.ties.keyframe_ids.tolist()]
-    return float(
-        np.hypot(settings.sigma_m, settings.mark_px * np.median(heights_m) / problem.camera.fx_px)
-    )
 
 
 def _wrong_point(

@@ -114,7 +114,17 @@ def _fronts(count: int, one: Rows, other: Rows) -> list[_Front]:
     """In the order in which they go out."""
     if count <= _AT_ONCE:
         return [_Front(np.arange(count), np.zeros(0, int), -1)]
-    when = _order(count, one, other)
+    # (count,) when each camera goes out, so that few ties arise: by least degree, the cameras of
+    # a branch together.
+    ties = coo_matrix((np.full(len(one), -1.0), (one, other)), shape=(count, count))
+    ties = ties + ties.T
+    degree = np.asarray(ties.sum(axis=0)).ravel()
+    regular = csc_matrix(
+        ties - coo_matrix((degree - 1, (np.arange(count), np.arange(count))), shape=(count, count))
+    )
+    when = splu(
+        regular, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0
+    ).perm_c.astype(int)
     tied = _tied_then(when, one, other)
     camera = np.argsort(when)
     merged: list[
@@ -164,19 +174,6 @@ def _waiting_little(
         if len(tied[end]):
             before[front_of[tied[end][0]]].append(end)
     return [each for order in branch.values() for each in order]
-
-
-def _order(count: int, one: Rows, other: Rows) -> Rows:
-    """(count,) when each camera goes out, so that few ties arise: by least degree, the cameras of a branch together."""
-    ties = coo_matrix((np.full(len(one), -1.0), (one, other)), shape=(count, count))
-    ties = ties + ties.T
-    degree = np.asarray(ties.sum(axis=0)).ravel()
-    regular = csc_matrix(
-        ties - coo_matrix((degree - 1, (np.arange(count), np.arange(count))), shape=(count, count))
-    )
-    return splu(
-        regular, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0
-    ).perm_c.astype(int)
 
 
 def _tied_then(when: Rows, one: Rows, other: Rows) -> list[Rows]:

@@ -498,7 +498,15 @@ class PlanarMapper:
             self._ask_dearly(tie)
             self._ask_under(tie, previous)
         if not tie.links and not new.prior.knows_place:
-            self._ask_everywhere(tie)
+            # Ask the last pictures and some of all the flight until one links: nobody knows where
+            # the new one is.
+            for each in [*self._own[::-1][1:10], *self._own[:: max(1, len(self._own) // 20)]]:
+                if (
+                    each not in tie.refusals
+                    and len(tie.refusals) < self._settings.recovery
+                    and not tie.links
+                ):
+                    self._ask(tie, each, None, Effort.ALL)
         if not self._own and tie.guess is None:
             tie.guess = Pose(new.prior.rotation, new.prior.position_m)
         reason = tie.refusal_reason
@@ -547,16 +555,6 @@ class PlanarMapper:
                 self._ask(tie, other, None, Effort.ALL)
             if len(tie.links) >= self._settings.wanted_links:
                 return
-
-    def _ask_everywhere(self, tie: _Tie) -> None:
-        """Ask the last pictures and some of all the flight until one links: nobody knows where the new one is."""
-        for each in [*self._own[::-1][1:10], *self._own[:: max(1, len(self._own) // 20)]]:
-            if (
-                each not in tie.refusals
-                and len(tie.refusals) < self._settings.recovery
-                and not tie.links
-            ):
-                self._ask(tie, each, None, Effort.ALL)
 
     def _guess_by_telemetry(self, new: Keyframe) -> Pose | None:
         prior = new.prior

@@ -226,7 +226,13 @@ class PoseGraph:
         """Tie a new keyframe to the graph by its links (`new_id` is this one), starting from `guess`."""
         self._append(keyframe_id, _Node(camera, True, np.full((4, 2), np.inf)), prior, guess)
         for each in links:
-            self._append_link(each)
+            old, new = self._ids[each.old_id], self._ids[each.new_id]
+            self._links.append(
+                each,
+                (old, self._nodes[old].camera),
+                (new, self._nodes[new].camera),
+                max(self._settings.sigma_px, each.sigma_px),
+            )
         free = np.zeros(len(self._nodes), bool)
         free[-self._settings.window :] = True
         free[[self._ids[each.old_id] for each in links]] = True
@@ -428,15 +434,6 @@ class PoseGraph:
         self._nodes.append(node)
         self._rows.append(prior, pose, own=node.own)
 
-    def _append_link(self, each: Link) -> None:
-        old, new = self._ids[each.old_id], self._ids[each.new_id]
-        self._links.append(
-            each,
-            (old, self._nodes[old].camera),
-            (new, self._nodes[new].camera),
-            max(self._settings.sigma_px, each.sigma_px),
-        )
-
     def _at(self, keyframe_ids: Sequence[int]) -> Rows:
         """(N,) the keyframes' node indices."""
         return np.fromiter(map(self._ids.__getitem__, keyframe_ids), int, len(keyframe_ids))
@@ -487,7 +484,8 @@ class PoseGraph:
 
         It costs the same however long the flight is.
         """
-        chosen = self._links_of(free)
+        # The links that a free node, (N,) bool, has.
+        chosen = np.flatnonzero(free[self._links.old] | free[self._links.new])
         pairs = self._links.of(chosen)
         near = np.unique(np.concatenate([np.flatnonzero(free), pairs.old, pairs.new]))
         few = replace(
@@ -537,10 +535,6 @@ class PoseGraph:
             if not len(ring) or room <= 0:
                 return reached
             reached[ring[-room:]] = True
-
-    def _links_of(self, free: NDArray[np.bool_]) -> Rows:
-        """The links that a free node, (N,) bool, has."""
-        return np.flatnonzero(free[self._links.old] | free[self._links.new])
 
     def _weighed_ground(self) -> Ground:
         """The ties to known ground, their sigmas as large as most of them miss by now: else none would pull."""

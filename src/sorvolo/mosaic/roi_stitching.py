@@ -178,7 +178,21 @@ class RoiStitcher:
                 frame_id,
                 f"too few features: {len(in_frame[0])} in the frame, {len(in_mosaic[0])} in the mosaic",
             )
-        pairs = self._match(in_mosaic[1], in_frame[1])
+        # (N, 2) indices of mosaic and frame features that match, each at most once.
+        mosaic = in_mosaic[1]
+        frame = in_frame[1]
+        if self._settings.matching == "cross-check":
+            found = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(frame, mosaic)
+        else:
+            nearest = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(frame, mosaic, k=2)
+            best: dict[int, cv2.DMatch] = {}
+            for pair in nearest:
+                if len(pair) == 2 and pair[0].distance < self._settings.ratio * pair[1].distance:
+                    rival = best.get(pair[0].trainIdx)
+                    if rival is None or pair[0].distance < rival.distance:
+                        best[pair[0].trainIdx] = pair[0]
+            found = list(best.values())
+        pairs = np.array([(m.trainIdx, m.queryIdx) for m in found], dtype=np.int64).reshape(-1, 2)
         if len(pairs) < self._settings.min_inliers:
             return NotStitched(
                 frame_id, f"only {len(pairs)} matches with the mosaic around the last frame"
@@ -219,21 +233,6 @@ class RoiStitcher:
         if descriptors is None or not len(keypoints):
             return np.zeros((0, 2)), np.zeros((0, 61), np.uint8)
         return np.array([keypoint.pt for keypoint in keypoints]), descriptors
-
-    def _match(self, mosaic: Descriptors, frame: Descriptors) -> NDArray[np.int64]:
-        """(N, 2) indices of mosaic and frame features that match, each at most once."""
-        if self._settings.matching == "cross-check":
-            found = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(frame, mosaic)
-        else:
-            nearest = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(frame, mosaic, k=2)
-            best: dict[int, cv2.DMatch] = {}
-            for pair in nearest:
-                if len(pair) == 2 and pair[0].distance < self._settings.ratio * pair[1].distance:
-                    rival = best.get(pair[0].trainIdx)
-                    if rival is None or pair[0].distance < rival.distance:
-                        best[pair[0].trainIdx] = pair[0]
-            found = list(best.values())
-        return np.array([(m.trainIdx, m.queryIdx) for m in found], dtype=np.int64).reshape(-1, 2)
 
     def _fit(
         self, mosaic_px: PointsPx, frame_px: PointsPx

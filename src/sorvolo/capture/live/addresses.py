@@ -125,7 +125,19 @@ def _stream(text: str) -> StreamAddress:
             f"{text}: no address ({error}); give for instance rtsp://192.168.1.10:554/live"
         ) from error
     scheme = parts.scheme.lower()
-    _check_stream(text, scheme, parts.hostname, port)
+    # Raises InputError for an address that lacks a part which its scheme needs, or whose scheme
+    # is not built in.
+    if scheme in ("udp", "rtp", "tcp") and port is None:
+        raise InputError(f"{shown_address(text)} has no port; give for instance {scheme}://:5000")
+    if not parts.hostname and scheme not in (*_WAITING, *_LISTENING):
+        raise InputError(
+            f"{shown_address(text)} has no host; give for instance {scheme}://192.168.1.10/live"
+        )
+    if scheme == "srt" and not _has_protocol("srt"):
+        raise InputError(
+            "this PyAV was built without SRT; receive it with another program and pass it on, for instance: "
+            "srt-live-transmit srt://HOST:PORT udp://127.0.0.1:5000, then give udp://:5000"
+        )
     options = {**_COMMON, **_BY_SCHEME.get(scheme, {})}
     url = text
     if not parts.hostname:  # the sender calls us, at whichever address of this machine
@@ -135,21 +147,6 @@ def _stream(text: str) -> StreamAddress:
     waits = not parts.hostname or scheme in _WAITING
     opens_s = (_LISTEN_S if waits else 0) + (0 if scheme in _WAITING else _OPEN_S)
     return StreamAddress(url, shown_address(text), container, options, waits, opens_s)
-
-
-def _check_stream(text: str, scheme: str, host: str | None, port: int | None) -> None:
-    """Raises InputError for an address that lacks a part which its scheme needs, or whose scheme is not built in."""
-    if scheme in ("udp", "rtp", "tcp") and port is None:
-        raise InputError(f"{shown_address(text)} has no port; give for instance {scheme}://:5000")
-    if not host and scheme not in (*_WAITING, *_LISTENING):
-        raise InputError(
-            f"{shown_address(text)} has no host; give for instance {scheme}://192.168.1.10/live"
-        )
-    if scheme == "srt" and not _has_protocol("srt"):
-        raise InputError(
-            "this PyAV was built without SRT; receive it with another program and pass it on, for instance: "
-            "srt-live-transmit srt://HOST:PORT udp://127.0.0.1:5000, then give udp://:5000"
-        )
 
 
 def _webcam(device: str, query: str) -> StreamAddress:

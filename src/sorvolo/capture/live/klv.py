@@ -162,7 +162,10 @@ def _number(item: Item, value: bytes) -> float:
     """The number in as many bytes as the sender chose; more bytes are the same range in finer steps."""
     bits = 8 * len(value)
     if item.is_imapb:
-        return _from_imapb(item, value)
+        forward, offset = _imapb(item, len(value))
+        number = (int.from_bytes(value, "big") - offset) / forward + item.lowest
+        # the upper half of the codes are special values (infinity, not a number)
+        return number if item.lowest <= number <= item.highest else nan
     if item.is_signed:
         whole = int.from_bytes(value, "big", signed=True)
         return (
@@ -194,22 +197,12 @@ def _bytes_of(item: Item, value: float) -> bytes:
 
 def _imapb(item: Item, length: int) -> tuple[float, float]:
     """Scale and zero offset of ST 1201, section 7.2: steps are a power of two, and zero stays exact."""
-    exponent = _ceil_log2(item.highest - item.lowest)
+    span = item.highest - item.lowest
+    whole = int(span)
+    exponent = (whole - 1).bit_length() if whole == span else whole.bit_length()
     forward = 2.0 ** (8 * length - 1 - exponent)
     zero = forward * item.lowest
     return forward, zero - zero // 1 if item.lowest < 0 < item.highest else 0.0
-
-
-def _from_imapb(item: Item, value: bytes) -> float:
-    forward, offset = _imapb(item, len(value))
-    number = (int.from_bytes(value, "big") - offset) / forward + item.lowest
-    # the upper half of the codes are special values (infinity, not a number)
-    return number if item.lowest <= number <= item.highest else nan
-
-
-def _ceil_log2(span: float) -> int:
-    whole = int(span)
-    return (whole - 1).bit_length() if whole == span else whole.bit_length()
 
 
 def _tagged(tag: int, value: bytes) -> bytes:

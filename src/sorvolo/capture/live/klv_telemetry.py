@@ -202,7 +202,9 @@ def _sets_in(path: Path, counts: Counter[str]) -> list[tuple[int, LocalSet]]:
             if not streams or not container.streams.video:
                 return []
             for packet in container.demux([container.streams.video[0], *streams]):
-                stamp_ns = _stamp_ns(packet)
+                # When a packet is shown, ns on its file's clock; -1 where it states nothing.
+                stamp = packet.pts if packet.pts is not None else packet.dts
+                stamp_ns = -1 if stamp is None else round(stamp * packet.time_base * 1_000_000_000)
                 if packet.stream.type != "video":
                     found += [(stamp_ns, each) for each in local_sets(bytes(packet), counts)]
                 elif stamp_ns >= 0:
@@ -220,12 +222,6 @@ def _columns_of_all(sets: Sequence[LocalSet]) -> dict[str, list[float]]:
     """Telemetry's columns over several sets, NaN where one states nothing."""
     rows = [columns_of(each) for each in sets]
     return {column: [row.get(column, nan) for row in rows] for column in TELEMETRY_COLUMNS}
-
-
-def _stamp_ns(packet: Any) -> int:
-    """When a packet is shown, ns on its file's clock; -1 where it states nothing."""
-    stamp = packet.pts if packet.pts is not None else packet.dts
-    return -1 if stamp is None else round(stamp * packet.time_base * 1_000_000_000)
 
 
 def _name(stream: Any) -> str:
@@ -328,7 +324,8 @@ def _copy(
         data = output.add_data_stream("klv")
         waiting, first_s = deque(samples), nan
         for packet in _packets(source, known):
-            now_s = _seconds(packet)
+            stamp = packet.pts if packet.pts is not None else packet.dts
+            now_s = float((stamp or 0) * (packet.time_base or _CLOCK))
             if packet.stream.index == pictures.index and isnan(first_s):
                 first_s = now_s
             for sample in _due(waiting, now_s - first_s):
@@ -348,11 +345,6 @@ def _due(waiting: deque[_Sample], video_s: float) -> Iterator[_Sample]:
     """Take the samples up to a time of the video out of those that wait; none while that is not known (NaN)."""
     while waiting and waiting[0][0] <= video_s:
         yield waiting.popleft()
-
-
-def _seconds(packet: Any) -> float:
-    stamp = packet.pts if packet.pts is not None else packet.dts
-    return float((stamp or 0) * (packet.time_base or _CLOCK))
 
 
 def _mux(

@@ -61,7 +61,14 @@ class Backlog:
         if self._stamp_ns is None or abs(stamp_ns - self._stamp_ns) >= STAMP_JUMP_NS:
             self._begin_anew()
         self._stamp_ns, stamp_s = stamp_ns, stamp_ns / SECOND_NS
-        behind_s = self._behind_s(now_s, now_s - stamp_s)
+        # How much a delay exceeds the least one lately.
+        delay_s = now_s - stamp_s
+        while self._delays_s and self._delays_s[-1][1] >= delay_s:
+            self._delays_s.pop()
+        self._delays_s.append((now_s, delay_s))
+        while self._delays_s[0][0] < now_s - self._settings.lately_s:
+            self._delays_s.popleft()
+        behind_s = delay_s - self._delays_s[0][1]
         if self._leaves_out_since is None:
             if behind_s > self._settings.most_behind_s:
                 self._leaves_out_since = now_s, stamp_s
@@ -80,15 +87,6 @@ class Backlog:
             self._has_caught_up |= stamp_s - first_s <= self._settings.live_rate * (now_s - began_s)
             self._leaves_out_since = now_s, stamp_s
         return self._has_caught_up
-
-    def _behind_s(self, now_s: float, delay_s: float) -> float:
-        """How much a delay exceeds the least one lately."""
-        while self._delays_s and self._delays_s[-1][1] >= delay_s:
-            self._delays_s.pop()
-        self._delays_s.append((now_s, delay_s))
-        while self._delays_s[0][0] < now_s - self._settings.lately_s:
-            self._delays_s.popleft()
-        return delay_s - self._delays_s[0][1]
 
 
 REFUSALS = (
@@ -229,7 +227,9 @@ class StreamReader:
         try:
             with ExitStack() as stack:
                 container = self._opened(stack)
-                video, metadata = _streams_of(container)
+                if not container.streams.video:
+                    raise ValueError("a stream without video")
+                video, metadata = container.streams.video[0], klv_streams(container)
                 self._listener.opened(_facts_of(container, video, metadata))
                 self._listener.restarted()
                 self._stamp_ns = -1
@@ -244,7 +244,17 @@ class StreamReader:
                         return came
                     if not packet.size:
                         continue
-                    self._note_heard(is_first=not came)
+                    # Something came; when a read times out, FFmpeg hands over the packet that it
+                    # had held back as well.
+                    is_first = not came
+                    now_s = time.monotonic()
+                    if (
+                        is_first
+                        or now_s - self._heard_s < self._settings.silent_s
+                        or self._file is not None
+                    ):
+                        self._heard_s = now_s
+                        self.outages.back()
                     if self._is_wanted(packet, backlog):
                         came |= self._take(packet)
             self._lost("the sender ended the stream")
@@ -279,13 +289,6 @@ class StreamReader:
         if isinstance(error, av.error.ExitError):
             return f"silent for {time.monotonic() - self._heard_s:.1f} s"
         return getattr(error, "strerror", None) or str(error)
-
-    def _note_heard(self, *, is_first: bool) -> None:
-        """Something came; when a read times out, FFmpeg hands over the packet that it had held back as well."""
-        now_s = time.monotonic()
-        if is_first or now_s - self._heard_s < self._settings.silent_s or self._file is not None:
-            self._heard_s = now_s
-            self.outages.back()
 
     def _is_wanted(self, packet: Any, backlog: Backlog) -> bool:
         """Whether a packet is looked at; video that is not is counted."""
@@ -338,12 +341,6 @@ class StreamReader:
         )
         if stamp_ns is not None and microseconds > 0:
             self._listener.reported(stamp_ns, microseconds * 1000)
-
-
-def _streams_of(container: Any) -> tuple[Any, list[Any]]:
-    if not container.streams.video:
-        raise ValueError("a stream without video")
-    return container.streams.video[0], klv_streams(container)
 
 
 def _facts_of(container: Any, video: Any, metadata: list[Any]) -> StreamFacts:

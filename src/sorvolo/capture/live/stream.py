@@ -186,7 +186,8 @@ class FrameQueue:
             if self._blocks:
                 self._changed.wait_for(lambda: self._is_over or self._fits(arrived))
             while self._waiting and not (self._holds_all and self._fits(arrived)):
-                self._drop_oldest()
+                self._held_bytes -= self._waiting.popleft().size_bytes
+                self.skipped += 1
             self._waiting.append(arrived)
             self._held_bytes += arrived.size_bytes
             self._changed.notify_all()
@@ -230,10 +231,6 @@ class FrameQueue:
 
     def _fits(self, arrived: Arrived) -> bool:
         return not self._waiting or self._held_bytes + arrived.size_bytes <= self._most_bytes
-
-    def _drop_oldest(self) -> None:
-        self._held_bytes -= self._waiting.popleft().size_bytes
-        self.skipped += 1
 
 
 _HOLD_S = 0.5  # the first frames of a connection come in a burst: only then is their delay known

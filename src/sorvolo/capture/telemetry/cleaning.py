@@ -107,9 +107,30 @@ def _cleaned_fixes(
     times: TimesNs, table: _Table, decimals: int | None
 ) -> tuple[_Table, list[Notice]]:
     """The table with only the fixes that the flight made, their sigma no smaller than their rounding."""
-    table, found = _without_null_fixes(table)
+    latitude, longitude = table["latitude_deg"], table["longitude_deg"]
+    unknown = np.isnan(latitude) | np.isnan(longitude)
+    null = (np.abs(latitude) < 1e-6) & (np.abs(longitude) < 1e-6)
+    table, found = (
+        _without_fixes(table, unknown | null),
+        [
+            *notice("no_fix", int(unknown.sum()), "{} samples have no position"),
+            *notice(
+                "null_fix",
+                int(null.sum()),
+                "{} positions are 0/0, written before the receiver's first fix",
+            ),
+        ],
+    )
     if decimals is not None and decimals <= _COARSE_DECIMALS:
-        table, rounded = _widened_to_rounding(table, decimals)
+        rounding = rounding_sigma_m(decimals)
+        placed = np.isfinite(table["latitude_deg"])
+        sigma = table.get("horizontal_sigma_m", np.full(len(placed), np.nan))
+        widened = {**table, "horizontal_sigma_m": np.where(placed, np.fmax(sigma, rounding), sigma)}
+        text = (
+            f"positions are printed with {decimals} decimals of a degree, in steps of "
+            f"{10.0**-decimals * M_PER_DEG_LATITUDE:.3g} m; their uncertainty is set to at least {rounding:.2g} m"
+        )
+        table, rounded = widened, notice("coarse_position", int(placed.sum()), text)
         found += rounded
     table, jumps = _without_jumps(times, table)
     return table, found + jumps
@@ -261,37 +282,11 @@ def _believable(table: _Table) -> tuple[_Table, list[Notice]]:
     )
 
 
-def _without_null_fixes(table: _Table) -> tuple[_Table, list[Notice]]:
-    latitude, longitude = table["latitude_deg"], table["longitude_deg"]
-    unknown = np.isnan(latitude) | np.isnan(longitude)
-    null = (np.abs(latitude) < 1e-6) & (np.abs(longitude) < 1e-6)
-    return _without_fixes(table, unknown | null), [
-        *notice("no_fix", int(unknown.sum()), "{} samples have no position"),
-        *notice(
-            "null_fix",
-            int(null.sum()),
-            "{} positions are 0/0, written before the receiver's first fix",
-        ),
-    ]
-
-
 def _without_fixes(table: _Table, rows: Mask | Rows) -> _Table:
     """The table with the positions of some rows unknown."""
     latitude, longitude = table["latitude_deg"].copy(), table["longitude_deg"].copy()
     latitude[rows] = longitude[rows] = np.nan
     return {**table, "latitude_deg": latitude, "longitude_deg": longitude}
-
-
-def _widened_to_rounding(table: _Table, decimals: int) -> tuple[_Table, list[Notice]]:
-    rounding = rounding_sigma_m(decimals)
-    placed = np.isfinite(table["latitude_deg"])
-    sigma = table.get("horizontal_sigma_m", np.full(len(placed), np.nan))
-    widened = {**table, "horizontal_sigma_m": np.where(placed, np.fmax(sigma, rounding), sigma)}
-    text = (
-        f"positions are printed with {decimals} decimals of a degree, in steps of "
-        f"{10.0**-decimals * M_PER_DEG_LATITUDE:.3g} m; their uncertainty is set to at least {rounding:.2g} m"
-    )
-    return widened, notice("coarse_position", int(placed.sum()), text)
 
 
 def _without_jumps(times: TimesNs, table: _Table) -> tuple[_Table, list[Notice]]:

@@ -121,7 +121,9 @@ def epochs_of(messages: list[Any]) -> tuple[list[Epoch], bool]:
             epochs.append(Epoch(now_ns))
         epochs[-1].kinds.add(message.msgID)
         _add(epochs[-1], message)
-    _forget_without_fix(epochs)
+    for epoch in epochs:
+        if not epoch.has_fix:
+            epoch.values = {}
     return epochs, bool(trusted)
 
 
@@ -134,12 +136,6 @@ def _dated(messages: list[Any]) -> list[Any]:
 def _is_valid(message: Any) -> bool:
     """Whether an RMC sentence states a fix; one that was cut before its status states none."""
     return getattr(message, "status", "") == "A"
-
-
-def _forget_without_fix(epochs: list[Epoch]) -> None:
-    for epoch in epochs:
-        if not epoch.has_fix:
-            epoch.values = {}
 
 
 def _add(epoch: Epoch, message: Any) -> None:
