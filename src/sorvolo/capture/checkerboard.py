@@ -8,7 +8,7 @@ import numpy as np
 
 from sorvolo.capture.intrinsics import check_lens
 from sorvolo.errors import GeometryError, InputError, SettingsError
-from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, PointsM, PointsPx
+from sorvolo.geometry.arrays import Floats, ImageRGB, PointsM, PointsPx
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 
