@@ -1,14 +1,10 @@
 """A benchmark's own script run again in a process of its own, so that its time and memory are its alone."""
 
 import json
-import os
-import resource
 import subprocess
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 
 def peak_mb() -> int:
@@ -35,34 +31,3 @@ def run_child(script: str, arguments: Sequence[str], limit_s: float) -> dict[str
         last = done.stderr.strip().splitlines()[-1:] or [f"exit code {done.returncode}"]
         return {"failure": last[0]}
     return json.loads(done.stdout.splitlines()[-1])
-
-
-def map_costs(flight: Path, site: Path, options: Sequence[str]) -> dict[str, Any]:
-    """What `sorvolo map` of a flight into `site`, without a detector, takes in a process of its own.
-
-    Ends the benchmark with the command's words where it fails.
-    """
-    command = [
-        sys.executable,
-        "-m",
-        "sorvolo",
-        "map",
-        str(flight),
-        "--site",
-        str(site),
-        "--model",
-        "none",
-        *options,
-    ]
-    load = os.getloadavg()[0]
-    before, started_s = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
-    done = subprocess.run(command, check=False, capture_output=True, text=True)
-    seconds, after = time.monotonic() - started_s, resource.getrusage(resource.RUSAGE_CHILDREN)
-    if done.returncode not in (0, 3):
-        sys.exit(done.stderr)
-    return {
-        "seconds": round(seconds, 1),
-        "load_before": load,
-        "cpu_s": round(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, 1),
-        "peak_mb": round(after.ru_maxrss / 1024),
-    }

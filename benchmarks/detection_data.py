@@ -1,10 +1,11 @@
-"""Which labelled pictures train the default model, which are held out to measure it, and how each set is read.
+"""How each labelled set is read, and which of its pictures are held out: the packaged models learnt from the rest.
 
 Split by flight, by video, or (HIT-UAV, whose neighbouring frames are near-duplicates) by blocks of consecutive ids.
 """
 
 import re
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -68,15 +69,11 @@ def tinyperson(data: Path) -> dict[str, LabelledSet]:
             > _TINYPERSON_LARGEST_PX
         )
         pictures.append(
-            LabelledPicture(
-                each.path,
-                each.width_px,
-                each.height_px,
-                each.group,
-                each.boxes_px[~large],
-                each.labels[~large],
-                np.vstack([each.ignored_px, each.boxes_px[large]]),
-                each.m_per_px,
+            replace(
+                each,
+                boxes_px=each.boxes_px[~large],
+                labels=each.labels[~large],
+                ignored_px=np.vstack([each.ignored_px, each.boxes_px[large]]),
             )
         )
     return _by_name(whole.only(pictures), TINYPERSON_HELD_OUT, TINYPERSON_VALIDATION)
@@ -129,34 +126,14 @@ def semantic_drone(data: Path) -> dict[str, LabelledSet]:
     return {"test": in_order(whole)}
 
 
-def mannequin(data: Path) -> dict[str, LabelledSet]:
-    """A dummy that floats on a pond, one video: only to train."""
-    return {
-        "train": in_order(
-            read_dataset(data / "mannequin", classes={"person": "person", "mannequin": "person"})
-        )
-    }
-
-
 def in_order(labelled: LabelledSet) -> LabelledSet:
     """The set with Sorvolo's own classes in their order, whatever order it was read with."""
     to_own = np.array([CLASSES.index(name) for name in labelled.classes], np.int64)
-    pictures = [
-        LabelledPicture(
-            each.path,
-            each.width_px,
-            each.height_px,
-            each.group,
-            each.boxes_px,
-            to_own[each.labels] if len(each.labels) else each.labels,
-            each.ignored_px,
-            each.m_per_px,
-        )
-        for each in labelled.pictures
-    ]
-    return LabelledSet(
-        labelled.name, CLASSES, tuple(pictures), labelled.unlabelled, labelled.notices
+    pictures = tuple(
+        replace(picture, labels=to_own[picture.labels] if len(picture.labels) else picture.labels)
+        for picture in labelled.pictures
     )
+    return replace(labelled, classes=CLASSES, pictures=pictures)
 
 
 def _by_name(whole: LabelledSet, test: Iterable[str], val: Iterable[str]) -> dict[str, LabelledSet]:

@@ -18,8 +18,7 @@ from pathlib import Path
 import numpy as np
 
 import detection_data
-from mosaic_methods import commit, machine
-from provenance import note_scoring
+from provenance import commit, machine, note_scoring
 from sorvolo.lab.datasets import read_dataset
 from sorvolo.lab.evaluation.detection_scores import score_set
 from sorvolo.lab.evaluation.detector import (

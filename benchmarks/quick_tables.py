@@ -1,11 +1,10 @@
 """The published tables that take minutes, all measured again at one commit: python benchmarks/quick_tables.py [NAME...]
 
-    python benchmarks/quick_tables.py --data ../shared/data --peer-bin ENVIRONMENT/bin
+    python benchmarks/quick_tables.py --data ../shared/data
     python benchmarks/quick_tables.py --list
 
 Without a NAME all of them, one after another; seeds are fresh ones, drawn from the commit. A changed tree is refused:
-commit first. --peer-bin is a virtual environment's bin with `orthomosaic` (PyPI's pyOrthomosaic) and pycolmap; without
-it, or without --data, what needs them is left out by name. A table that fails does not keep the others from being made.
+commit first. Without --data, what needs real flights is left out by name. A table that fails does not keep the others from being made.
 What each took in processor time is printed, and --list prints of every result file which commit it was measured at.
 """
 
@@ -26,50 +25,27 @@ HERE = Path(__file__).parent
 
 @dataclass(frozen=True)
 class QuickTable:
-    """A benchmark's file and arguments; {data} and {peers} are the folders given. Minutes are processor time."""
+    """A benchmark's file and arguments; {data} is the folder given, {results} the folder of results. Minutes are processor time."""
 
     script: str
-    arguments: tuple[str, ...]
+    arguments: str
     minutes: float
 
 
 TABLES = {
-    "mosaic_methods": QuickTable(
-        "mosaic_methods", ("--count", "1", "--methods", "planar", "thesis"), 2.0
-    ),
+    "mosaic_methods": QuickTable("mosaic_methods", "--count 1 --methods planar thesis", 2.0),
     "planar_survey": QuickTable(
-        "mosaic_methods",
-        ("--methods", "planar", "--output", str(HERE / "results" / "planar_survey.json")),
-        1.2,
+        "mosaic_methods", "--methods planar --output {results}/planar_survey.json", 1.2
     ),
-    "watch_counts": QuickTable("watch_counts", (), 7.2),
-    "peers": QuickTable(
-        "peers",
-        ("{data}/flights", "--flights", "brighton_beach", "--peer-bin", "{peers}", "--three-d"),
-        4.7,
-    ),
-    "change_methods": QuickTable(
-        "change_methods", ("--split", "test", "--data", "{data}", "--jobs", "1"), 4.1
-    ),
-    "change_events": QuickTable("change_events", ("--count", "1", "--methods", "robust"), 8.5),
-    "thesis_tables": QuickTable("thesis_tables", (), 8.5),
+    "watch_counts": QuickTable("watch_counts", "", 7.2),
+    "change_events": QuickTable("change_events", "--count 1 --methods robust", 8.5),
+    "thesis_tables": QuickTable("thesis_tables", "", 8.5),
     "planar_sand": QuickTable(
         "mosaic_methods",
-        (
-            "--count",
-            "1",
-            "--preset",
-            "sand",
-            "--methods",
-            "planar",
-            "--output",
-            str(HERE / "results" / "planar_sand.json"),
-        ),
+        "--count 1 --preset sand --methods planar --output {results}/planar_sand.json",
         0.3,
     ),
-    "real_flights": QuickTable("real_flights", ("{data}/flights",), 3.0),
-    "first_look": QuickTable("first_look", (), 2.6),
-    "change_heights": QuickTable("change_heights", (), 0.7),
+    "real_flights": QuickTable("real_flights", "{data}/flights", 3.0),
 }
 
 
@@ -82,7 +58,6 @@ def main() -> None:
         "names", nargs="*", metavar="NAME", help=f"of {', '.join(TABLES)}; else all"
     )
     parser.add_argument("--data", type=Path, help="the folder of real data")
-    parser.add_argument("--peer-bin", type=Path)
     parser.add_argument(
         "--list", action="store_true", help="only print the commit of each result file"
     )
@@ -95,23 +70,18 @@ def main() -> None:
         return
     if commit().endswith("-dirty") or not commit():
         sys.exit("the tree differs from its commit, so no figure could be made again: commit first")
-    places = {"data": options.data, "peers": options.peer_bin}
-    failed = [name for name in options.names or TABLES if not made(name, TABLES[name], places)]
+    names = options.names or TABLES
+    failed = [name for name in names if not make_table(name, TABLES[name], options.data)]
     if failed:
         sys.exit(f"not made: {', '.join(failed)}")
 
 
-def made(name: str, table: QuickTable, places: dict[str, Path | None]) -> bool:
-    """Run one benchmark; False where it failed. One that needs a folder that was not given is left out."""
-    missing = [
-        key
-        for key, place in places.items()
-        if place is None and f"{{{key}}}" in " ".join(table.arguments)
-    ]
-    if missing:
-        print(f"{name}: left out, needs the folder of {' and of '.join(missing)}", flush=True)
+def make_table(name: str, table: QuickTable, data: Path | None) -> bool:
+    """Run one benchmark; False where it failed. One that needs `data` is left out without it."""
+    if data is None and "{data}" in table.arguments:
+        print(f"{name}: left out, needs --data", flush=True)
         return True
-    words = [each.format(**places) for each in table.arguments]
+    words = [word.format(data=data, results=HERE / "results") for word in table.arguments.split()]
     before_s = _children_s()
     done = subprocess.run(
         [sys.executable, HERE / f"{table.script}.py", *words],

@@ -33,7 +33,7 @@ large. An area (over 100 m2) is found when one event covers at least 40 % of it;
 cover is given as well. An event is false when at least half of it lies on ground drawn as unchanged. Events that touch
 neither are counted as elsewhere: not all that changed is drawn.
 
-Each run is appended to results/real_dates.json: how often a pair was scored is how often it stands there.
+Each run is appended to results/real_dates.json.
 """
 
 import argparse
@@ -50,7 +50,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from provenance import commit, machine
+from provenance import commit, machine, note_scoring
 from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.geometry.homography import apply_homography, fit_similarity
 from sorvolo.geometry.level_ground import footprint
@@ -192,6 +192,7 @@ def main() -> None:
                 "taken": options.taken,
                 "seed": options.seed,
                 "model": options.model,
+                **note_scoring(f"real_dates, {name}"),
                 **score(pair, attitude, truth, options),
             }
             append(options.output, run)

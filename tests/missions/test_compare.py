@@ -707,9 +707,7 @@ def test_killed_half_way_the_site_stays_whole_and_the_same_command_ends_well(com
     ("brightness", "printed"),
     [
         pytest.param(0.4, "dark or of the ground's colour", marks=pytest.mark.long),
-        pytest.param(
-            0.06, "means little", marks=pytest.mark.long
-        ),  # benchmarks/change_unfit.py has nights, too
+        pytest.param(0.06, "means little", marks=pytest.mark.long),
     ],
 )
 def test_a_flight_in_the_dark_is_reported_to_show_less_and_paints_no_black_ground(

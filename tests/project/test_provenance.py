@@ -75,39 +75,11 @@ def test_each_scoring_of_a_held_out_set_counts(provenance: ModuleType, tmp_path:
     assert json.loads(ledger.read_text()) == {"a set": 2, "another": 1}
 
 
-@pytest.mark.parametrize(
-    "name", ["change_events", "change_methods", "watch_counts", "watch_counts_detector"]
-)
+@pytest.mark.parametrize("name", ["change_events", "watch_counts", "watch_counts_detector"])
 def test_published_scores_state_how_often_their_set_was_scored(name: str) -> None:
     result = json.loads((BENCHMARKS / "results" / f"{name}.json").read_text())
     ledger = json.loads((BENCHMARKS / "results" / "scored.json").read_text())
     assert 1 <= result["times_scored"] <= ledger[result["held_out"]]
-
-
-def test_a_comparison_of_programs_keeps_what_only_an_earlier_run_has(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    keep_earlier = importlib.import_module("peers").keep_earlier
-    flights = {"beach": {"photos": 18, "colmap": {"cpu_s": 85}}}
-    keep_earlier(
-        flights,
-        {
-            "commit": "b",
-            "flights": {
-                "beach": {"colmap": {"cpu_s": 146}, "pyorthomosaic_3d": {"cpu_s": 227}},
-                "field": {"commit": "a", "photos": 75},
-            },
-        },
-    )
-    assert flights == {
-        "beach": {
-            "photos": 18,
-            "colmap": {"cpu_s": 85},
-            "pyorthomosaic_3d": {"commit": "b", "cpu_s": 227},
-        },
-        "field": {"commit": "a", "photos": 75},
-    }
 
 
 def test_each_result_states_what_was_measured(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,7 @@ _Grey = NDArray[np.float32]
 @dataclass(frozen=True)
 class CrownLengths:
     """Metres on the ground over which crowns are recognised: each by choice, since only what all of them give together
-    was measured (benchmarks/search_crowns.py)."""
+    was measured."""
 
     leaf_m: float = 0.1  # along a pixel on which leaves show ...
     leaves_m: float = 0.5  # ... and over which their roughness is taken
@@ -38,7 +38,7 @@ class CrownLengths:
 
 @dataclass(frozen=True)
 class CrownSettings:
-    """How crowns are recognised on a small picture. Measured by benchmarks/search_crowns.py."""
+    """How crowns are recognised on a small picture."""
 
     green: float = 0.05  # excess green, (2 g - r - b) / (r + g + b), of plants
     plants: float = 0.6  # share of green ground around a place of plants; by choice

@@ -4,12 +4,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-_QUICK_KERNEL = 3  # px a side; PyTorch's own way is quick for these (benchmarks/depthwise_speed.py)
+_QUICK_KERNEL = 3  # px a side; PyTorch's own way is quick for these
 
 
 class _Depthwise(torch.autograd.Function):
     """The same values as torch's own. The weights' gradient is computed in float32, and with a stride the features'
-    too: mostly several times as fast as in bfloat16 (benchmarks/depthwise_speed.py)."""
+    too: mostly several times as fast as in bfloat16."""
 
     @staticmethod
     def forward(ctx, features: Tensor, weight: Tensor, stride: int, padding: int) -> Tensor:  # type: ignore[no-untyped-def]

@@ -60,7 +60,7 @@ def load_exported(
     variances are those that `pictures` (N, 3, H, W), RGB 0 to 255, give them, so that they fit the pictures which are
     to be learnt from; what the model sees in a picture stays the same. `classes` are the model's: those that the file
     names too keep what it knows of them, the others start as `model` has them; None: the same ones in the same order.
-    Of a file that holds two networks (`training.daylight`) it is the aerial one.
+    Of a file that joins several networks, as the packaged one does, it is the aerial one.
     Raises InputError where the file's layers are not the model's, as those of a model in eight bits are not, and for a
     model with batch norms that do not learn (ResNet-50's of the presets `accurate` and `thesis`).
     """
