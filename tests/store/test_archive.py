@@ -19,7 +19,7 @@ from sorvolo.errors import GeometryError, SettingsError, StoreError
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue_place import is_site
-from sorvolo.store.site.schema import SCHEMA_VERSION
+from sorvolo.store.site.schema import FORMAT
 from sorvolo.store.site.tiles import TileBlobs
 from sorvolo.survey.mosaic import Status
 
@@ -376,12 +376,10 @@ def test_another_format_version_is_refused_with_both_versions(file_folder: Path)
     with opened(file_folder):
         pass
     with sqlite3.connect(file_folder / "site.db") as connection:
-        connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION + 6}")
+        connection.execute(f"PRAGMA user_version = {FORMAT + 6}")
     connection.close()
     for write in (True, False):
-        with pytest.raises(
-            StoreError, match=rf"version {SCHEMA_VERSION + 6},.* version {SCHEMA_VERSION};"
-        ):
+        with pytest.raises(StoreError, match=rf"version {FORMAT + 6},.* version {FORMAT};"):
             Archive.open(file_folder, write=write)
 
 

@@ -21,7 +21,6 @@ from sorvolo.geometry.polygons import signed_area
 from sorvolo.store.exports.change_files import changes_geojson, mask_name, write_view_masks
 from sorvolo.store.exports.placemarks import Placemark, gpx_bytes, kml_bytes
 from sorvolo.store.exports.places import longitude_latitude
-from sorvolo.store.site import schema
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.change_records import StoredChange, stored_changes
 from sorvolo.survey.findings import Change, ChangeKind, HeightChange, Verdict
@@ -479,50 +478,3 @@ def test_a_version_is_found_by_its_time_and_differs_by_its_tiles(folder: Path) -
         assert {version.flown_utc for version in archive.versions()} == {""}
         with pytest.raises(InputError, match="had no map"):
             archive.version_at(made[0] - timedelta(seconds=1))
-
-
-def older_format(folder: Path) -> None:
-    """Take away what later formats than the first added."""
-    connection = sqlite3.connect(folder / "site.db")
-    for name in ("changes", "comparisons", "leftovers", "reviews", "searches", "objects", "flown"):
-        connection.execute(f"DROP TABLE {name}")
-    connection.execute("PRAGMA user_version = 1")
-    connection.commit()
-    connection.close()
-
-
-def test_a_site_of_the_first_format_is_read_as_it_is_and_upgraded_to_be_written(
-    folder: Path,
-) -> None:
-    older_format(folder)
-    with Archive.open(folder, write=False) as archive:
-        assert archive.changes() == archive.reviews() == [] and archive.comparisons() == {}
-        assert len(archive.tiles()) == 4 and len(archive.keyframes()) == 4
-    with sqlite3.connect(folder / "site.db") as connection:
-        assert connection.execute("PRAGMA user_version").fetchone() == (1,)
-    connection.close()
-    with Archive.open(folder, write=True) as archive:
-        assert len(archive.tiles()) == 4 and len(archive.keyframes()) == 4
-        compare(archive, "b", [fake_change(1)])
-        assert len(archive.changes()) == 1
-        assert [version.flown_utc[:10] for version in archive.versions()] == ["2023-11-14"] * 2
-    with sqlite3.connect(folder / "site.db") as connection:
-        assert connection.execute("PRAGMA user_version").fetchone() == (schema.SCHEMA_VERSION,)
-    connection.close()
-
-
-def test_an_upgrade_that_fails_leaves_the_first_format(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    older_format(folder)
-    monkeypatch.setattr(schema, "set_format", "no function")  # the last step of the upgrade fails
-    with pytest.raises(TypeError), Archive.open(folder, write=True):
-        pass
-    connection = sqlite3.connect(folder / "site.db")
-    tables = {
-        name
-        for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
-    }
-    assert connection.execute("PRAGMA user_version").fetchone() == (1,)
-    connection.close()
-    assert not tables & {"changes", "comparisons", "leftovers", "reviews"}

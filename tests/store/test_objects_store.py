@@ -181,45 +181,11 @@ def test_what_was_deleted_is_made_again(tmp_path: Path) -> None:
     assert list(features(tmp_path / "objects.geojson")) == ["a-o1"]
 
 
-def test_a_site_of_format_2(tmp_path: Path) -> None:
-    """It is read as having no objects, and brought up to date when it is written."""
-    commit(tmp_path, "a", None)
-    connection = sqlite3.connect(tmp_path / "site.db")
-    connection.executescript(
-        "DROP TABLE objects; DROP TABLE searches; DROP TABLE flown; PRAGMA user_version = 2;"
-    )
-    connection.close()
-    with Archive.open(tmp_path, write=False) as archive:
-        assert archive.objects() == []
-        assert not archive.is_searched
-    commit(tmp_path, "b", search((thing("b-o1", 3.0, 4.0),)))
-    assert list(features(tmp_path / "objects.geojson")) == ["b-o1"]
-    with sqlite3.connect(tmp_path / "site.db") as connection:
-        assert connection.execute("PRAGMA user_version").fetchone() == (schema.SCHEMA_VERSION,)
-
-
-def test_a_site_of_format_4(tmp_path: Path) -> None:
-    """Its searches count as searches for all classes; it is read as it is, and brought up to date when written."""
-    commit(tmp_path, "a", search((thing("a-o1", 3.0, 4.0, "person"),), classes=("person",)))
-    connection = sqlite3.connect(tmp_path / "site.db")
-    connection.executescript(
-        "ALTER TABLE searches DROP COLUMN searched_for; PRAGMA user_version = 4;"
-    )
-    connection.close()
-    with Archive.open(tmp_path, write=False) as archive:
-        assert [len(each.frames.for_class("car")) for each in archive.searches()] == [3]
-    commit(tmp_path, "b", search((), classes=("car",)))
-    with Archive.open(tmp_path, write=False) as archive:
-        assert [len(each.frames.for_class("car")) for each in archive.searches()] == [3, 3]
-        assert [len(each.frames.for_class("person")) for each in archive.searches()] == [3, 0]
-        assert [each.thing.id for each in archive.newest_objects()] == ["a-o1"]
-
-
 def test_a_site_of_a_later_format_is_refused(tmp_path: Path) -> None:
     """Its files stay as they are."""
     commit(tmp_path, "a", None)
     connection = sqlite3.connect(tmp_path / "site.db")
-    connection.execute(f"PRAGMA user_version = {schema.SCHEMA_VERSION + 1}")
+    connection.execute(f"PRAGMA user_version = {schema.FORMAT + 1}")
     connection.close()
     with pytest.raises(StoreError, match="format version"):
         Archive.open(tmp_path, write=True)

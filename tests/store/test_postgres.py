@@ -14,7 +14,6 @@ from pathlib import Path
 
 import pytest
 from fake_flights import SITE, frame, image, map_flight, tile
-from sqlalchemy import Connection, create_engine, inspect
 
 from postgres_server import PostgresServer, program
 from sorvolo.cli.main import main
@@ -33,7 +32,6 @@ from sorvolo.store.site.catalogue_place import (
 )
 from sorvolo.store.site.database import ConnectionLostError
 from sorvolo.store.site.journal import Entry
-from sorvolo.store.site.migrations.upgrade import upgrade
 from sorvolo.store.site.postgres_database import PostgresDatabase
 
 PASSWORD = "c0rrect-horse"
@@ -168,9 +166,9 @@ def test_a_lost_schema_costs_no_file(site: Path, postgres: PostgresServer) -> No
 
 
 def test_a_later_format_is_refused(site: Path, postgres: PostgresServer) -> None:
-    postgres.sql(f"UPDATE {schema_of(site)}.alembic_version SET version_num = '77'")
+    postgres.sql(f"UPDATE {schema_of(site)}.numbers SET last = 77 WHERE name = 'format'")
     for write in (True, False):
-        with pytest.raises(StoreError, match=rf"version 77,.* version {schema.SCHEMA_VERSION};"):
+        with pytest.raises(StoreError, match=rf"version 77,.* version {schema.FORMAT};"):
             Archive.open(site, write=write)
 
 
@@ -633,65 +631,6 @@ def test_a_database_that_is_not_there_or_of_another_kind_is_named(
     monkeypatch.setattr(postgres_database, "OLDEST_SERVER", 99)
     with pytest.raises(StoreError, match=r"is PostgreSQL \d+, 99 or later was needed"):
         Archive.open(tmp_path / "site", write=True)
-
-
-def shape(url: str, name: str | None) -> dict[str, object]:
-    """Tables, columns, keys and indexes, as the database has them."""
-    engine = create_engine(url)
-    about, found = inspect(engine), {}
-    for table in sorted(set(about.get_table_names(name)) - {"alembic_version"}):
-        columns = [
-            (each["name"], str(each["type"]), each["nullable"])
-            for each in about.get_columns(table, name)
-        ]
-        keys = [
-            (each["constrained_columns"], each["referred_table"], each["options"])
-            for each in about.get_foreign_keys(table, name)
-        ]
-        unique = [each["column_names"] for each in about.get_unique_constraints(table, name)]
-        found[table] = (
-            columns,
-            about.get_pk_constraint(table, name)["constrained_columns"],
-            keys,
-            unique,
-            sorted(str(each["column_names"]) for each in about.get_indexes(table, name)),
-        )
-    engine.dispose()
-    return found
-
-
-def migrate(connection: Connection) -> None:
-    upgrade(connection, 0)
-
-
-@pytest.mark.parametrize("place", ["sqlite", "postgresql"])
-def test_migrations_from_nothing_end_with_today_s_tables(
-    place: str, tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
-    if place == "sqlite":
-        urls, names = (
-            [f"sqlite:///{tmp_path / each}" for each in ("migrated", "made")],
-            [None, None],
-        )
-    else:
-        server = request.getfixturevalue("postgres")
-        names = ["migrated", "made"]
-        for each in names:
-            server.sql(f"DROP SCHEMA IF EXISTS {each} CASCADE", f"CREATE SCHEMA {each}")
-        urls = [str(parsed_url(server.url)) + f"?options=-csearch_path={each}" for each in names]
-    for url, make in zip(urls, (migrate, schema.make_tables)):
-        engine = create_engine(url)
-        with engine.begin() as connection:
-            make(connection)
-        engine.dispose()
-    assert shape(urls[0], names[0]) == shape(urls[1], names[1])
-    if place == "sqlite":
-        sql = "SELECT name FROM sqlite_master WHERE sql LIKE '%AUTOINCREMENT%'"
-        for url in urls:
-            engine = create_engine(url)
-            with engine.begin() as connection:
-                assert set(connection.exec_driver_sql(sql).scalars()) == {"runs", "versions"}
-            engine.dispose()
 
 
 def copied(source: Path, target: Path, scratch: Path) -> None:

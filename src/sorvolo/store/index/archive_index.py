@@ -33,6 +33,7 @@ from sorvolo.store.site.catalogue_place import (
     pointed_database,
 )
 from sorvolo.store.site.database import Database
+from sorvolo.store.site.schema import format_of
 from sorvolo.store.site.sqlite_database import SqliteDatabase
 
 INDEX = "archive-index.db"
@@ -58,7 +59,7 @@ class ArchiveIndex:
         try:
             database.check()
             with database.reading() as connection:
-                found = tables.index_format(connection)
+                found = format_of(connection)
         except BaseException:
             database.close()
             raise

@@ -21,7 +21,7 @@ from sqlalchemy.types import UserDefinedType
 
 from sorvolo.errors import StoreError
 from sorvolo.store.site.database import Layout
-from sorvolo.store.site.schema import Nanoseconds, String, make_numbers, numbers
+from sorvolo.store.site.schema import Nanoseconds, String, make_numbers
 
 FORMAT = 1
 """An index of another format is rebuilt: everything in it comes from the sites."""
@@ -122,8 +122,6 @@ def make_index(connection: Connection) -> None:
     """The empty tables, inside the caller's transaction. Raises StoreError for a PostgreSQL without PostGIS."""
     if connection.dialect.name != "sqlite":
         _demand_postgis(connection)
-        make_numbers(connection, ["format"])
-        connection.execute(numbers.update().where(numbers.c.name == "format").values(last=FORMAT))
     metadata.create_all(connection)
     if (
         connection.dialect.name != "sqlite"
@@ -140,15 +138,7 @@ def make_index(connection: Connection) -> None:
                 f"CREATE VIRTUAL TABLE {table.name}_places USING rtree(id, west, east, south, north)"
             )
         )
-    if connection.dialect.name == "sqlite":
-        connection.exec_driver_sql(f"PRAGMA user_version = {FORMAT:d}")
-
-
-def index_format(connection: Connection) -> int:
-    """The format of an index."""
-    if connection.dialect.name == "sqlite":
-        return int(connection.exec_driver_sql("PRAGMA user_version").scalar_one())
-    return int(connection.execute(numbers.select().where(numbers.c.name == "format")).one().last)
+    make_numbers(connection, FORMAT)
 
 
 LAYOUT = Layout(_APPLICATION_ID, make_index, beside="public", page_bytes=16_384)

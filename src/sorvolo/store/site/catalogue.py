@@ -34,7 +34,6 @@ from sorvolo.store.site import schema
 from sorvolo.store.site.catalogue_place import Catalogues, open_database
 from sorvolo.store.site.database import Database
 from sorvolo.store.site.names import checked_crs, checked_image_path
-from sorvolo.store.site.schema import SCHEMA_VERSION
 from sorvolo.store.site.sqlite_database import SqliteDatabase
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import Status
@@ -129,9 +128,7 @@ class Catalogue:
     """The open catalogue; `reading` and `changing` give one transaction each, the functions below use them."""
 
     def __init__(self, database: Database, site: Path, *, write: bool) -> None:
-        """Open, and bring an older format up to date if it is to be written.
-
-        Raises StoreError when it is damaged, no catalogue, of a format that is not known, or out of reach; for a
+        """Raises StoreError when it is damaged, no catalogue, of a format that is not known, or out of reach; for a
         writer, also when another process writes.
         """
         self._database = database
@@ -143,7 +140,7 @@ class Catalogue:
         )
         try:
             database.check()
-            self._bring_up_to_date(site, write=write)
+            self._check_format(site)
         except BaseException:
             database.close()
             raise
@@ -163,22 +160,14 @@ class Catalogue:
         """What messages call it."""
         return self._database.place
 
-    def _bring_up_to_date(self, site: Path, *, write: bool) -> None:
+    def _check_format(self, site: Path) -> None:
         with self.reading() as connection:
             version = schema.format_of(connection)
-        if not schema.OLDEST_VERSION <= version <= SCHEMA_VERSION:
+        if version != schema.FORMAT:
             raise StoreError(
                 f"the site {site} has format version {version}, this Sorvolo works with "
-                f"version {SCHEMA_VERSION}; use the Sorvolo that made it, or map into a new folder"
+                f"version {schema.FORMAT}; use the Sorvolo that made it, or map into a new folder"
             )
-        if write and version < SCHEMA_VERSION:
-            from sorvolo.store.site.migrations.upgrade import (
-                upgrade,
-            )  # Alembic loads slowly, and seldom has work
-
-            with self.changing() as connection:
-                upgrade(connection, version)
-                schema.set_format(connection, SCHEMA_VERSION)
 
 
 @contextmanager
@@ -304,9 +293,7 @@ def _compressions(connection: Connection) -> dict[int, str]:
 
 
 def _flown_ns(connection: Connection) -> dict[int, int]:
-    """When the flights were flown that made the versions, by version; none in a file of a format before 4."""
-    if schema.format_of(connection) < 4:
-        return {}
+    """When the flights were flown that made the versions, by version."""
     return {row.version_id: row.first_ns for row in connection.execute(select(schema.flown))}
 
 
@@ -515,13 +502,8 @@ def _drop(connection: Connection, table: Table, unfinished: ColumnElement[bool])
     first = connection.execute(select(func.min(table.c.id)).where(unfinished)).scalar()
     if first is not None:
         connection.execute(delete(table).where(unfinished))
-        if connection.dialect.name == "sqlite":
-            connection.exec_driver_sql(
-                "UPDATE sqlite_sequence SET seq = ? WHERE name = ?", (first - 1, table.name)
-            )
-        else:
-            known = update(schema.numbers).where(schema.numbers.c.name == table.name)
-            connection.execute(known.values(last=first - 1))
+        known = update(schema.numbers).where(schema.numbers.c.name == table.name)
+        connection.execute(known.values(last=first - 1))
 
 
 def owe_documents(connection: Connection, flight_ids: Collection[str]) -> None:
@@ -609,14 +591,13 @@ def derived_version(connection: Connection) -> int:
 
 
 def _inserted(connection: Connection, table: Table, values: Mapping[str, Any]) -> int:
-    """The number of the row, which no row of the table had before; SQLite gives it by itself."""
-    if connection.dialect.name != "sqlite":
-        known = update(schema.numbers).where(schema.numbers.c.name == table.name)
-        given = known.values(last=schema.numbers.c.last + 1).returning(schema.numbers.c.last)
-        values = {**values, "id": connection.execute(given).scalar_one()}
-    key = connection.execute(insert(table).values(**values)).inserted_primary_key
-    assert key is not None  # both give one for each inserted row
-    return int(key[0])
+    """The number of the row, which no row of the table had before."""
+    known = update(schema.numbers).where(schema.numbers.c.name == table.name)
+    connection.execute(known.values(last=schema.numbers.c.last + 1))
+    given = select(schema.numbers.c.last).where(schema.numbers.c.name == table.name)
+    number = int(connection.execute(given).scalar_one())
+    connection.execute(insert(table).values(id=number, **values))
+    return number
 
 
 def _row_of(keyframe: StoredKeyframe, run_id: int) -> dict[str, Any]:

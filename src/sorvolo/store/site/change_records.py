@@ -131,8 +131,6 @@ def load_changes(connection: Connection, flight_id: str | None = None) -> list[S
     A verdict belongs to a change of its id whose box still meets the one that was looked at: other settings may
     have given the id to another piece of ground.
     """
-    if _is_older(connection):
-        return []
     query = (
         select(schema.changes, schema.runs.c.flight_id)
         .join(schema.runs, schema.runs.c.id == schema.changes.c.run_id)
@@ -148,8 +146,6 @@ def load_changes(connection: Connection, flight_id: str | None = None) -> list[S
 
 def load_reviews(connection: Connection) -> list[StoredReview]:
     """All reviews, oldest first."""
-    if _is_older(connection):
-        return []
     rows = connection.execute(
         select(schema.reviews).order_by(schema.reviews.c.at_utc, schema.reviews.c.change_id)
     )
@@ -196,8 +192,6 @@ def drop_reviews(connection: Connection, changes: Sequence[StoredChange]) -> Non
 
 def compared_versions(connection: Connection) -> dict[int, Mapping[str, int]]:
     """The versions that comparisons made: the number of changes of each kind."""
-    if _is_older(connection):
-        return {}
     return {row.version_id: row.kinds for row in connection.execute(select(schema.comparisons))}
 
 
@@ -208,7 +202,7 @@ def is_compared(connection: Connection, run_id: int) -> bool:
         .select_from(schema.comparisons)
         .where(schema.comparisons.c.run_id == run_id)
     )
-    return not _is_older(connection) and connection.execute(query).scalar_one() > 0
+    return connection.execute(query).scalar_one() > 0
 
 
 def outlines_meet(one_m: PointsM, other_m: PointsM) -> bool:
@@ -218,11 +212,6 @@ def outlines_meet(one_m: PointsM, other_m: PointsM) -> bool:
             (one_m.min(axis=0) <= other_m.max(axis=0)) & (other_m.min(axis=0) <= one_m.max(axis=0))
         )
     )
-
-
-def _is_older(connection: Connection) -> bool:
-    """Whether the catalogue, opened to be read, is of a format that knew no changes."""
-    return schema.format_of(connection) < 2
 
 
 def _centre(outline_m: PointsM) -> PointsM:
@@ -314,8 +303,8 @@ def _change_of(row: Row[Any], review: StoredReview | None) -> StoredChange:
             CropPlace(west_m, north_m, m_per_px, width_px, height_px),
             review.verdict if review is not None and is_reviewed else None,
             review.note if review is not None and is_reviewed else "",
-            _number(values.get("sigma_in_map_m")),  # sites of earlier versions have neither
-            HeightChange(*risen) if (risen := values.get("height_change")) else None,
+            _number(values["sigma_in_map_m"]),
+            HeightChange(*risen) if (risen := values["height_change"]) else None,
         )
 
 

@@ -62,19 +62,15 @@ def add_search(connection: Connection, run_id: int, search: ObjectSearch) -> Non
 
 def load_searches(connection: Connection) -> list[StoredSearch]:
     """The searches of complete runs, by flight rank."""
-    if _is_older(connection):
-        return []
     table = schema.searches
-    knows_classes = schema.format_of(connection) >= 5
-    columns = [each for each in table.c if knows_classes or each is not table.c.searched_for]
-    rows = connection.execute(_of_complete_runs(table, columns).order_by(schema.flights.c.rank))
+    rows = connection.execute(_of_complete_runs(table, table.c).order_by(schema.flights.c.rank))
     with reading_rows("search"):
         return [
             StoredSearch(
                 row.flight_id,
                 row.rank,
                 row.model,
-                _frames_of(row.outlines_m, row.searched_for if knows_classes else None),
+                _frames_of(row.outlines_m, row.searched_for),
             )
             for row in rows
         ]
@@ -82,8 +78,6 @@ def load_searches(connection: Connection) -> list[StoredSearch]:
 
 def load_objects(connection: Connection, flight_id: str | None = None) -> list[StoredObject]:
     """The objects of complete runs by flight rank and number; of one flight if its id is given."""
-    if _is_older(connection):
-        return []
     query = _of_complete_runs(schema.objects, schema.objects.c).order_by(
         schema.flights.c.rank, schema.objects.c.number
     )
@@ -119,8 +113,6 @@ def newest_objects(
 
 def is_searched(connection: Connection, run_id: int) -> bool:
     """Whether the run's frames were searched for objects."""
-    if _is_older(connection):
-        return False
     query = select(schema.searches.c.run_id).where(schema.searches.c.run_id == run_id)
     return connection.execute(query).first() is not None
 
@@ -180,8 +172,3 @@ def _object_of(object_id: str, values: dict[str, Any]) -> MapObject:
             for name in ("sigma_m", "length_m", "width_m")
         }
         return MapObject(checked_name(object_id, "object"), **{**values, **lengths})
-
-
-def _is_older(connection: Connection) -> bool:
-    """Whether the catalogue, opened to be read, is of a format that knew no objects."""
-    return schema.format_of(connection) < 3

@@ -1,4 +1,4 @@
-"""The tables of the catalogue, the same in SQLite and in PostgreSQL, and the formats that are read."""
+"""The tables of the catalogue, the same in SQLite and in PostgreSQL, and the number of its format."""
 
 from collections.abc import Sequence
 
@@ -16,12 +16,12 @@ from sqlalchemy import (
     MetaData,
     Table,
     insert,
+    select,
 )
 from sqlalchemy import String as AnyString
 
-SCHEMA_VERSION = 5
-OLDEST_VERSION = 1
-"""The oldest format that is still read, and brought up to date when it is opened to be written."""
+FORMAT = 1
+"""A catalogue of another format is refused."""
 
 String = AnyString().with_variant(
     AnyString(collation="C"), "postgresql"
@@ -55,7 +55,9 @@ flights = Table(
 runs = Table(
     "runs",
     metadata,
-    Column("id", Integer, primary_key=True),
+    Column(
+        "id", Integer, primary_key=True, autoincrement=False
+    ),  # names the run's folder: never used twice
     Column("flight_id", ForeignKey("flights.id"), nullable=False),
     Column("fingerprint", String, nullable=False),
     Column("status", String, nullable=False),  # mapping | complete
@@ -66,7 +68,6 @@ runs = Table(
     Column("frames", JSON, nullable=False),  # status -> number of frames
     Column("notes", JSON, nullable=False),
     Column("files_written", Boolean, nullable=False),
-    sqlite_autoincrement=True,  # a run's number names its folder: never used twice
 )
 keyframes = Table(
     "keyframes",
@@ -102,14 +103,13 @@ leftovers = Table(
 versions = Table(
     "versions",
     metadata,
-    Column("id", Integer, primary_key=True),
+    Column("id", Integer, primary_key=True, autoincrement=False),
     Column("parent_id", Integer, nullable=False),  # the version it was painted over; 0: none
     Column("flight_id", ForeignKey("flights.id"), nullable=False),
     Column("run_id", Integer, nullable=False),
     Column("created_utc", String, nullable=False),
     Column("complete", Boolean, nullable=False),
     Column("export_crs", String, nullable=False),  # "" is the site's own
-    sqlite_autoincrement=True,
 )
 version_tiles = Table(
     "version_tiles",
@@ -154,9 +154,7 @@ searches = Table(
     Column("run_id", ForeignKey("runs.id", ondelete="CASCADE"), primary_key=True),
     Column("model", String, nullable=False),
     Column("outlines_m", JSON, nullable=False),  # (N, 4, 2) of the frames that were looked at
-    Column(
-        "searched_for", JSON
-    ),  # class -> (N,) 0 or 1; NULL where a format before 5 wrote it: not known
+    Column("searched_for", JSON),  # class -> (N,) 0 or 1; null: each frame for every class
 )
 objects = Table(
     "objects",
@@ -173,13 +171,12 @@ flown = Table(
     Column("first_ns", Nanoseconds, nullable=False),  # UTC; from 1970 on where no clock has a date
     Column("last_ns", Nanoseconds, nullable=False),
 )
-postgres_metadata = MetaData()
+numbers_metadata = MetaData()
 numbers = Table(
     "numbers",
-    postgres_metadata,  # what SQLite keeps by itself: the number given last to a run and to a version
-    Column(
-        "name", String, primary_key=True
-    ),  # "runs", "versions"; "writes" counts the transactions that wrote
+    numbers_metadata,
+    # "runs" and "versions": the number given last; "writes": transactions that wrote, counted in PostgreSQL; "format"
+    Column("name", String, primary_key=True),
     Column("last", BigInteger, nullable=False),
 )
 NUMBERED = ("runs", "versions")
@@ -187,33 +184,24 @@ WRITES = "writes"
 
 
 def make_tables(connection: Connection) -> None:
-    """The tables of the newest format, inside the caller's transaction."""
+    """Make the empty tables, inside the caller's transaction."""
     metadata.create_all(connection)
-    if connection.dialect.name != "sqlite":
-        make_numbers(connection, NUMBERED)
-    set_format(connection, SCHEMA_VERSION)
+    make_numbers(connection, FORMAT, NUMBERED)
 
 
-def make_numbers(connection: Connection, names: Sequence[str]) -> None:
-    """The table that PostgreSQL needs beside: these numbers, and the count of writes."""
+def make_numbers(connection: Connection, format_number: int, names: Sequence[str] = ()) -> None:
+    """Make the table of these numbers, of the count of writes and of the format."""
     numbers.create(connection)
-    connection.execute(insert(numbers), [{"name": name, "last": 0} for name in (*names, WRITES)])
-
-
-def set_format(connection: Connection, number: int) -> None:
-    """Note the format in SQLite's header or in Alembic's own table, inside the caller's transaction."""
+    first = {**dict.fromkeys((*names, WRITES), 0), "format": format_number}
+    rows = [{"name": name, "last": last} for name, last in first.items()]
+    connection.execute(insert(numbers), rows)
     if connection.dialect.name == "sqlite":
-        connection.exec_driver_sql(f"PRAGMA user_version = {number:d}")
-        return
-    from sorvolo.store.site.migrations.upgrade import (
-        stamp,
-    )  # only where tables are made: Alembic loads slowly
-
-    stamp(connection, number)
+        connection.exec_driver_sql(f"PRAGMA user_version = {format_number:d}")
 
 
 def format_of(connection: Connection) -> int:
-    """The format of the catalogue, 1 to SCHEMA_VERSION where this Sorvolo knows it."""
+    """Return the format of a catalogue or an index."""
     if connection.dialect.name == "sqlite":
         return int(connection.exec_driver_sql("PRAGMA user_version").scalar_one())
-    return int(connection.exec_driver_sql("SELECT version_num FROM alembic_version").scalar_one())
+    query = select(numbers.c.last).where(numbers.c.name == "format")
+    return int(connection.execute(query).scalar_one())

@@ -1,1 +1,0 @@
-"""Alembic migrations of the catalogue, from the oldest format that is read to the newest."""

@@ -1,1 +1,0 @@
-"""One migration for each format of the catalogue."""
