@@ -197,7 +197,7 @@ def _map_to_step(folder: Path, seed: int, last: int, steps: Path) -> None:
             "archive.py",
             "flight_writer.py",
             "catalogue.py",
-            "sqlite_database.py",
+            "database.py",
             "derived.py",
             "atomic.py",
         )

@@ -11,6 +11,8 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
+from sqlalchemy import Connection, delete, insert, select, update
+
 from sorvolo.errors import StoreError
 from sorvolo.store.atomic import (
     TEMPORARY_PREFIX,
@@ -37,6 +39,7 @@ from sorvolo.store.copies.site_state import (
 )
 from sorvolo.store.nofollow import open_below, refuse_links
 from sorvolo.store.site import catalogue as records
+from sorvolo.store.site import schema
 from sorvolo.store.site.catalogue import Catalogue
 from sorvolo.store.site.catalogue_place import (
     CATALOGUE,
@@ -45,6 +48,7 @@ from sorvolo.store.site.catalogue_place import (
     create_database,
     is_site,
 )
+from sorvolo.store.site.database import SqliteDatabase
 from sorvolo.store.site.files import (
     COPYING,
     JOURNAL,
@@ -56,9 +60,8 @@ from sorvolo.store.site.files import (
     refuse_unfinished,
 )
 from sorvolo.store.site.origin import ORIGIN, TILE_SIZES, UNSENT
-from sorvolo.store.site.row_copies import copy_rows
-from sorvolo.store.site.sqlite_database import SqliteDatabase
 
+_ROWS_AT_ONCE = 1000
 _OF_THE_FOLDER = frozenset(
     {
         CATALOGUE,
@@ -331,6 +334,19 @@ def _overwrite_rows(folder: Path, new: Path, catalogues: Catalogues | None) -> N
         source.reading() as read,
     ):
         copy_rows(read, written)
+
+
+def copy_rows(source: Connection, target: Connection) -> None:
+    """Make the target's rows the source's, inside the callers' transactions."""
+    for table in reversed(schema.metadata.sorted_tables):
+        target.execute(delete(table))
+    for table in schema.metadata.sorted_tables:
+        for rows in source.execute(select(table)).mappings().partitions(_ROWS_AT_ONCE):
+            target.execute(insert(table), [dict(row) for row in rows])
+    # the numbers of runs and versions that are gone are not given again
+    numbers = schema.numbers
+    for row in source.execute(select(numbers).where(numbers.c.name.in_(schema.NUMBERED))):
+        target.execute(update(numbers).where(numbers.c.name == row.name).values(last=row.last))
 
 
 def _paths(folder: Path) -> Iterator[str]:

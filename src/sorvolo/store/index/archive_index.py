@@ -32,9 +32,8 @@ from sorvolo.store.site.catalogue_place import (
     parsed_url,
     pointed_database,
 )
-from sorvolo.store.site.database import Database
+from sorvolo.store.site.database import Database, SqliteDatabase
 from sorvolo.store.site.schema import format_of
-from sorvolo.store.site.sqlite_database import SqliteDatabase
 
 INDEX = "archive-index.db"
 POINTER = "archive-index.json"

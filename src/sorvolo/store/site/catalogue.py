@@ -32,9 +32,8 @@ from sorvolo.geometry.units import DAY_NS
 from sorvolo.store.rasters.geotiff import COMPRESSIONS
 from sorvolo.store.site import schema
 from sorvolo.store.site.catalogue_place import Catalogues, open_database
-from sorvolo.store.site.database import Database
+from sorvolo.store.site.database import Database, SqliteDatabase
 from sorvolo.store.site.names import checked_crs, checked_image_path
-from sorvolo.store.site.sqlite_database import SqliteDatabase
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import Status
 
