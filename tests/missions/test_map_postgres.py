@@ -72,7 +72,7 @@ def rows(site: Path) -> dict[str, list[dict[str, Any]]]:
     """Every row of the catalogue but when it was written; of settings what does not name the site."""
     with (
         Archive.open(site, write=False) as archive,
-        archive._files.catalogue.reading() as connection,
+        archive.catalogue.reading() as connection,
     ):
         found = {}
         for table in schema.metadata.sorted_tables:

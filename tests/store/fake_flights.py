@@ -198,7 +198,7 @@ def _map_to_step(folder: Path, seed: int, last: int, steps: Path) -> None:
             "flight_writer.py",
             "catalogue.py",
             "database.py",
-            "derived.py",
+            "upkeep.py",
             "atomic.py",
         )
         if event != "call" or not called.f_code.co_filename.endswith(ordering):

@@ -482,7 +482,7 @@ def test_readers_know_that_the_catalogue_changed_when_they_can_see_it(folder: Pa
     with opened(folder) as writer, read() as reader, read() as twin:
         before = reader.change_mark()
         assert reader.change_mark() == before != twin.change_mark()
-        with writer._files.catalogue.changing() as connection:
+        with writer.catalogue.changing() as connection:
             connection.exec_driver_sql("UPDATE site SET name = 'longer than it was'")
             assert reader.change_mark() == before
         after = reader.change_mark()

@@ -249,7 +249,7 @@ def test_a_connection_cut_within_a_transaction_undoes_it_whole(
         "pg_backend_pid()"
     )
     with Archive.open(site, write=True) as archive:
-        catalogue = archive._files.catalogue
+        catalogue = archive.catalogue
         with pytest.raises(ConnectionLostError), catalogue.changing() as connection:
             connection.execute(schema.site.update().values(name="half"))
             postgres.sql(cut)

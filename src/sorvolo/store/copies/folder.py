@@ -55,7 +55,7 @@ from sorvolo.store.site.files import (
     LIVE_COVERAGE,
     LIVE_PREVIEW,
     LOCK,
-    SiteFiles,
+    SiteFolder,
     lock_folder,
     refuse_unfinished,
 )
@@ -100,7 +100,7 @@ class FolderEnd:
         Raises StoreError for no site, one without a map, or one that is a copy that is not finished.
         """
         refuse_unfinished(self.folder)
-        files = SiteFiles.open(self.folder, write=False, catalogues=self._catalogues)
+        files = SiteFolder.open(self.folder, write=False, catalogues=self._catalogues)
         try:
             path = scratch / CATALOGUE
             _copy_catalogue(files.catalogue, path)

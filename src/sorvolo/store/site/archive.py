@@ -10,14 +10,13 @@ from sqlalchemy import Connection
 
 from sorvolo.errors import InputError, SettingsError, SorvoloWarning, StoreError
 from sorvolo.geometry.arrays import ImageRGB
-from sorvolo.geometry.grid import SiteGrid
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.site import catalogue as records
 from sorvolo.store.site import change_records, object_records
 from sorvolo.store.site.catalogue import FlightEntry, StoredKeyframe, TileDifference, VersionEntry
 from sorvolo.store.site.catalogue_place import Catalogues
 from sorvolo.store.site.change_records import StoredChange, StoredReview
-from sorvolo.store.site.files import HeightFile, SiteFiles
+from sorvolo.store.site.files import SiteFolder
 from sorvolo.store.site.flight_writer import FlightWriter
 from sorvolo.store.site.journal import RunJournal
 from sorvolo.store.site.names import is_plain_name
@@ -38,16 +37,14 @@ __all__ = ["Archive", "FlightWriter"]
 _MEGABYTE = 1_000_000
 
 
-class Archive:
+class Archive(SiteFolder):
     """One site on disk; a context manager. Made by `open`.
 
     The catalogue is the truth. Tiles and keyframe images are files that it names; everything else is derived
     from them and replaced whole, so that the folder can be read at any moment, whatever was killed when.
     """
 
-    def __init__(self, files: SiteFiles) -> None:
-        self._files = files
-        self._writer: FlightWriter | None = None
+    _writer: FlightWriter | None = None
 
     @classmethod
     def open(cls, folder: Path, *, write: bool, catalogues: Catalogues | None = None) -> Self:
@@ -58,19 +55,15 @@ class Archive:
         StoreError when the folder is no site, is being written by another process, cannot be written, is
         damaged, holds a link, or has another format version; then nothing in it was changed.
         """
-        files = SiteFiles.open(Path(folder), write=write, catalogues=catalogues)
+        archive = super().open(Path(folder), write=write, catalogues=catalogues)
         try:
             if write:
-                forget_unfinished(files)
-                repair(files)
+                forget_unfinished(archive)
+                repair(archive)
         except BaseException:
-            files.close()
+            archive.close()
             raise
-        return cls(files)
-
-    def close(self) -> None:
-        """Let go of the catalogue and of the right to write."""
-        self._files.close()
+        return archive
 
     def __enter__(self) -> Self:
         return self
@@ -79,69 +72,14 @@ class Archive:
         self.close()
 
     @property
-    def folder(self) -> Path:
-        """The site folder."""
-        return self._files.folder
-
-    @property
-    def mosaic_path(self) -> Path:
-        """The map as a Cloud Optimized GeoTIFF."""
-        return self._files.mosaic_path
-
-    @property
-    def preview_path(self) -> Path:
-        """The map as a small PNG."""
-        return self._files.preview_path
-
-    @property
-    def kmz_path(self) -> Path:
-        """The map for Google Earth; there is none for a local site."""
-        return self._files.kmz_path
-
-    @property
-    def live_preview_path(self) -> Path:
-        """Where the mission may keep a small PNG of the growing map; removed when the flight is done."""
-        return self._files.live_preview_path
-
-    @property
-    def live_coverage_path(self) -> Path:
-        """Where the mission may keep the ground seen by now, as GeoJSON; removed when the flight is done."""
-        return self._files.live_coverage_path
-
-    def flight_folder(self, flight_id: str) -> Path:
-        """Where a flight's frames.geojson, report.json, report.html, keyframes and changes lie."""
-        return self._files.flight_folder(flight_id)
-
-    def height_path(self, flight_id: str, file: HeightFile) -> Path:
-        """Where a file of a flight's heights lies, whether it is there or not."""
-        return self._files.height_path(flight_id, file)
-
-    def frames(self, flight_id: str) -> Sequence[Any]:
-        """The features of a flight's frames.geojson (docs/formats.md); none when somebody took it away or broke it."""
-        return self._files.frames(flight_id)
-
-    def report(self, flight_id: str) -> Mapping[str, Any]:
-        """A flight's report.json (docs/formats.md); empty when somebody took it away or broke it."""
-        return self._files.report(flight_id)
-
-    @property
     def has_site(self) -> bool:
         """Whether `create_site` was ever called on this folder."""
-        return self._files.find_site() is not None
-
-    def site(self) -> Site:
-        """The site; raises StoreError when there is none yet."""
-        return self._files.site()
+        return self.find_site() is not None
 
     @property
     def created_utc(self) -> str:
         """When the site was created, to the millisecond: no other site of its name has the same; "" before."""
-        with self._files.catalogue.reading() as connection:
-            return records.created_utc(connection)
-
-    def site_grid(self) -> SiteGrid:
-        """The pixel grid of the site's tiles; raises StoreError when there is no site yet."""
-        return self._files.site_grid()
+        return self._read(records.created_utc)
 
     def create_site(self, site: Site) -> None:
         """Fix the site for ever; raises StoreError when the folder has one."""
@@ -150,27 +88,21 @@ class Archive:
             raise StoreError(
                 f"{self.folder} holds the site {self.site().name!r}; choose another folder"
             )
-        with self._files.catalogue.changing() as connection:
+        with self.catalogue.changing() as connection:
             records.add_site(connection, site)
 
     def flights(self) -> list[FlightEntry]:
         """Every flight by rank. A complete run stays listed until the run that replaces it commits."""
-        with self._files.catalogue.reading() as connection:
-            return records.list_flights(connection)
-
-    def versions(self) -> list[VersionEntry]:
-        """Every state of the map, oldest first, the one being made included."""
-        return self._files.versions()
+        return self._read(records.list_flights)
 
     def change_mark(self) -> tuple[int, int]:
         """Another one after each change that others made to the catalogue; what is read after it is no older."""
-        return self._files.catalogue.change_mark()
+        return self.catalogue.change_mark()
 
     @property
     def exported_version(self) -> int:
         """The version that mosaic.tif and the other files of the map show; 0 for none."""
-        with self._files.catalogue.reading() as connection:
-            return records.derived_version(connection)
+        return self._read(records.derived_version)
 
     def version_at(self, moment: datetime) -> VersionEntry:
         """The newest version of flights flown by a moment, taken as UTC when it names no time zone.
@@ -194,24 +126,21 @@ class Archive:
 
     def tile_difference(self, version: VersionEntry) -> TileDifference:
         """What a version's map has that the one it was painted over has not."""
-        with self._files.catalogue.reading() as connection:
+        with self.catalogue.reading() as connection:
             changed, removed = records.tile_changes(connection, version)
-        return TileDifference(len(changed), removed, self._files.blobs.size_bytes(changed))
+        return TileDifference(len(changed), removed, self.blobs.size_bytes(changed))
 
     def comparisons(self) -> dict[int, Mapping[str, int]]:
         """The versions that comparisons made: how many changes of each kind each found."""
-        with self._files.catalogue.reading() as connection:
-            return change_records.compared_versions(connection)
+        return self._read(change_records.compared_versions)
 
     def changes(self, flight_id: str | None = None) -> list[StoredChange]:
         """The changes that complete runs found, by flight rank and number, with their verdicts; of one flight."""
-        with self._files.catalogue.reading() as connection:
-            return change_records.load_changes(connection, flight_id)
+        return self._read(change_records.load_changes, flight_id)
 
     def reviews(self) -> list[StoredReview]:
         """All reviews of changes, oldest first, also of changes that were replaced since."""
-        with self._files.catalogue.reading() as connection:
-            return change_records.load_reviews(connection)
+        return self._read(change_records.load_reviews)
 
     @property
     def is_searched(self) -> bool:
@@ -220,17 +149,15 @@ class Archive:
 
     def objects(self, flight_id: str | None = None) -> list[StoredObject]:
         """The objects that complete runs found, by flight rank and number; of one flight."""
-        with self._files.catalogue.reading() as connection:
-            return object_records.load_objects(connection, flight_id)
+        return self._read(object_records.load_objects, flight_id)
 
     def searches(self) -> list[StoredSearch]:
         """Which ground each complete run searched for objects, by flight rank."""
-        with self._files.catalogue.reading() as connection:
-            return object_records.load_searches(connection)
+        return self._read(object_records.load_searches)
 
     def newest_objects(self, flights: Collection[str] | None = None) -> list[StoredObject]:
         """What stands on the site by the newest look at each piece of ground; as far as these flights know."""
-        with self._files.catalogue.reading() as connection:
+        with self.catalogue.reading() as connection:
             found, searches = (
                 object_records.load_objects(connection),
                 object_records.load_searches(connection),
@@ -259,7 +186,7 @@ class Archive:
         self, wanted: Collection[str], change: Callable[[Connection, Sequence[StoredChange]], None]
     ) -> None:
         self._require_writable()
-        with self._files.catalogue.changing() as connection:
+        with self.catalogue.changing() as connection:
             found = [each for each in change_records.load_changes(connection) if each.id in wanted]
             unknown = sorted(set(wanted) - {each.id for each in found})
             if unknown:
@@ -268,16 +195,15 @@ class Archive:
                 )
             change(connection, found)
             records.owe_documents(connection, {each.flight_id for each in found})
-        repair(self._files)
+        repair(self)
 
     def keyframes(self, flight_id: str | None = None) -> list[StoredKeyframe]:
         """Keyframes of complete runs, by flight rank and index; of one flight when its id is given."""
-        with self._files.catalogue.reading() as connection:
-            return records.load_keyframes(connection, flight_id)
+        return self._read(records.load_keyframes, flight_id)
 
     def image(self, keyframe: StoredKeyframe) -> ImageRGB:
         """A keyframe's undistorted image; raises StoreError when its flight was mapped again meanwhile."""
-        return self._files.image(keyframe.flight_id, keyframe.image_path)
+        return self.stored_image(keyframe.flight_id, keyframe.image_path)
 
     def tiles(self, version: int | None = None) -> TileView:
         """The tiles of a version, of the newest complete one by default, read when asked for; {} if none.
@@ -288,17 +214,16 @@ class Archive:
             raise StoreError(
                 f"{self.folder} has no version {version} of its map; `versions` lists them"
             )
-        with self._files.catalogue.reading() as connection:
-            newest = records.newest_version(connection)
-        return self._files.tiles(newest if version is None else version)
+        newest = self._read(records.newest_version)
+        return self.version_tiles(newest if version is None else version)
 
     def live_tiles(self) -> TileView:
         """The tiles of the map that is being made, as of its last flush; else of the newest complete one."""
-        with self._files.catalogue.reading() as connection:
+        with self.catalogue.reading() as connection:
             version = records.newest_version(connection, complete=False) or records.newest_version(
                 connection
             )
-        return self._files.tiles(version)
+        return self.version_tiles(version)
 
     def journal(
         self, flight_id: str, key: str, program: str = "", *, anew: bool = False
@@ -309,36 +234,34 @@ class Archive:
         are deleted, and their pictures: a warning names each. `anew`: so is what a killed run left.
         """
         self._require_writable()
-        path = self._files.journal_path(flight_id)
-        with self._files.catalogue.reading() as connection:
-            newest = records.newest_version(connection)
+        path = self.journal_path(flight_id)
+        newest = self._read(records.newest_version)
         journal = RunJournal(path, key, newest, program)
         if not anew and (why_not := journal.why_not):
             _warn(
                 f"{flight_id}: a run that was stopped cannot continue: {why_not}; it starts again"
             )
         self._forget_stopped(path if journal.is_begun and not anew else None, but=flight_id)
-        remove_unused(self._files)
+        remove_unused(self)
         return journal
 
     def stopped_run(self, key: str, program: str) -> RunJournal | None:
         """What a killed run of this `key` left, of whatever flight; None where there is none. See `journal`."""
-        with self._files.catalogue.reading() as connection:
-            newest = records.newest_version(connection)
-        for flight_id in stopped_flights(self._files):
-            journal = RunJournal(self._files.journal_path(flight_id), key, newest, program)
+        newest = self._read(records.newest_version)
+        for flight_id in stopped_flights(self):
+            journal = RunJournal(self.journal_path(flight_id), key, newest, program)
             if journal.is_begun:
                 return journal
         return None
 
     def _forget_stopped(self, kept: Path | None, *, but: str) -> None:
         """Forget the runs that were stopped, all but `kept`, with a warning for those of other flights than `but`."""
-        for each in stopped_flights(self._files):
+        for each in stopped_flights(self):
             if each != but:
                 _warn(
                     f"a run of {each} was stopped before it was complete, and cannot continue: the map changes now"
                 )
-        forget_journals(self._files, kept)
+        forget_journals(self, kept)
 
     def begin_flight(
         self,
@@ -368,7 +291,7 @@ class Archive:
         grid = self.site_grid().grid
         if journal is None:
             self._forget_stopped(None, but=flight_id)
-        with self._files.catalogue.changing() as connection:
+        with self.catalogue.changing() as connection:
             run_id, version_id = records.begin_run(
                 connection,
                 flight_id,
@@ -377,15 +300,15 @@ class Archive:
                 plain_json(settings),
             )
             base = records.tile_hashes(connection, version_id)
-        self._files.blobs.cache_bytes = min(self._files.blobs.cache_bytes, tiles_mb * _MEGABYTE)
-        tiles = GrowingTiles(self._files.blobs, base, grid.tile_px, tiles_mb * _MEGABYTE)
+        self.blobs.cache_bytes = min(self.blobs.cache_bytes, tiles_mb * _MEGABYTE)
+        tiles = GrowingTiles(self.blobs, base, grid.tile_px, tiles_mb * _MEGABYTE)
         self._writer = FlightWriter(
-            self._files, flight_id, run_id, version_id, tiles, images_mb * _MEGABYTE
+            self, flight_id, run_id, version_id, tiles, images_mb * _MEGABYTE
         )
         return self._writer
 
     def _require_writable(self) -> None:
-        if not self._files.is_writable:
+        if not self.is_writable:
             raise StoreError(f"{self.folder} was opened to be read; open it with write=True")
 
 

@@ -1,11 +1,11 @@
-"""SiteFiles: what a site consists of - its folder, its catalogue, its tiles; the only path layout (docs/formats.md)."""
+"""SiteFolder: what a site consists of - its folder, its catalogue, its tiles; the only path layout (docs/formats.md)."""
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 from sorvolo.errors import StoreError, UnavailableError
 from sorvolo.geometry.arrays import ImageRGB
@@ -29,6 +29,8 @@ from sorvolo.store.site.names import checked_document, checked_image_path, check
 from sorvolo.store.site.origin import ORIGIN, TILE_SIZES, UNSENT, find_origin
 from sorvolo.store.site.tiles import TileBlobs, TileView
 from sorvolo.survey.flight import Site
+
+T = TypeVar("T")
 
 STAGED = "staged"
 """The folder of a flight in which its next run collects pictures until it is committed."""
@@ -60,7 +62,7 @@ class HeightFile(StrEnum):
     REPORT = "heights.json"
 
 
-class SiteFiles:
+class SiteFolder:
     """One open site: its catalogue and its tile blobs, and the path of everything that lies in its folder.
 
     Every name that comes out of the catalogue is checked before it becomes a path. Made by `open`.
@@ -167,7 +169,7 @@ class SiteFiles:
             f"flights/{checked_name(flight_id, 'flight')}/keyframes/{int(run_id)}/{index:06d}.jpg"
         )
 
-    def image(self, flight_id: str, image_path: str, step: int = 1) -> ImageRGB:
+    def stored_image(self, flight_id: str, image_path: str, step: int = 1) -> ImageRGB:
         """A stored keyframe, at a `step`-th (1, 2, 4, 8) of its size.
 
         Raises StoreError when it is gone, damaged, or no keyframe of this flight.
@@ -211,10 +213,14 @@ class SiteFiles:
             return {}
         return content if isinstance(content, dict) else {}
 
+    def _read(self, query: Callable[..., T], *arguments: object) -> T:
+        """What a query finds in one transaction."""
+        with self.catalogue.reading() as connection:
+            return query(connection, *arguments)
+
     def find_site(self) -> Site | None:
         """The site; None while there is none."""
-        with self.catalogue.reading() as connection:
-            return records.load_site(connection)
+        return self._read(records.load_site)
 
     def site(self) -> Site:
         """The site; raises StoreError while there is none."""
@@ -230,15 +236,13 @@ class SiteFiles:
 
     def versions(self) -> list[VersionEntry]:
         """Every state of the map, oldest first."""
-        with self.catalogue.reading() as connection:
-            return records.list_versions(connection)
+        return self._read(records.list_versions)
 
-    def tiles(self, version_id: int) -> TileView:
+    def version_tiles(self, version_id: int) -> TileView:
         """The tiles of a version, read when asked for; none for a version that does not exist."""
 
         def hashes() -> Mapping[Any, str]:
-            with self.catalogue.reading() as connection:
-                return records.tile_hashes(connection, version_id)
+            return self._read(records.tile_hashes, version_id)
 
         return TileView(self.blobs, hashes(), hashes)
 

@@ -30,10 +30,15 @@ from sorvolo.store.rasters.geotiff import parse_crs
 from sorvolo.store.site import catalogue as records
 from sorvolo.store.site import change_records, object_records
 from sorvolo.store.site.catalogue import StoredKeyframe
-from sorvolo.store.site.derived import STAGED_FOLDERS
-from sorvolo.store.site.files import SiteFiles
+from sorvolo.store.site.files import SiteFolder
 from sorvolo.store.site.tiles import GrowingTiles
-from sorvolo.store.site.upkeep import forget_journals, forget_unfinished, remove_unused, repair
+from sorvolo.store.site.upkeep import (
+    STAGED_FOLDERS,
+    forget_journals,
+    forget_unfinished,
+    remove_unused,
+    repair,
+)
 from sorvolo.survey.findings import Change
 from sorvolo.survey.map_objects import ObjectSearch
 from sorvolo.survey.mosaic import PlacedFrame, Status
@@ -49,7 +54,7 @@ class FlightWriter:
 
     def __init__(
         self,
-        files: SiteFiles,
+        files: SiteFolder,
         flight_id: str,
         run_id: int,
         version_id: int,
@@ -62,7 +67,7 @@ class FlightWriter:
         self._sizes: dict[str, tuple[int, int]] = {}  # path of each saved image: width, height
         self._sha256: dict[int, str] = {}  # of each saved image, by frame index
         self._cache = ImageCache(
-            lambda index: files.image(flight_id, self._image_path(index)), cache_bytes
+            lambda index: files.stored_image(flight_id, self._image_path(index)), cache_bytes
         )
         self._boxes: dict[str, list[list[int]]] = {}  # of each mask saved
         self._is_open = True
@@ -183,7 +188,7 @@ class FlightWriter:
 
     def small_image(self, index: int, step: int) -> ImageRGB:
         """A keyframe saved earlier at a `step`-th (1, 2, 4, 8) of its size, rounded up."""
-        return self._files.image(self._flight_id, self._image_path(index), step)
+        return self._files.stored_image(self._flight_id, self._image_path(index), step)
 
     def save_masks(self, frame_name: str, changed: ImageGray, valid: Mask, boxes: Boxes) -> None:
         """Store one view's mask and boxes (N, 4), to appear as masks/<frame>.png and in masks/boxes.json on commit.

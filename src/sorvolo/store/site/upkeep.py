@@ -1,27 +1,42 @@
-"""Upkeep of a site: missing derived files are written, files that nothing refers to are removed."""
+"""Derived files of a site, made from its catalogue: written where they are owed, removed where nothing names them."""
 
+import os
 import shutil
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
-from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, writing
+from sorvolo.geometry.arrays import ImageRGBA
+from sorvolo.geometry.grid import TileIndex
+from sorvolo.store.atomic import (
+    atomic_write_bytes,
+    remove_leftovers,
+    sync_file,
+    temporary_beside,
+    writing,
+)
+from sorvolo.store.exports.change_files import change_placemarks, changes_geojson, crop_names
+from sorvolo.store.exports.map_pictures import Picture, pictures, small_map_of, write_small_maps
+from sorvolo.store.exports.object_files import CROPS, OBJECTS, object_placemarks, objects_geojson
+from sorvolo.store.exports.placemarks import Placemark, gpx_bytes, kml_bytes
+from sorvolo.store.exports.plain import features_name, features_path, geojson_bytes
+from sorvolo.store.images import rgba_from_png
+from sorvolo.store.nofollow import read_below
+from sorvolo.store.pages.changes import changes_page
+from sorvolo.store.rasters.geotiff import write_cog
 from sorvolo.store.site import catalogue as records
 from sorvolo.store.site import change_records, object_records
 from sorvolo.store.site.catalogue import OwedFiles, VersionEntry
-from sorvolo.store.site.derived import (
-    map_is_there,
-    site_objects_are_there,
-    take_staged,
-    write_change_files,
-    write_map_files,
-    write_object_files,
-    write_site_objects,
-)
-from sorvolo.store.site.files import JOURNAL, STAGED, SiteFiles
+from sorvolo.store.site.files import JOURNAL, STAGED, SiteFolder
 from sorvolo.store.site.journal import is_journal_after
 
+STAGED_FOLDERS = ("changes", "masks", CROPS)
+# of the map in changes.html; daily flights without change should cost little
+_PICTURE_PX, _UNCHANGED_PX = 1600, 800
 
-def repair(files: SiteFiles) -> None:
+
+def repair(files: SiteFolder) -> None:
     """Write the derived files that a killed process had not yet written, and those of the map that were deleted.
 
     Raises StoreError on a full disk; what the catalogue holds stays true.
@@ -46,16 +61,16 @@ def repair(files: SiteFiles) -> None:
         records.mark_written(connection, [each.run_id for each in owed], newest.id)
 
 
-def _is_shown(files: SiteFiles, newest: VersionEntry, shown: int) -> bool:
+def _is_shown(files: SiteFolder, newest: VersionEntry, shown: int) -> bool:
     """Whether the map's files are those of the newest version, or would be the same."""
     return _looks_like(files, newest, shown) and (not newest.tiles or map_is_there(files))
 
 
-def _newest(files: SiteFiles) -> VersionEntry | None:
+def _newest(files: SiteFolder) -> VersionEntry | None:
     return next((each for each in reversed(files.versions()) if each.complete), None)
 
 
-def forget_unfinished(files: SiteFiles) -> None:
+def forget_unfinished(files: SiteFolder) -> None:
     """Drop runs that never committed, then every file that nothing refers to.
 
     The journal of a run that was killed stays, and its pictures, as long as the map is the one that it began over.
@@ -70,7 +85,7 @@ def forget_unfinished(files: SiteFiles) -> None:
     remove_unused(files)
 
 
-def remove_unused(files: SiteFiles) -> None:
+def remove_unused(files: SiteFolder) -> None:
     """Delete tiles and pictures that nothing in the catalogue refers to, and what killed processes left."""
     with files.catalogue.reading() as connection:
         runs, used = records.run_ids(connection), records.used_hashes(connection)
@@ -89,14 +104,14 @@ def remove_unused(files: SiteFiles) -> None:
         _remove_unused_pictures(flight, {str(run_id) for run_id in runs.get(flight.name, set())})
 
 
-def forget_journals(files: SiteFiles, kept: Path | None = None) -> None:
+def forget_journals(files: SiteFolder, kept: Path | None = None) -> None:
     """Delete the journals of runs that were killed, all but `kept`, which continues: the site changes."""
     for flight in files.flight_folders():
         if flight / JOURNAL != kept:
             (flight / JOURNAL).unlink(missing_ok=True)
 
 
-def stopped_flights(files: SiteFiles) -> list[str]:
+def stopped_flights(files: SiteFolder) -> list[str]:
     """The flights whose runs were stopped before they were complete."""
     return [each.name for each in files.flight_folders() if (each / JOURNAL).is_file()]
 
@@ -111,7 +126,7 @@ def _remove_unused_pictures(flight: Path, known_runs: set[str]) -> None:
             emptied.rmdir()
 
 
-def _looks_like(files: SiteFiles, version: VersionEntry, shown: int) -> bool:
+def _looks_like(files: SiteFolder, version: VersionEntry, shown: int) -> bool:
     """Whether the map's files, which show another version, would be the same for this one."""
     if version.id == shown:
         return True
@@ -121,7 +136,7 @@ def _looks_like(files: SiteFiles, version: VersionEntry, shown: int) -> bool:
     return same and written_as == (version.export_crs, version.compress)
 
 
-def _write_flight_files(files: SiteFiles, owed: OwedFiles) -> None:
+def _write_flight_files(files: SiteFolder, owed: OwedFiles) -> None:
     folder = files.flight_folder(owed.flight_id)
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -139,3 +154,208 @@ def _write_flight_files(files: SiteFiles, owed: OwedFiles) -> None:
     )
     write_change_files(files, owed.flight_id, version)
     write_object_files(files, owed.flight_id, is_searched=is_searched)
+
+
+def write_map_files(files: SiteFolder, version: VersionEntry) -> None:
+    """Write mosaic.tif, preview.png and mosaic.kmz of a version; remove them when it has no tiles."""
+    tiles = files.version_tiles(version.id)
+    if not tiles:
+        for path in (files.preview_path, files.mosaic_path, files.kmz_path):
+            path.unlink(missing_ok=True)
+        return
+    site = files.site()
+    small = small_map_of(tiles, files.site_grid().grid.tile_px)
+    waiting: list[Future[None]] = []
+    with ThreadPoolExecutor(1, thread_name_prefix="previews") as other:
+
+        def pass_by(index: TileIndex, tile: ImageRGBA) -> None:
+            small.take(index, tile)
+            if small.taken == len(tiles):  # while GDAL makes its file
+                kmz = None if site.is_local else files.kmz_path
+                waiting.append(
+                    other.submit(
+                        write_small_maps,
+                        small,
+                        files.site_grid(),
+                        site.name,
+                        files.preview_path,
+                        kmz,
+                    )
+                )
+
+        write_cog(
+            tiles,
+            files.site_grid(),
+            files.mosaic_path,
+            crs=version.export_crs or None,
+            compress=version.compress,
+            pass_by=pass_by,
+        )
+    for each in waiting:
+        each.result()
+
+
+def map_is_there(files: SiteFolder) -> bool:
+    """Whether no file of the map is missing."""
+    paths = [files.preview_path, files.mosaic_path]
+    return all(
+        path.is_file() for path in paths + ([] if files.site().is_local else [files.kmz_path])
+    )
+
+
+def take_staged(flight_folder: Path, run_id: int) -> None:
+    """Put the pictures that a committed run collected in the place of those of the run before it.
+
+    May be stopped at any moment and called again.
+    """
+    staged = flight_folder / STAGED / str(run_id)
+    for name in STAGED_FOLDERS:
+        if not (staged / name).is_dir():
+            continue
+        with writing(flight_folder / name):
+            former = temporary_beside(flight_folder / name)
+            if (flight_folder / name).exists():
+                os.replace(flight_folder / name, former)
+            if any((staged / name).iterdir()):
+                os.replace(staged / name, flight_folder / name)
+            else:
+                (staged / name).rmdir()
+            sync_file(flight_folder)
+            shutil.rmtree(former, ignore_errors=True)
+    shutil.rmtree(flight_folder / STAGED, ignore_errors=True)
+
+
+def write_change_files(files: SiteFolder, flight_id: str, version: VersionEntry | None) -> None:
+    """Write changes.geojson and changes.html of a flight; remove them when `version` is None: it was not compared.
+
+    `version` is the map that the comparison made. The page shows what report.json in the flight's folder holds.
+    """
+    folder = files.flight_folder(flight_id)
+    if version is None:
+        _remove_list(folder, "changes")
+        (folder / "changes.html").unlink(missing_ok=True)
+        return
+    with files.catalogue.reading() as connection:
+        changes = change_records.load_changes(connection, flight_id)
+    site = files.site()
+    placemarks = [] if site.is_local else change_placemarks(changes, site)
+    _write_list(
+        folder, "changes", changes_geojson(changes, site), placemarks, is_local=site.is_local
+    )
+    crops = {each.id: _crops(files, flight_id, each.id) for each in changes}
+    before, after = _before_and_after(files, version, _PICTURE_PX if changes else _UNCHANGED_PX)
+    made = {each.id: each for each in files.versions()}
+    page = changes_page(
+        files.report(flight_id),
+        changes,
+        before,
+        after,
+        site,
+        crops,
+        coverage=files.coverage(flight_id),
+        before_words=_words_of(made.get(version.parent_id)),
+        after_words=_words_of(version),
+    )
+    atomic_write_bytes(folder / "changes.html", page.encode())
+
+
+def write_object_files(files: SiteFolder, flight_id: str, *, is_searched: bool) -> None:
+    """Write objects.geojson of a flight; remove it when the flight's frames were not searched for objects."""
+    folder, site = files.flight_folder(flight_id), files.site()
+    if not is_searched:
+        _remove_list(folder, OBJECTS)
+        return
+    with files.catalogue.reading() as connection:
+        found = object_records.load_objects(connection, flight_id)
+    placemarks = [] if site.is_local else object_placemarks(found, site)
+    collection = objects_geojson(found, site, crops_from_site=False)
+    _write_list(folder, OBJECTS, collection, placemarks, is_local=site.is_local)
+
+
+def write_site_objects(files: SiteFolder) -> None:
+    """Write objects.geojson of the site, the newest of each place; remove it when no flight was ever searched."""
+    with files.catalogue.reading() as connection:
+        searches = object_records.load_searches(connection)
+        found = object_records.newest_objects(object_records.load_objects(connection), searches)
+    if not searches:
+        _remove_list(files.folder, OBJECTS)
+        return
+    site = files.site()
+    placemarks = [] if site.is_local else object_placemarks(found, site)
+    collection = objects_geojson(found, site, crops_from_site=True)
+    _write_list(files.folder, OBJECTS, collection, placemarks, is_local=site.is_local)
+
+
+def site_objects_are_there(files: SiteFolder) -> bool:
+    """Whether the site's objects.geojson is there if, and only if, any flight was searched."""
+    with files.catalogue.reading() as connection:
+        is_searched = bool(object_records.load_searches(connection))
+    return is_searched == features_path(files.folder, OBJECTS).is_file()
+
+
+def _write_list(
+    folder: Path,
+    name: str,
+    collection: Mapping[str, Any],
+    placemarks: Sequence[Placemark],
+    *,
+    is_local: bool,
+) -> None:
+    """Write a list of places as GeoJSON, KML and GPX; of a local site as plain JSON alone: it has no place on Earth."""
+    _remove_list(folder, name, but=features_name(name, is_local=is_local))
+    atomic_write_bytes(folder / features_name(name, is_local=is_local), geojson_bytes(collection))
+    if not is_local:
+        atomic_write_bytes(folder / f"{name}.kml", kml_bytes(name, placemarks))
+        atomic_write_bytes(folder / f"{name}.gpx", gpx_bytes(name, placemarks))
+
+
+def _remove_list(folder: Path, name: str, but: str = "") -> None:
+    for file in (
+        f"{name}.geojson",
+        f"{name}.json",
+        *((f"{name}.kml", f"{name}.gpx") if not but else ()),
+    ):
+        if file != but:
+            (folder / file).unlink(missing_ok=True)
+
+
+def _before_and_after(
+    files: SiteFolder, version: VersionEntry, most_px: int
+) -> tuple[Picture | None, Picture | None]:
+    """The map before the version and with it, on the same ground; None where neither has a tile."""
+    maps = [files.version_tiles(version.parent_id), files.version_tiles(version.id)]
+    if not any(maps):
+        return None, None
+    with files.catalogue.reading() as connection:
+        alike = records.tiles_alike(connection, version.id, version.parent_id)
+    before, after = pictures(maps, most_px, alike)
+    return before, after
+
+
+def _words_of(version: VersionEntry | None) -> tuple[str, str]:
+    """A version by its flight, and when that was flown; where nothing of it is dated, when the version was made."""
+    if version is None:
+        return "no map yet", ""
+    date = (
+        f"flown {version.flown_utc[:10]}"
+        if version.flown_utc
+        else f"mapped {version.created_utc[:10]}"
+    )
+    return f"version {version.id}: flight {version.flight_id},", date
+
+
+def _crops(
+    files: SiteFolder, flight_id: str, change_id: str
+) -> tuple[ImageRGBA | None, ImageRGBA | None]:
+    """A change's pictures before and after; None for one that is gone."""
+    before, after = (
+        _crop(files, f"flights/{flight_id}/changes/{name}") for name in crop_names(change_id)
+    )
+    return before, after
+
+
+def _crop(files: SiteFolder, name: str) -> ImageRGBA | None:
+    try:
+        return rgba_from_png(read_below(files.folder, name), str(files.folder / name))
+    except FileNotFoundError:
+        return None
