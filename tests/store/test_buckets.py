@@ -16,10 +16,9 @@ from fake_flights import hashes, mapped_site
 
 from ended_work import ended
 from sorvolo.errors import StoreError
-from sorvolo.store.copies.bucket import MANIFEST, BucketEnd
+from sorvolo.store.copies.bucket import MANIFEST, BucketEnd, prune
 from sorvolo.store.copies.folder import FolderEnd
 from sorvolo.store.copies.object_store import Objects, open_objects
-from sorvolo.store.copies.tidying import prune
 from sorvolo.store.copies.transfer import CopyOutcome, SiteEnd, copy, verify
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.findings import Verdict

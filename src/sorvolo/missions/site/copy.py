@@ -7,10 +7,9 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 from sorvolo.errors import SettingsError, SorvoloWarning, StoreError
-from sorvolo.store.copies.bucket import BucketEnd
+from sorvolo.store.copies.bucket import BucketEnd, Pruned, prune
 from sorvolo.store.copies.folder import FolderEnd
 from sorvolo.store.copies.object_store import open_objects
-from sorvolo.store.copies.tidying import Pruned, prune
 from sorvolo.store.copies.transfer import CopyOutcome, CopyUpdate, SiteEnd, copy, verify
 from sorvolo.store.site.catalogue_place import Catalogues, chosen_catalogues
 

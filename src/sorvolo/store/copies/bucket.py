@@ -7,9 +7,9 @@ import secrets
 import tempfile
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, closing, nullcontext
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, BinaryIO, Self
@@ -42,27 +42,8 @@ _MOST_TILE_BYTES = 16_000_000  # 512 x 512 pixels take a megabyte
 SHOWN = ("mosaic.tif", "preview.png")
 """The newest map, which has plain names as well, for GIS and browsers."""
 
+_KEYS_AT_ONCE = 1000  # in a request to remove them
 _MOST_SUFFIX = 10  # characters of an ending, its point included
-
-
-@contextmanager
-def _beside(stream: BinaryIO) -> Iterator[tuple[BinaryIO, Callable[[bytes], object]]]:
-    """Where a stream's bytes can be read again from this machine, and what has to be called with them: a file itself,
-    or a temporary one beside a stream of a store, from which nothing can be read while a store is written to.
-
-    Raises StoreError where the temporary folder is full.
-    """
-    if isinstance(getattr(stream, "raw", None), io.FileIO):
-        yield stream, len
-        return
-    folder = Path(tempfile.gettempdir())
-    with tempfile.TemporaryFile() as beside:
-
-        def keep(chunk: bytes) -> None:
-            with writing(folder):
-                beside.write(chunk)
-
-        yield beside, keep
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,18 +141,13 @@ class BucketEnd:
     """
 
     def __init__(self, objects: Objects, base: str | None = None) -> None:
-        self._objects, self._base = objects, base
-        self._round = _Round()
+        self._objects, self.name, self._base = objects, objects.name, base
+        self._begin(None, "", {})
         self.written: Manifest | None = None  # by `conclude`
         self.shown: Manifest | None = None  # what `state` last gave
         self.tile_bytes: Mapping[
             str, int
         ] = {}  # of the site's tiles, by SHA-256, after `state` or `conclude`
-
-    @property
-    def name(self) -> str:
-        """The address, for messages."""
-        return self._objects.name
 
     @property
     def has_site(self) -> bool:
@@ -262,9 +238,7 @@ class BucketEnd:
 
     def accept(self, new: SiteState, scratch: Path) -> None:
         """Read what the store holds. Raises StoreError where the new state would lose any of it."""
-        self._round = _Round()
-        manifest, self._round.etag = self.find_manifest()
-        self._round.manifest = manifest
+        manifest, etag = self.find_manifest()
         if manifest is None:
             if self._base:
                 raise StoreError(
@@ -282,21 +256,28 @@ class BucketEnd:
             refuse_other(self.name, manifest.held.identity, new.held)
             if self._base is None:
                 refuse_loss(self.name, missing_from(manifest.held, manifest.files, new))
-        self._round.stored = self._objects.sizes("")
+        self._begin(manifest, etag, self._objects.sizes(""))
+
+    def _begin(self, former: Manifest | None, etag: str, stored: Mapping[str, int]) -> None:
+        """Begin a round of copying over what the store holds."""
+        self._former, self._etag, self._stored = former, etag, stored
+        self._put: dict[str, SiteFile] = {}
+        self._claimed: set[str] = set()
+        self._lock = threading.Lock()
 
     def lacks(self, state: SiteState) -> list[SiteFile]:
         """The files whose bytes are not there, judged by names and sizes; the others are noted."""
-        known = self._round.manifest.files if self._round.manifest is not None else {}
+        known = self._former.files if self._former is not None else {}
         lacking = []
         for file in state.files.values():
             former = known.get(file.path)
             same = former if former and _is_same_picture(file, former) else file
-            stored = self._round.stored.get(key_of(same)) if same.sha256 else None
+            stored = self._stored.get(key_of(same)) if same.sha256 else None
             if stored is not None and same.size in (
                 stored,
                 0,
             ):  # 0: not fetched into a working copy
-                self._round.files[file.path] = same
+                self._put[file.path] = same
             else:
                 lacking.append(file)
         return lacking
@@ -307,26 +288,32 @@ class BucketEnd:
         Raises DamagedError for bytes of another SHA-256 than the file's.
         """
         digest, size = hashlib.sha256(), 0
-        with _beside(stream) as (here, kept):
+        # nothing can be read from a store while a store is written to
+        is_here = isinstance(getattr(stream, "raw", None), io.FileIO)
+        with tempfile.TemporaryFile() as beside:
             for chunk in chunks_of(stream):
                 digest.update(chunk)
                 size += len(chunk)
-                kept(chunk)
+                if not is_here:
+                    with writing(Path(tempfile.gettempdir())):
+                        beside.write(chunk)
             refuse_damaged(file, digest.hexdigest())
             named = SiteFile(file.path, size, digest.hexdigest())
-            is_new = self._round.stored.get(key_of(named)) != size
-            if is_new and self._round.claim(key_of(named)):
-                self._objects.write(key_of(named), here)
-            self._round.files[file.path] = named
+            key = key_of(named)
+            is_new = self._stored.get(key) != size
+            with self._lock:  # files with the same bytes share one object
+                is_first = key not in self._claimed
+                self._claimed.add(key)
+            if is_new and is_first:
+                self._objects.write(key, stream if is_here else beside)
+            self._put[file.path] = named
         return is_new
 
     def conclude(self, state: SiteState) -> None:
         """Make everything that was put the site. Raises StoreError where another writer was faster."""
-        former, stored = self._round.manifest, self._round.stored
+        former, stored = self._former, self._stored
         here = {
-            path: replace(each, stamp=0)
-            for path, each in self._round.files.items()
-            if path in state.files
+            path: replace(each, stamp=0) for path, each in self._put.items() if path in state.files
         }
         self.tile_bytes = {
             tile_of(path): stored.get(path, each.size)
@@ -337,19 +324,21 @@ class BucketEnd:
         if former and former.held == state.held and dict(former.files) == files:
             self.written = former  # nothing is new
             return
-        size, sha256 = self._store_catalogue(state.catalogue)
-        manifest = _next_manifest(former, state.held, (size, sha256), files)
+        sha256, size = (
+            hashlib.sha256(state.catalogue.read_bytes()).hexdigest(),
+            state.catalogue.stat().st_size,
+        )
+        if stored.get(catalogue_key(sha256)) != size:
+            with state.catalogue.open("rb") as stream:
+                self._objects.write(catalogue_key(sha256), stream)
+        generation = 1 if former is None else former.generation + 1
+        now_utc = datetime.now(UTC).isoformat(timespec="seconds")
+        manifest = Manifest(
+            secrets.token_hex(16), generation, now_utc, state.held, (size, sha256), files
+        )
         self._swap(manifest)
         self.written = manifest
         self._show(manifest)
-
-    def _store_catalogue(self, path: Path) -> tuple[int, str]:
-        """Store the catalogue under its content's name; its bytes and SHA-256."""
-        sha256, size = hashlib.sha256(path.read_bytes()).hexdigest(), path.stat().st_size
-        if self._round.stored.get(catalogue_key(sha256)) != size:
-            with path.open("rb") as stream:
-                self._objects.write(catalogue_key(sha256), stream)
-        return size, sha256
 
     def free_bytes(self) -> int | None:
         """Unknown."""
@@ -358,7 +347,7 @@ class BucketEnd:
     def _swap(self, manifest: Manifest) -> None:
         """Replace the manifest by this one if it has not changed since it was read."""
         try:
-            self._objects.swap(MANIFEST, manifest.data(), self._round.etag)
+            self._objects.swap(MANIFEST, manifest.data(), self._etag)
         except (ConflictError, StoreError) as error:
             # the answer may have been lost, not what was written
             found, _ = self.find_manifest()
@@ -370,7 +359,7 @@ class BucketEnd:
 
     def _show(self, manifest: Manifest) -> None:
         """Store the newest map under plain names as well; of two writers, the later one wins."""
-        former = self._round.manifest
+        former = self._former
         shown = {} if former is None else {name: former.files.get(name) for name in SHOWN}
         done = ""
         try:
@@ -406,41 +395,67 @@ class BucketEnd:
         )
 
 
+@dataclass(frozen=True)
+class Pruned:
+    """What was removed, or would be: objects and their bytes; and how many bytes stay."""
+
+    objects: int
+    bytes: int
+    kept_bytes: int
+
+
+def prune(objects: Objects, older_than_s: float, *, only_count: bool = False) -> Pruned:
+    """Remove the objects that the site does not name and that were stored more than `older_than_s` ago.
+
+    A concurrent writer could rely on such an object. So the manifest states that a prune runs, and writers that began
+    before find that the manifest has changed. A prune that was killed is repeated. Raises StoreError where there is no
+    site, or where another writer comes in between.
+    """
+    end = BucketEnd(objects)
+    manifest, etag = end.find_manifest()
+    if manifest is None:
+        raise StoreError(f"no site at {objects.name}; there is nothing to tidy")
+    with tempfile.TemporaryDirectory(prefix="sorvolo-") as scratch:
+        files = end.state_of(manifest, Path(scratch)).files.values()
+    used = {key_of(file) for file in files if file.sha256}
+    used |= {catalogue_key(manifest.catalogue[1]), MANIFEST, *SHOWN}
+    if not only_count:
+        manifest = replace(manifest, tidying=datetime.now(UTC).isoformat(timespec="seconds"))
+        _swap_manifest(objects, manifest, etag)
+    stored = {
+        key: about
+        for key, about in objects.listing("").items()
+        if key.startswith(("tiles/", "files/", "catalogues/"))
+    }
+    unused = {
+        key: size
+        for key, (size, age_s) in stored.items()
+        if key not in used and age_s > older_than_s
+    }
+    if not only_count:
+        keys = sorted(unused)
+        for start in range(0, len(keys), _KEYS_AT_ONCE):
+            objects.remove(keys[start : start + _KEYS_AT_ONCE])
+        _, etag = end.find_manifest()
+        _swap_manifest(objects, replace(manifest, tidying="", tidied=secrets.token_hex(8)), etag)
+    total = sum(size for size, _ in stored.values())
+    return Pruned(len(unused), sum(unused.values()), total - sum(unused.values()))
+
+
+def _swap_manifest(objects: Objects, manifest: Manifest, etag: str) -> None:
+    try:
+        objects.swap(MANIFEST, manifest.data(), etag)
+    except ConflictError:
+        raise StoreError(
+            f"another writer has changed the site at {objects.name}; run the same command again"
+        ) from None
+
+
 def sites_at(objects: Objects) -> list[str]:
     """The sites at a place and in the folders right below it, by name; "." where the place itself is one."""
     if BucketEnd(objects).has_site:
         return ["."]
     return sorted(each for each in objects.folders() if objects.has(f"{each}/{MANIFEST}"))
-
-
-@dataclass
-class _Round:
-    """What one round of copying found and did."""
-
-    manifest: Manifest | None = None
-    etag: str = ""
-    stored: Mapping[str, int] = field(default_factory=dict)
-    files: dict[str, SiteFile] = field(default_factory=dict)
-    claimed: set[str] = field(default_factory=set)
-    lock: threading.Lock = field(default_factory=threading.Lock)
-
-    def claim(self, key: str) -> bool:
-        """Whether the caller is the first to write this object: files with the same bytes share one object."""
-        with self.lock:
-            is_first = key not in self.claimed
-            self.claimed.add(key)
-        return is_first
-
-
-def _next_manifest(
-    former: Manifest | None,
-    held: CatalogueState,
-    catalogue: tuple[int, str],
-    files: Mapping[str, SiteFile],
-) -> Manifest:
-    generation = 1 if former is None else former.generation + 1
-    now_utc = datetime.now(UTC).isoformat(timespec="seconds")
-    return Manifest(secrets.token_hex(16), generation, now_utc, held, catalogue, files)
 
 
 def _is_same_picture(file: SiteFile, former: SiteFile) -> bool:

@@ -34,6 +34,7 @@ from sorvolo.store.copies.site_state import (
     missing_from,
     named_files,
     refuse_damaged,
+    sha256_of,
     tile_of,
     tile_path,
 )
@@ -82,12 +83,7 @@ class FolderEnd:
 
     def __init__(self, folder: Path, catalogues: Catalogues | None = None) -> None:
         """A new copy's catalogue goes where `catalogues` has it; None: a file in the folder."""
-        self.folder, self._catalogues = folder, catalogues
-
-    @property
-    def name(self) -> str:
-        """The folder, for messages."""
-        return str(self.folder)
+        self.folder, self.name, self._catalogues = folder, str(folder), catalogues
 
     @property
     def has_site(self) -> bool:
@@ -100,22 +96,12 @@ class FolderEnd:
         Raises StoreError for no site, one without a map, or one that is a copy that is not finished.
         """
         refuse_unfinished(self.folder)
-        files = SiteFolder.open(self.folder, write=False, catalogues=self._catalogues)
-        try:
-            path = scratch / CATALOGUE
-            _copy_catalogue(files.catalogue, path)
-        finally:
-            files.close()
-        with closing(Catalogue.at(path, write=True)) as copied:
-            with copied.changing() as connection:
-                records.drop_unfinished(connection)
-            held = find_state(copied)
-            named = named_files(copied)
+        path = scratch / CATALOGUE
+        held, listed, left_out = self._snapshot(path)
         if held is None:
             raise StoreError(
                 f"{self.folder} has no map yet: there is nothing to copy; map a flight into it first"
             )
-        listed, left_out = _listed(self.folder, *named)
         return SiteState(held, path, listed, left_out)
 
     def is_still(self, state: SiteState, scratch: Path) -> bool:
@@ -158,9 +144,13 @@ class FolderEnd:
         Raises StoreError where another site is in the folder, or one that holds what the new state lacks.
         """
         if (self.folder / COPYING).is_file():
-            refuse_other(self.name, _identity_of(self.folder / COPYING), new.held)
+            try:
+                identity = str(json.loads((self.folder / COPYING).read_bytes())["identity"])
+            except (ValueError, KeyError, TypeError):
+                identity = ""
+            refuse_other(self.name, identity, new.held)
         if is_site(self.folder):
-            held, files = self._held(scratch)
+            held, files, _ = self._snapshot(scratch / f"held-{CATALOGUE}")
             if held is not None:
                 refuse_other(self.name, held.identity, new.held)
                 self._refuse_loss(held, files, new)
@@ -177,7 +167,7 @@ class FolderEnd:
     def find_held(self) -> CatalogueState | None:
         """What the folder's catalogue holds, unfinished runs apart; None for no map."""
         with tempfile.TemporaryDirectory(prefix="sorvolo-") as scratch:
-            return self._held(Path(scratch))[0]
+            return self._snapshot(Path(scratch) / CATALOGUE)[0]
 
     def lacks(self, state: SiteState) -> list[SiteFile]:
         """The files that have yet to be put: not here, or of another size or time."""
@@ -230,17 +220,20 @@ class FolderEnd:
         )
         return shutil.disk_usage(there).free
 
-    def _held(self, scratch: Path) -> tuple[CatalogueState | None, Mapping[str, SiteFile]]:
-        """What the folder's catalogue holds (None: no map), unfinished runs apart, and its files."""
-        path = scratch / f"held-{CATALOGUE}"
-        with closing(
-            Catalogue.open(self.folder, write=False, catalogues=self._catalogues)
-        ) as catalogue:
-            _copy_catalogue(catalogue, path)
+    def _snapshot(
+        self, path: Path
+    ) -> tuple[CatalogueState | None, Mapping[str, SiteFile], tuple[str, ...]]:
+        """What a copy of the catalogue in a new file holds (None: no map), unfinished runs apart; the site's files,
+        and files that do not belong to it."""
+        site = SiteFolder.open(self.folder, write=False, catalogues=self._catalogues)
+        try:
+            _copy_catalogue(site.catalogue, path)
+        finally:
+            site.close()
         with closing(Catalogue.at(path, write=True)) as copied:
             with copied.changing() as connection:
                 records.drop_unfinished(connection)
-            return find_state(copied), _listed(self.folder, *named_files(copied))[0]
+            return find_state(copied), *_listed(self.folder, *named_files(copied))
 
     def _has(self, file: SiteFile) -> bool:
         try:
@@ -251,20 +244,10 @@ class FolderEnd:
             return False
         if file.is_lasting or (file.stamp and about.st_mtime_ns == file.stamp):
             return True
-        return (
-            not file.stamp
-            and bool(file.sha256)
-            and file_sha256(self.folder, file.path) == file.sha256
-        )
-
-
-def file_sha256(folder: Path, path: str) -> str:
-    """The SHA-256 of a file below the folder."""
-    digest = hashlib.sha256()
-    with open_below(folder, path) as stream:
-        for chunk in chunks_of(stream):
-            digest.update(chunk)
-    return digest.hexdigest()
+        if file.stamp or not file.sha256:
+            return False
+        with open_below(self.folder, file.path) as stream:
+            return sha256_of(stream) == file.sha256
 
 
 def refuse_other(name: str, identity: str, held: CatalogueState) -> None:
@@ -283,13 +266,6 @@ def refuse_loss(name: str, lost: str) -> None:
             f"{name} holds what the source of the copy lacks: {lost}. Nothing was copied; copy in the other direction "
             "first, or to a new place"
         )
-
-
-def _identity_of(note: Path) -> str:
-    try:
-        return str(json.loads(note.read_bytes())["identity"])
-    except (ValueError, KeyError, TypeError):
-        return ""
 
 
 def _copy_catalogue(catalogue: Catalogue, path: Path) -> None:

@@ -185,6 +185,14 @@ def chunks_of(stream: BinaryIO) -> Iterator[bytes]:
         yield chunk
 
 
+def sha256_of(stream: BinaryIO) -> str:
+    """The SHA-256 of the rest of a stream."""
+    digest = hashlib.sha256()
+    for chunk in chunks_of(stream):
+        digest.update(chunk)
+    return digest.hexdigest()
+
+
 def refuse_damaged(file: SiteFile, sha256: str) -> None:
     """Raise DamagedError where a file's bytes are known and have another SHA-256."""
     if file.sha256 and file.sha256 != sha256:

@@ -8,7 +8,6 @@ from sqlalchemy import (
     ColumnElement,
     Connection,
     Float,
-    ForeignKey,
     Index,
     Integer,
     LargeBinary,
@@ -21,7 +20,15 @@ from sqlalchemy.types import UserDefinedType
 
 from sorvolo.errors import StoreError
 from sorvolo.store.site.database import Layout
-from sorvolo.store.site.schema import Nanoseconds, String, make_numbers
+from sorvolo.store.site.schema import (
+    Nanoseconds,
+    String,
+    known,
+    make_numbers,
+    number,
+    owner,
+)
+from sorvolo.store.site.schema import text as text_column
 
 FORMAT = 1
 """An index of another format is rebuilt: everything in it comes from the sites."""
@@ -52,63 +59,55 @@ metadata = MetaData()
 sites = Table(
     "sites",
     metadata,
-    Column("id", Integer, primary_key=True, autoincrement=False),
-    Column("path", String, nullable=False, unique=True),  # of its folder, below the archive's
-    Column("name", String, nullable=False),
-    Column("is_local", Boolean, nullable=False),  # without a place on Earth: it has no flights here
-    Column("state", String, nullable=False),  # a hash of what the site held when it was read
+    number(),
+    known("path", String, unique=True),  # of its folder, below the archive's
+    text_column("name"),
+    known("is_local", Boolean),  # without a place on Earth: it has no flights here
+    text_column("state"),  # a hash of what the site held when it was read
 )
 flights = Table(
     "flights",
     metadata,
-    Column("id", Integer, primary_key=True, autoincrement=False),
-    Column("site_id", ForeignKey("sites.id", ondelete="CASCADE"), nullable=False),
-    Column("flight", String, nullable=False),
-    Column("state", String, nullable=False),  # which run of it was read
-    Column("kind", String, nullable=False),  # map | compare
-    Column("first_ns", Nanoseconds, nullable=False),  # UTC; from 1970 on where no clock has a date
-    Column("last_ns", Nanoseconds, nullable=False),
-    Column(
-        "frames", Integer, nullable=False
-    ),  # that were placed; one row each would be slow to ask
-    Column(
-        "frame_names", String, nullable=False
-    ),  # a line each, in the order of their outlines, as below
-    Column("frame_times", LargeBinary, nullable=False),  # ns as little-endian integers of 64 bits
-    Column(
-        "frame_kept", LargeBinary, nullable=False
-    ),  # a byte each: 1 where the site has its picture
-    Column(
-        "outlines", Geometry, nullable=False
-    ),  # a collection of what each shows, polygons of four corners
+    number(),
+    owner("site_id", "sites.id", nullable=False),
+    text_column("flight"),
+    text_column("state"),  # which run of it was read
+    text_column("kind"),  # map | compare
+    known("first_ns", Nanoseconds),  # UTC; from 1970 on where no clock has a date
+    known("last_ns", Nanoseconds),
+    known("frames", Integer),  # that were placed; one row each would be slow to ask
+    text_column("frame_names"),  # a line each, in the order of their outlines, as below
+    known("frame_times", LargeBinary),  # ns as little-endian integers of 64 bits
+    known("frame_kept", LargeBinary),  # a byte each: 1 where the site has its picture
+    known("outlines", Geometry),  # a collection of what each shows, polygons of four corners
     Column("place", Geometry),  # all that they show; NULL without any
 )
 objects = Table(
     "objects",
     metadata,
-    Column("id", Integer, primary_key=True, autoincrement=False),
-    Column("flight_id", ForeignKey("flights.id", ondelete="CASCADE"), nullable=False),
-    Column("object_id", String, nullable=False),
-    Column("label", String, nullable=False),
-    Column("score", Float, nullable=False),
-    Column("first_ns", Nanoseconds, nullable=False),
-    Column("last_ns", Nanoseconds, nullable=False),
+    number(),
+    owner("flight_id", "flights.id", nullable=False),
+    text_column("object_id"),
+    text_column("label"),
+    known("score", Float),
+    known("first_ns", Nanoseconds),
+    known("last_ns", Nanoseconds),
     Column("sigma_m", Float),  # NULL where unknown
-    Column("place", Geometry, nullable=False),
+    known("place", Geometry),
 )
 changes = Table(
     "changes",
     metadata,
-    Column("id", Integer, primary_key=True, autoincrement=False),
-    Column("flight_id", ForeignKey("flights.id", ondelete="CASCADE"), nullable=False),
-    Column("change_id", String, nullable=False),
-    Column("kind", String, nullable=False),
-    Column("label", String, nullable=False),  # what it is; its kind where that is not known
-    Column("score", Float, nullable=False),
-    Column("first_ns", Nanoseconds, nullable=False),
-    Column("last_ns", Nanoseconds, nullable=False),
-    Column("verdict", String, nullable=False),  # "": nobody reviewed it
-    Column("place", Geometry, nullable=False),
+    number(),
+    owner("flight_id", "flights.id", nullable=False),
+    text_column("change_id"),
+    text_column("kind"),
+    text_column("label"),  # what it is; its kind where that is not known
+    known("score", Float),
+    known("first_ns", Nanoseconds),
+    known("last_ns", Nanoseconds),
+    text_column("verdict"),  # "": nobody reviewed it
+    known("place", Geometry),
 )
 PLACED = (flights, objects, changes)
 """The tables with a place; in SQLite each has an R-tree `<name>_places` with the boxes of its rows."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Self
@@ -29,6 +29,7 @@ from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.geometry.grid import TileIndex
 from sorvolo.geometry.pose import Pose
 from sorvolo.geometry.units import DAY_NS
+from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.rasters.geotiff import COMPRESSIONS
 from sorvolo.store.site import schema
 from sorvolo.store.site.catalogue_place import Catalogues, open_database
@@ -207,20 +208,13 @@ def created_utc(connection: Connection) -> str:
 
 def add_site(connection: Connection, site: Site) -> None:
     """Write the site's one row."""
+    place = asdict(site.origin)
+    facts = {
+        name: getattr(site, name)
+        for name in ("name", "height_reference", "crs", "m_per_px", "is_local")
+    }
     connection.execute(
-        insert(schema.site).values(
-            id=1,
-            name=site.name,
-            latitude_deg=site.origin.latitude_deg,
-            longitude_deg=site.origin.longitude_deg,
-            height_m=site.origin.height_m,
-            height_reference=site.height_reference,
-            crs=site.crs,
-            m_per_px=site.m_per_px,
-            is_local=site.is_local,
-            created_utc=utc_now(),
-            derived_version=0,
-        )
+        insert(schema.site).values(id=1, **place, **facts, created_utc=utc_now(), derived_version=0)
     )
 
 
@@ -235,26 +229,28 @@ def list_flights(connection: Connection) -> list[FlightEntry]:
     return list(
         {
             row.flight_id: FlightEntry(
-                row.flight_id,
-                row.rank,
-                row.fingerprint,
-                row.status,
-                row.started_utc,
-                row.finished_utc,
-                row.method,
-                row.frames,
-                row.settings,
-                tuple(row.notes),
+                **{
+                    **_named(row, FlightEntry, "id", "notes"),
+                    "id": row.flight_id,
+                    "notes": tuple(row.notes),
+                }
             )
             for row in rows
         }.values()
     )
 
 
+def _named(row: Row[Any], record: Any, *without: str) -> dict[str, Any]:
+    """The columns of a row that a record has fields for, by their common names."""
+    names = {each.name for each in fields(record)} - set(without)
+    return {name: value for name, value in row._mapping.items() if name in names}
+
+
 def list_versions(connection: Connection) -> list[VersionEntry]:
     """Every version, oldest first."""
     tiles = func.count(schema.version_tiles.c.sha256)
-    flown_ns, compressions = _flown_ns(connection), _compressions(connection)
+    flown_ns = {row.version_id: row.first_ns for row in connection.execute(select(schema.flown))}
+    compressions = _compressions(connection)
     rows = connection.execute(
         select(schema.versions, tiles.label("tiles"))
         .outerjoin(schema.version_tiles, schema.version_tiles.c.version_id == schema.versions.c.id)
@@ -263,16 +259,12 @@ def list_versions(connection: Connection) -> list[VersionEntry]:
     )
     return [
         VersionEntry(
-            row.id,
-            row.parent_id,
-            row.flight_id,
-            row.created_utc,
-            row.tiles,
-            row.complete,
-            checked_crs(row.export_crs),
-            row.run_id,
-            flown_ns.get(row.id, -1),
-            compressions[row.id],
+            **{
+                **_named(row, VersionEntry),
+                "export_crs": checked_crs(row.export_crs),
+                "flown_ns": flown_ns.get(row.id, -1),
+                "compress": compressions[row.id],
+            }
         )
         for row in rows
     ]
@@ -289,11 +281,6 @@ def _compressions(connection: Connection) -> dict[int, str]:
         wish = wishes.get(row.run_id)
         found[row.id] = wish if wish in COMPRESSIONS else found.get(row.parent_id, COMPRESSIONS[0])
     return found
-
-
-def _flown_ns(connection: Connection) -> dict[int, int]:
-    """When the flights were flown that made the versions, by version."""
-    return {row.version_id: row.first_ns for row in connection.execute(select(schema.flown))}
 
 
 def newest_version(connection: Connection, *, complete: bool = True) -> int:
@@ -524,16 +511,9 @@ def run_ids(connection: Connection) -> dict[str, set[int]]:
 
 def load_keyframes(connection: Connection, flight_id: str | None) -> list[StoredKeyframe]:
     """Keyframes of complete runs by flight rank and index, of one flight when its id is given."""
-    query = (
-        select(schema.keyframes, schema.runs.c.flight_id)
-        .join(schema.runs, schema.runs.c.id == schema.keyframes.c.run_id)
-        .join(schema.flights, schema.flights.c.id == schema.runs.c.flight_id)
-        .where(schema.runs.c.status == "complete")
-        .order_by(schema.flights.c.rank, schema.keyframes.c.frame_index)
-    )
-    if flight_id is not None:
-        query = query.where(schema.flights.c.id == flight_id)
-    return [_keyframe_of(row) for row in connection.execute(query)]
+    query = schema.of_complete_runs(schema.keyframes, flight_id)
+    rows = connection.execute(query.order_by(schema.keyframes.c.frame_index))
+    return [_keyframe_of(row) for row in rows]
 
 
 @dataclass(frozen=True)
@@ -600,29 +580,18 @@ def _inserted(connection: Connection, table: Table, values: Mapping[str, Any]) -
 
 
 def _row_of(keyframe: StoredKeyframe, run_id: int) -> dict[str, Any]:
-    camera, pose = keyframe.camera, keyframe.site_from_camera
+    camera, pose = asdict(keyframe.camera), keyframe.site_from_camera
+    del camera["distortion"]
+    alike = ("name", "time_ns", "status", "image_path", "site_from_image", "gains", "vignette")
     return {
+        **plain_json(
+            {name: getattr(keyframe, name) for name in (*alike, "sigma_m", "residual_px")}
+        ),
         "run_id": run_id,
         "frame_index": keyframe.index,
-        "name": keyframe.name,
-        "time_ns": keyframe.time_ns,
-        "status": keyframe.status.value,
-        "image_path": keyframe.image_path,
-        "camera": {
-            "width_px": camera.width_px,
-            "height_px": camera.height_px,
-            "fx_px": camera.fx_px,
-            "fy_px": camera.fy_px,
-            "cx_px": camera.cx_px,
-            "cy_px": camera.cy_px,
-        },
-        "site_from_image": keyframe.site_from_image.tolist(),
+        "camera": camera,
         "rotation": [] if pose is None else pose.rotation.tolist(),
         "translation_m": [] if pose is None else pose.translation_m.tolist(),
-        "gains": keyframe.gains.tolist(),
-        "vignette": keyframe.vignette.tolist(),
-        "sigma_m": keyframe.sigma_m if np.isfinite(keyframe.sigma_m) else None,
-        "residual_px": keyframe.residual_px if np.isfinite(keyframe.residual_px) else None,
     }
 
 

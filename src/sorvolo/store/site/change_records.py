@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ from sqlalchemy import Connection, Row, delete, func, insert, select
 
 from sorvolo.errors import StoreError
 from sorvolo.geometry.arrays import Floats, PointsM, frozen
-from sorvolo.store.exports.plain import number_or_null
+from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.site import schema
 from sorvolo.store.site.catalogue import reading_rows, utc_now
 from sorvolo.store.site.names import checked_name, is_plain_name
@@ -131,15 +131,8 @@ def load_changes(connection: Connection, flight_id: str | None = None) -> list[S
     A verdict belongs to a change of its id whose box still meets the one that was looked at: other settings may
     have given the id to another piece of ground.
     """
-    query = (
-        select(schema.changes, schema.runs.c.flight_id)
-        .join(schema.runs, schema.runs.c.id == schema.changes.c.run_id)
-        .join(schema.flights, schema.flights.c.id == schema.runs.c.flight_id)
-        .where(schema.runs.c.status == "complete")
-        .order_by(schema.flights.c.rank, schema.changes.c.number, schema.changes.c.id)
-    )
-    if flight_id is not None:
-        query = query.where(schema.flights.c.id == flight_id)
+    query = schema.of_complete_runs(schema.changes, flight_id)
+    query = query.order_by(schema.changes.c.number, schema.changes.c.id)
     reviews = {review.change_id: review for review in load_reviews(connection)}
     return [_change_of(row, reviews.get(row.id)) for row in connection.execute(query)]
 
@@ -158,7 +151,7 @@ def load_reviews(connection: Connection) -> list[StoredReview]:
                 row.at_utc,
                 row.note,
                 ChangeKind(row.kind),
-                frozen(np.reshape(np.asarray(row.outline_m, np.float64), (-1, 2))),
+                _outline(row.outline_m),
             )
             for row in rows
         ]
@@ -218,95 +211,60 @@ def _centre(outline_m: PointsM) -> PointsM:
     return (outline_m.min(axis=0) + outline_m.max(axis=0)) / 2
 
 
+_STORED = (
+    *(each.name for each in fields(ChangeFacts)),
+    "velocity_m_s",
+    "class_before",
+    "class_after",
+    "announced_ns",
+    "sigma_in_map_m",
+    "height_change",
+)  # fields of a change that are stored as they are
+
+
 def _stored(flight_id: str, number: int, change: Change) -> StoredChange:
     patch = change.patch
     height_px, width_px = patch.changed.shape
     return StoredChange(
-        change.id,
-        change.kind,
-        change.score,
-        change.outline_m,
-        change.first_seen_ns,
-        change.last_seen_ns,
-        change.views,
-        change.area_m2,
-        change.length_m,
-        change.sigma_m,
-        flight_id,
-        number,
-        change.velocity_m_s,
-        change.class_before,
-        change.class_after,
-        change.announced_ns,
-        CropPlace(patch.west_m, patch.north_m, patch.m_per_px, width_px, height_px),
-        sigma_in_map_m=change.sigma_in_map_m,
-        height_change=change.height_change,
+        **{name: getattr(change, name) for name in _STORED},
+        flight_id=flight_id,
+        number=number,
+        crop=CropPlace(patch.west_m, patch.north_m, patch.m_per_px, width_px, height_px),
     )
 
 
 def _row_of(change: StoredChange, run_id: int) -> dict[str, Any]:
-    crop, risen = change.crop, change.height_change
-    return {
-        "id": change.id,
-        "run_id": run_id,
-        "number": change.number,
-        "kind": change.kind.value,
-        "properties": {
-            "score": float(change.score),
-            "outline_m": change.outline_m.tolist(),
-            "first_seen_ns": int(change.first_seen_ns),
-            "last_seen_ns": int(change.last_seen_ns),
-            "announced_ns": int(change.announced_ns),
-            "views": int(change.views),
-            "area_m2": number_or_null(change.area_m2),
-            "length_m": number_or_null(change.length_m),
-            "sigma_m": number_or_null(change.sigma_m),
-            "sigma_in_map_m": number_or_null(change.sigma_in_map_m),
-            "height_change": None if risen is None else [float(risen.rise_m), float(risen.sigma_m)],
-            "velocity_m_s": change.velocity_m_s.tolist(),
-            "class_before": change.class_before,
-            "class_after": change.class_after,
-            "crop": [
-                *map(float, (crop.west_m, crop.north_m, crop.m_per_px)),
-                crop.width_px,
-                crop.height_px,
-            ],
-        },
-    }
+    properties = plain_json({name: getattr(change, name) for name in (*_STORED, "crop")})
+    kept = {name: properties.pop(name) for name in ("id", "kind")}
+    return {**kept, "run_id": run_id, "number": change.number, "properties": properties}
 
 
 def _change_of(row: Row[Any], review: StoredReview | None) -> StoredChange:
     with reading_rows("change"):
-        values = row.properties
-        outline_m = frozen(np.reshape(np.asarray(values["outline_m"], np.float64), (-1, 2)))
-        west_m, north_m, m_per_px, width_px, height_px = values["crop"]
-        if not len(outline_m) or not m_per_px > 0:
+        values, crop = row.properties, CropPlace(**row.properties["crop"])
+        outline_m = _outline(values["outline_m"])
+        if not len(outline_m) or not crop.m_per_px > 0:
             raise ValueError("no outline, or a picture without a scale")
+        sizes = ("area_m2", "length_m", "sigma_m", "sigma_in_map_m")
+        risen = values["height_change"]
         is_reviewed = review is not None and outlines_meet(outline_m, review.outline_m)
         return StoredChange(
-            checked_name(row.id, "change"),
-            ChangeKind(row.kind),
-            values["score"],
-            outline_m,
-            values["first_seen_ns"],
-            values["last_seen_ns"],
-            values["views"],
-            _number(values["area_m2"]),
-            _number(values["length_m"]),
-            _number(values["sigma_m"]),
-            row.flight_id,
-            row.number,
-            frozen(values["velocity_m_s"]),
-            values["class_before"],
-            values["class_after"],
-            values["announced_ns"],
-            CropPlace(west_m, north_m, m_per_px, width_px, height_px),
-            review.verdict if review is not None and is_reviewed else None,
-            review.note if review is not None and is_reviewed else "",
-            _number(values["sigma_in_map_m"]),
-            HeightChange(*risen) if (risen := values["height_change"]) else None,
+            **{
+                **values,
+                **{name: np.nan if values[name] is None else values[name] for name in sizes},
+                "id": checked_name(row.id, "change"),
+                "kind": ChangeKind(row.kind),
+                "outline_m": outline_m,
+                "velocity_m_s": frozen(values["velocity_m_s"]),
+                "height_change": None if risen is None else HeightChange(**risen),
+                "crop": crop,
+            },
+            flight_id=row.flight_id,
+            number=row.number,
+            verdict=review.verdict if review is not None and is_reviewed else None,
+            note=review.note if review is not None and is_reviewed else "",
         )
 
 
-def _number(stored: float | None) -> float:
-    return np.nan if stored is None else stored
+def _outline(rows: Any) -> PointsM:
+    return frozen(np.reshape(np.asarray(rows, np.float64), (-1, 2)))

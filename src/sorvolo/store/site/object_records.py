@@ -1,13 +1,13 @@
 """What stands on the map, as rows of the catalogue: each flight's search, its objects, and the newest of each place."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, Table, insert, select
+from sqlalchemy import Connection, insert, select
 
-from sorvolo.store.exports.plain import number_or_null
+from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.site import schema
 from sorvolo.store.site.catalogue import reading_rows
 from sorvolo.store.site.names import checked_name
@@ -62,8 +62,7 @@ def add_search(connection: Connection, run_id: int, search: ObjectSearch) -> Non
 
 def load_searches(connection: Connection) -> list[StoredSearch]:
     """The searches of complete runs, by flight rank."""
-    table = schema.searches
-    rows = connection.execute(_of_complete_runs(table, table.c).order_by(schema.flights.c.rank))
+    rows = connection.execute(schema.of_complete_runs(schema.searches))
     with reading_rows("search"):
         return [
             StoredSearch(
@@ -78,11 +77,7 @@ def load_searches(connection: Connection) -> list[StoredSearch]:
 
 def load_objects(connection: Connection, flight_id: str | None = None) -> list[StoredObject]:
     """The objects of complete runs by flight rank and number; of one flight if its id is given."""
-    query = _of_complete_runs(schema.objects, schema.objects.c).order_by(
-        schema.flights.c.rank, schema.objects.c.number
-    )
-    if flight_id is not None:
-        query = query.where(schema.flights.c.id == flight_id)
+    query = schema.of_complete_runs(schema.objects, flight_id).order_by(schema.objects.c.number)
     return [
         StoredObject(row.flight_id, row.rank, _object_of(row.id, row.properties), (row.flight_id,))
         for row in connection.execute(query)
@@ -125,15 +120,6 @@ def _frames_of(outlines_m: Any, searched_for: Any) -> SearchedFrames:
     )
 
 
-def _of_complete_runs(table: Table, columns: Iterable[Any]) -> Any:
-    return (
-        select(*columns, schema.runs.c.flight_id, schema.flights.c.rank)
-        .join(schema.runs, schema.runs.c.id == table.c.run_id)
-        .join(schema.flights, schema.flights.c.id == schema.runs.c.flight_id)
-        .where(schema.runs.c.status == "complete")
-    )
-
-
 def _since(found: StoredObject, before: Sequence[StoredObject]) -> StoredObject:
     """The object with the time since which it has stood there, where an earlier flight found the same."""
     thing = found.thing
@@ -146,23 +132,10 @@ def _since(found: StoredObject, before: Sequence[StoredObject]) -> StoredObject:
     return found
 
 
-def _properties(each: MapObject) -> dict[str, Any]:
-    return {
-        "label": each.label,
-        "score": each.score,
-        "class_scores": each.class_scores,
-        "position_m": each.position_m.tolist(),
-        "sigma_m": number_or_null(each.sigma_m),
-        "length_m": number_or_null(each.length_m),
-        "width_m": number_or_null(each.width_m),
-        "views": each.views,
-        "possible_views": each.possible_views,
-        "first_seen_ns": int(each.first_seen_ns),
-        "last_seen_ns": int(each.last_seen_ns),
-        "moving": each.moving,
-        "velocity_m_s": each.velocity_m_s.tolist(),
-        "best_frame": each.best_frame,
-    }
+def _properties(thing: MapObject) -> dict[str, Any]:
+    names = (each.name for each in fields(MapObject) if each.name not in ("id", "crop_jpeg"))
+    properties: dict[str, Any] = plain_json({name: getattr(thing, name) for name in names})
+    return properties
 
 
 def _object_of(object_id: str, values: dict[str, Any]) -> MapObject:

@@ -1,6 +1,7 @@
 """The tables of the catalogue, the same in SQLite and in PostgreSQL, and the number of its format."""
 
 from collections.abc import Sequence
+from typing import Any
 
 from sqlalchemy import (
     JSON,
@@ -23,153 +24,170 @@ from sqlalchemy import String as AnyString
 FORMAT = 1
 """A catalogue of another format is refused."""
 
-String = AnyString().with_variant(
-    AnyString(collation="C"), "postgresql"
-)  # ordered by bytes, as SQLite does
-Nanoseconds = BigInteger().with_variant(Integer, "sqlite")  # SQLite's integers have 64 bits
+# ordered by bytes, as SQLite does
+String = AnyString().with_variant(AnyString(collation="C"), "postgresql")
+# SQLite's integers have 64 bits
+Nanoseconds = BigInteger().with_variant(Integer, "sqlite")
+
+
+def known(name: str, kind: Any, *constraints: Any, **options: Any) -> Column[Any]:
+    """A column that is never NULL."""
+    return Column(name, kind, *constraints, nullable=False, **options)
+
+
+def text(name: str) -> Column[Any]:
+    """A column of text that is never NULL."""
+    return known(name, String)
+
+
+def number(name: str = "id") -> Column[Any]:
+    """The primary key, a number that the caller gives."""
+    return Column(name, Integer, primary_key=True, autoincrement=False)
+
+
+def owner(name: str, target: str, **options: Any) -> Column[Any]:
+    """A reference to the row that this one goes with."""
+    return Column(name, ForeignKey(target, ondelete="CASCADE"), **options)
+
 
 metadata = MetaData()
 site = Table(
     "site",
     metadata,
-    Column("id", Integer, primary_key=True),  # always 1
-    Column("name", String, nullable=False),
-    Column("latitude_deg", Float, nullable=False),
-    Column("longitude_deg", Float, nullable=False),
-    Column("height_m", Float, nullable=False),
-    Column("height_reference", String, nullable=False),
-    Column("crs", String, nullable=False),
-    Column("m_per_px", Float, nullable=False),
-    Column("is_local", Boolean, nullable=False),
-    Column("created_utc", String, nullable=False),
-    Column(
-        "derived_version", Integer, nullable=False
-    ),  # the version in mosaic.tif and its kin; 0: none
+    number(),  # always 1
+    text("name"),
+    known("latitude_deg", Float),
+    known("longitude_deg", Float),
+    known("height_m", Float),
+    text("height_reference"),
+    text("crs"),
+    known("m_per_px", Float),
+    known("is_local", Boolean),
+    text("created_utc"),
+    known("derived_version", Integer),  # the version in mosaic.tif and its kin; 0: none
 )
 flights = Table(
     "flights",
     metadata,
     Column("id", String, primary_key=True),
-    Column("rank", Integer, nullable=False, unique=True),
+    known("rank", Integer, unique=True),
 )
 runs = Table(
     "runs",
     metadata,
-    Column(
-        "id", Integer, primary_key=True, autoincrement=False
-    ),  # names the run's folder: never used twice
-    Column("flight_id", ForeignKey("flights.id"), nullable=False),
-    Column("fingerprint", String, nullable=False),
-    Column("status", String, nullable=False),  # mapping | complete
-    Column("started_utc", String, nullable=False),
-    Column("finished_utc", String, nullable=False),  # "" while mapping
-    Column("method", String, nullable=False),
-    Column("settings", JSON, nullable=False),
-    Column("frames", JSON, nullable=False),  # status -> number of frames
-    Column("notes", JSON, nullable=False),
-    Column("files_written", Boolean, nullable=False),
+    number(),  # names the run's folder: never used twice
+    known("flight_id", String, ForeignKey("flights.id")),
+    text("fingerprint"),
+    text("status"),  # mapping | complete
+    text("started_utc"),
+    text("finished_utc"),  # "" while mapping
+    text("method"),
+    known("settings", JSON),
+    known("frames", JSON),  # status -> number of frames
+    known("notes", JSON),
+    known("files_written", Boolean),
 )
 keyframes = Table(
     "keyframes",
     metadata,
-    Column("run_id", ForeignKey("runs.id", ondelete="CASCADE"), primary_key=True),
+    owner("run_id", "runs.id", primary_key=True),
     Column("frame_index", Integer, primary_key=True),
-    Column("name", String, nullable=False),
-    Column("time_ns", Nanoseconds, nullable=False),
-    Column("status", String, nullable=False),
-    Column("image_path", String, nullable=False),
-    Column("camera", JSON, nullable=False),  # width_px, height_px, fx_px, fy_px, cx_px, cy_px
-    Column("site_from_image", JSON, nullable=False),  # (3, 3)
-    Column("rotation", JSON, nullable=False),  # (3, 3) site_from_camera, [] when unknown
-    Column("translation_m", JSON, nullable=False),  # (3,), [] when unknown
-    Column("gains", JSON, nullable=False),
-    Column("vignette", JSON, nullable=False),
+    text("name"),
+    known("time_ns", Nanoseconds),
+    text("status"),
+    text("image_path"),
+    known("camera", JSON),  # width_px, height_px, fx_px, fy_px, cx_px, cy_px
+    known("site_from_image", JSON),  # (3, 3)
+    known("rotation", JSON),  # (3, 3) site_from_camera, [] when unknown
+    known("translation_m", JSON),  # (3,), [] when unknown
+    known("gains", JSON),
+    known("vignette", JSON),
     Column("sigma_m", Float),  # NULL when unknown
     Column("residual_px", Float),
 )
 documents = Table(
     "documents",
     metadata,  # the text files of a run, verbatim until they are written, then emptied to save room
-    Column("run_id", ForeignKey("runs.id", ondelete="CASCADE"), primary_key=True),
+    owner("run_id", "runs.id", primary_key=True),
     Column("name", String, primary_key=True),
-    Column("content", LargeBinary, nullable=False),  # b"": the file is on the disk
+    known("content", LargeBinary),  # b"": the file is on the disk
 )
 leftovers = Table(
     "leftovers",
     metadata,  # text files of the run before that this one has not: to be removed
-    Column("run_id", ForeignKey("runs.id", ondelete="CASCADE"), primary_key=True),
+    owner("run_id", "runs.id", primary_key=True),
     Column("name", String, primary_key=True),
 )
 versions = Table(
     "versions",
     metadata,
-    Column("id", Integer, primary_key=True, autoincrement=False),
-    Column("parent_id", Integer, nullable=False),  # the version it was painted over; 0: none
-    Column("flight_id", ForeignKey("flights.id"), nullable=False),
-    Column("run_id", Integer, nullable=False),
-    Column("created_utc", String, nullable=False),
-    Column("complete", Boolean, nullable=False),
-    Column("export_crs", String, nullable=False),  # "" is the site's own
+    number(),
+    known("parent_id", Integer),  # the version it was painted over; 0: none
+    known("flight_id", String, ForeignKey("flights.id")),
+    known("run_id", Integer),
+    text("created_utc"),
+    known("complete", Boolean),
+    text("export_crs"),  # "" is the site's own
 )
 version_tiles = Table(
     "version_tiles",
     metadata,
-    Column("version_id", ForeignKey("versions.id", ondelete="CASCADE"), primary_key=True),
+    owner("version_id", "versions.id", primary_key=True),
     Column("tile_column", Integer, primary_key=True),
     Column("tile_row", Integer, primary_key=True),
-    Column("sha256", String, nullable=False),
+    text("sha256"),
 )
 Index("version_tiles_by_content", version_tiles.c.sha256)
 comparisons = Table(
     "comparisons",
     metadata,  # a version that a comparison made; kept when its run is replaced
-    Column("version_id", ForeignKey("versions.id", ondelete="CASCADE"), primary_key=True),
-    Column("run_id", Integer, nullable=False),
-    Column("kinds", JSON, nullable=False),  # kind -> number of changes
+    owner("version_id", "versions.id", primary_key=True),
+    known("run_id", Integer),
+    known("kinds", JSON),  # kind -> number of changes
 )
 changes = Table(
     "changes",
     metadata,
     Column("id", String, primary_key=True),
-    Column("run_id", ForeignKey("runs.id", ondelete="CASCADE"), nullable=False),
-    Column("number", Integer, nullable=False),
-    Column("kind", String, nullable=False),
-    Column("properties", JSON, nullable=False),
+    owner("run_id", "runs.id", nullable=False),
+    known("number", Integer),
+    text("kind"),
+    known("properties", JSON),
 )
 Index("changes_by_run", changes.c.run_id)
 reviews = Table(
     "reviews",
     metadata,  # no foreign keys: a verdict outlives the run whose change was looked at
     Column("change_id", String, primary_key=True),
-    Column("flight_id", String, nullable=False),
-    Column("verdict", String, nullable=False),
-    Column("at_utc", String, nullable=False),
-    Column("note", String, nullable=False),
-    Column("kind", String, nullable=False),
-    Column("outline_m", JSON, nullable=False),
+    text("flight_id"),
+    text("verdict"),
+    text("at_utc"),
+    text("note"),
+    text("kind"),
+    known("outline_m", JSON),
 )
 searches = Table(
     "searches",
     metadata,  # a run whose frames were searched for objects, perhaps without finding any
-    Column("run_id", ForeignKey("runs.id", ondelete="CASCADE"), primary_key=True),
-    Column("model", String, nullable=False),
-    Column("outlines_m", JSON, nullable=False),  # (N, 4, 2) of the frames that were looked at
+    owner("run_id", "runs.id", primary_key=True),
+    text("model"),
+    known("outlines_m", JSON),  # (N, 4, 2) of the frames that were looked at
     Column("searched_for", JSON),  # class -> (N,) 0 or 1; null: each frame for every class
 )
 objects = Table(
     "objects",
     metadata,
-    Column("run_id", ForeignKey("runs.id", ondelete="CASCADE"), primary_key=True),
+    owner("run_id", "runs.id", primary_key=True),
     Column("number", Integer, primary_key=True),
-    Column("id", String, nullable=False),
-    Column("properties", JSON, nullable=False),
+    text("id"),
+    known("properties", JSON),
 )
 flown = Table(
     "flown",
     metadata,  # when the flight was flown that made a version; kept when its run is replaced
-    Column("version_id", ForeignKey("versions.id", ondelete="CASCADE"), primary_key=True),
-    Column("first_ns", Nanoseconds, nullable=False),  # UTC; from 1970 on where no clock has a date
-    Column("last_ns", Nanoseconds, nullable=False),
+    owner("version_id", "versions.id", primary_key=True),
+    known("first_ns", Nanoseconds),  # UTC; from 1970 on where no clock has a date
+    known("last_ns", Nanoseconds),
 )
 numbers_metadata = MetaData()
 numbers = Table(
@@ -177,7 +195,7 @@ numbers = Table(
     numbers_metadata,
     # "runs" and "versions": the number given last; "writes": transactions that wrote, counted in PostgreSQL; "format"
     Column("name", String, primary_key=True),
-    Column("last", BigInteger, nullable=False),
+    known("last", BigInteger),
 )
 NUMBERED = ("runs", "versions")
 WRITES = "writes"
@@ -193,8 +211,9 @@ def make_numbers(connection: Connection, format_number: int, names: Sequence[str
     """Make the table of these numbers, of the count of writes and of the format."""
     numbers.create(connection)
     first = {**dict.fromkeys((*names, WRITES), 0), "format": format_number}
-    rows = [{"name": name, "last": last} for name, last in first.items()]
-    connection.execute(insert(numbers), rows)
+    connection.execute(
+        insert(numbers), [{"name": name, "last": last} for name, last in first.items()]
+    )
     if connection.dialect.name == "sqlite":
         connection.exec_driver_sql(f"PRAGMA user_version = {format_number:d}")
 
@@ -205,3 +224,15 @@ def format_of(connection: Connection) -> int:
         return int(connection.exec_driver_sql("PRAGMA user_version").scalar_one())
     query = select(numbers.c.last).where(numbers.c.name == "format")
     return int(connection.execute(query).scalar_one())
+
+
+def of_complete_runs(table: Table, flight_id: str | None = None) -> Any:
+    """Select the rows that complete runs have, with `flight_id` and `rank`, by rank; of one flight if its id is given."""
+    query = (
+        select(table, runs.c.flight_id, flights.c.rank)
+        .join(runs, runs.c.id == table.c.run_id)
+        .join(flights, flights.c.id == runs.c.flight_id)
+        .where(runs.c.status == "complete")
+        .order_by(flights.c.rank)
+    )
+    return query if flight_id is None else query.where(flights.c.id == flight_id)
