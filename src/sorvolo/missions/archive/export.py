@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 from sorvolo.errors import InputError, SettingsError, StoreError
@@ -12,8 +13,7 @@ from sorvolo.missions.site.working_copy import fetch_site
 from sorvolo.store.copies.bucket import sites_at
 from sorvolo.store.copies.object_store import open_objects
 from sorvolo.store.copies.working import store_address
-from sorvolo.store.exports.stac_geoparquet import StacItem, demand_pyarrow, item_table
-from sorvolo.store.index.stac_items import PROPERTIES, site_items
+from sorvolo.store.index.stac_table import demand_pyarrow, site_items, stac_table
 from sorvolo.store.site.archive import Archive
 
 
@@ -53,12 +53,12 @@ def export_archive(root: str, out: Path) -> Generator[ExportUpdate, None, Export
         raise InputError(f"no folder {out.resolve().parent} to write {out.name} to; make it first")
     names = _sites(root)
     outcome = ExportOutcome(sites=len(names))
-    with item_table(out, PROPERTIES) as table:
+    with stac_table(out) as table:
         for done, name in enumerate(names, start=1):
             items = yield from _site(root, name, out, outcome)
-            table.add(items, items[0].title if items else name)
+            table.add(items)
             for each in items:
-                kind = str(each.properties["sorvolo:kind"])
+                kind = str(each["sorvolo:kind"])
                 outcome.kinds[kind] = outcome.kinds.get(kind, 0) + 1
             yield ExportUpdate(name, done, len(names))
         outcome.rows = table.rows
@@ -76,7 +76,7 @@ def _sites(root: str) -> list[str]:
 
 def _site(
     root: str, name: str, out: Path, outcome: ExportOutcome
-) -> Generator[ExportUpdate, None, list[StacItem]]:
+) -> Generator[ExportUpdate, None, list[dict[str, Any]]]:
     """The items of one site; none of one that is local or cannot be read, which the outcome names."""
     try:
         folder = yield from _folder(root, name)
