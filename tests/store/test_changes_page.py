@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sorvolo.geometry.grid import SiteGrid
-from sorvolo.store.exports.coverage_files import coverage_geojson
+from sorvolo.store.exports.ground_files import coverage_geojson
 from sorvolo.store.exports.map_pictures import Picture
 from sorvolo.store.pages.changes import changes_page
 from sorvolo.store.site.change_records import StoredChange, stored_changes

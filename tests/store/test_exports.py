@@ -16,7 +16,7 @@ from fake_flights import LOCAL_SITE, ORIGIN, SITE, frame, tile
 
 from sorvolo.geometry.geodesy import Geodetic, Projection
 from sorvolo.geometry.grid import SiteGrid
-from sorvolo.store.exports.frame_files import frames_geojson
+from sorvolo.store.exports.ground_files import frames_geojson
 from sorvolo.store.exports.map_pictures import (
     LivePreview,
     picture,

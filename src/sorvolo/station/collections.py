@@ -16,7 +16,7 @@ from sorvolo.station.problems import Problem
 from sorvolo.station.sites import SiteShelf
 from sorvolo.station.watch_findings import Findings
 from sorvolo.store.exports.change_files import changes_geojson
-from sorvolo.store.exports.coverage_files import COVERAGE
+from sorvolo.store.exports.ground_files import COVERAGE
 from sorvolo.store.exports.object_files import objects_geojson
 from sorvolo.store.exports.places import longitude_latitude
 from sorvolo.store.exports.plain import features_name

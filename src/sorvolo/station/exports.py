@@ -19,8 +19,7 @@ from sorvolo.station.problems import Problem
 from sorvolo.station.security import needs
 from sorvolo.station.sites import SiteShelf
 from sorvolo.station.tokens import Role
-from sorvolo.store.exports.geopackage import write_geopackage
-from sorvolo.store.exports.qgis_styles import LAYER_STYLES, qml_of
+from sorvolo.store.exports.geopackage import LAYER_STYLES, qml_of, write_geopackage
 from sorvolo.store.nofollow import open_below
 from sorvolo.store.site.archive import Archive
 

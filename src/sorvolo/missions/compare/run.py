@@ -44,7 +44,7 @@ from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.heights.measure import flight_with_heights, read_field
 from sorvolo.store.exports.change_files import write_pictures
-from sorvolo.store.exports.coverage_files import COVERAGE, coverage_geojson
+from sorvolo.store.exports.ground_files import COVERAGE, coverage_geojson
 from sorvolo.store.exports.map_pictures import Picture, picture
 from sorvolo.store.exports.plain import features_name, geojson_bytes
 from sorvolo.store.images import ImageCache

@@ -26,7 +26,7 @@ from sorvolo.mosaic.flight_figures import (
     track_row,
 )
 from sorvolo.mosaic.graph_report import GraphReport
-from sorvolo.store.exports.control_files import control_summary
+from sorvolo.store.exports.ground_files import control_summary
 from sorvolo.store.exports.map_pictures import Picture
 from sorvolo.store.exports.plain import utc_text
 from sorvolo.survey.control import ControlReport

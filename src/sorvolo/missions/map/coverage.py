@@ -12,7 +12,7 @@ from sorvolo.missions.map.painting import REST
 from sorvolo.missions.plan_flight import ReflySettings, fly_again
 from sorvolo.mosaic.seen_ground import PictureOnGround, coverage_figures, seen_ground
 from sorvolo.store.atomic import atomic_write_bytes
-from sorvolo.store.exports.coverage_files import COVERAGE, holes_lonlat, seen_geojson
+from sorvolo.store.exports.ground_files import COVERAGE, holes_lonlat, seen_geojson
 from sorvolo.store.exports.plain import features_name, geojson_bytes
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.area import Area

@@ -31,7 +31,7 @@ from sorvolo.mosaic.placing import map_m_per_px, sees_horizon
 from sorvolo.mosaic.planar import PlanarMapper, Registered
 from sorvolo.mosaic.seen_ground import PictureOnGround
 from sorvolo.registration.lens import Undistorter, refined_camera
-from sorvolo.store.exports.control_files import control_documents
+from sorvolo.store.exports.ground_files import control_documents
 from sorvolo.store.exports.map_pictures import picture
 from sorvolo.store.images import image_from_jpeg, jpeg_from_image
 from sorvolo.store.pages.flight import report_page

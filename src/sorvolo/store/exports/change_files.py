@@ -7,11 +7,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Boxes, Floats, ImageBGR, ImageGray, Mask, PointsM
+from sorvolo.geometry.arrays import Boxes, Floats, ImageBGR, ImageGray, Mask
 from sorvolo.geometry.polygons import signed_area
 from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.exports.placemarks import Placemark
-from sorvolo.store.exports.places import longitude_latitude
+from sorvolo.store.exports.places import place_deg, ring
 from sorvolo.store.exports.plain import feature_collection, rounded, time_words, utc_text
 from sorvolo.store.images import png_from_rgba
 from sorvolo.store.site.change_records import StoredChange
@@ -22,6 +22,7 @@ CHANGED, UNCHANGED, UNKNOWN = 255, 0, 128
 """The meaning of a pixel in a view's mask."""
 
 BOXES_FILE = "boxes.json"
+_SIZES = ("area_m2", "length_m", "sigma_m", "sigma_in_map_m")
 _PICTURE_ENDINGS = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".dng", ".bmp"}
 
 
@@ -42,7 +43,7 @@ def change_placemarks(changes: Iterable[StoredChange], site: Site) -> list[Place
         Placemark(
             f"{each.id} {each.kind.value}",
             _description(each),
-            *_point(each.centre_m, site),
+            *place_deg(each.centre_m, site),
             each.first_seen_ns,
             tuple((x, y) for x, y in _ring(each.outline_m, site)[:-1]),
         )
@@ -102,7 +103,7 @@ def boxes_json(boxes: Boxes) -> list[list[int]]:
 
 def _feature(change: StoredChange, site: Site) -> dict[str, Any]:
     east_m, north_m = change.centre_m
-    is_still = not np.any(change.velocity_m_s)
+    is_still, risen = not np.any(change.velocity_m_s), change.height_change
     properties = {
         "id": change.id,
         "number": change.number,
@@ -113,16 +114,9 @@ def _feature(change: StoredChange, site: Site) -> dict[str, Any]:
         "announced": utc_text(change.announced_ns) if change.announced_ns >= 0 else None,
         "views": change.views,
         "single_view": change.is_single_view,
-        "area_m2": rounded(change.area_m2, 4),
-        "length_m": rounded(change.length_m, 4),
-        "sigma_m": rounded(change.sigma_m, 4),
-        "sigma_in_map_m": rounded(change.sigma_in_map_m, 4),
-        "height_change_m": None
-        if change.height_change is None
-        else rounded(change.height_change.rise_m, 3),
-        "height_change_sigma_m": None
-        if change.height_change is None
-        else rounded(change.height_change.sigma_m, 3),
+        **{name: rounded(getattr(change, name), 4) for name in _SIZES},
+        "height_change_m": None if risen is None else rounded(risen.rise_m, 3),
+        "height_change_sigma_m": None if risen is None else rounded(risen.sigma_m, 3),
         "class_before": change.class_before or None,
         "class_after": change.class_after or None,
         "east_m": rounded(east_m, 4),
@@ -163,13 +157,5 @@ def _description(change: StoredChange) -> str:
     return "\n".join(lines)
 
 
-def _point(position_m: PointsM, site: Site) -> tuple[float, float]:
-    longitudes, latitudes = longitude_latitude(position_m[None], site)
-    return float(longitudes[0]), float(latitudes[0])
-
-
 def _ring(outline_m: Floats, site: Site) -> list[list[float]]:
-    corners = outline_m if signed_area(outline_m) >= 0 else outline_m[::-1]
-    if not site.is_local:
-        corners = np.column_stack(longitude_latitude(corners, site))
-    return [[round(float(x), 10), round(float(y), 10)] for x, y in [*corners, corners[0]]]
+    return ring(outline_m if signed_area(outline_m) >= 0 else outline_m[::-1], site, 10)

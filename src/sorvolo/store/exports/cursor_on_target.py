@@ -8,7 +8,7 @@ from xml.etree.ElementTree import Element, SubElement, tostring
 
 import numpy as np
 
-from sorvolo.store.exports.places import longitude_latitude
+from sorvolo.store.exports.places import place_deg, wrapped_deg
 from sorvolo.store.exports.plain import utc_text
 from sorvolo.survey.flight import Site
 from sorvolo.survey.objects import Track
@@ -28,7 +28,7 @@ DRONE_TYPE = "a-f-A-M-H-Q"
 """The event type of one's own drone: friendly, in the air, military by the standard's branch, rotary wing, unmanned."""
 
 _OTHER_TYPE = "a-u-G"
-_UNKNOWN_M = "9999999.0"  # what the schema wants where a height or an error is not known
+UNKNOWN_M = "9999999.0"  # what the schema wants where a height or an error is not known
 
 
 def cot_type(label: str, types: Mapping[str, str] = COT_TYPES) -> str:
@@ -52,27 +52,19 @@ def cot_event(
     ground's height above the ellipsoid where the site knows it. Speed and course are sent of what moves. The site must
     be geo-referenced.
     """
-    longitude, latitude = (
-        float(each[0]) for each in longitude_latitude(track.position_m[None], site)
-    )
-    event = _event(uid, cot_type(track.label, types), now_ns, stale_s)
-    error_m = float(np.sqrt(np.linalg.eigvalsh(track.covariance_m2)[-1]))
-    SubElement(
-        event,
-        "point",
-        {
-            "lat": f"{latitude:.7f}",
-            "lon": f"{(longitude + 180) % 360 - 180:.7f}",
-            "hae": f"{site.origin.height_m:.1f}"
-            if site.height_reference == "ellipsoidal"
-            else _UNKNOWN_M,
-            "ce": f"{error_m:.1f}",
-            "le": _UNKNOWN_M,
-        },
-    )
-    detail = SubElement(event, "detail")
     label = _printable(track.label)
-    SubElement(detail, "contact", {"callsign": f"{label} {track.id}"})
+    event, detail = begin_event(
+        uid,
+        cot_type(track.label, types),
+        *place_deg(track.position_m, site),
+        now_ns=now_ns,
+        stale_s=stale_s,
+        height=f"{site.origin.height_m:.1f}"
+        if site.height_reference == "ellipsoidal"
+        else UNKNOWN_M,
+        error_m=float(np.sqrt(np.linalg.eigvalsh(track.covariance_m2)[-1])),
+        callsign=f"{label} {track.id}",
+    )
     east, north = track.velocity_m_s
     if track.moving:
         course_deg = float(np.degrees(np.arctan2(east, north))) % 360
@@ -87,7 +79,7 @@ def cot_event(
     ).text = (
         f"{label}, score {track.score:.2f}, {track.views} views, last seen {seen}, found by Sorvolo"
     )
-    return bytes(tostring(event, encoding="utf-8"))
+    return event_bytes(event)
 
 
 @dataclass(frozen=True)
@@ -114,20 +106,17 @@ class DroneView:
 def cot_drone(view: DroneView, *, uid: str, callsign: str, now_ns: int, stale_s: float) -> bytes:
     """A drone as one event, with its camera's field of view in `<sensor>` where azimuth and angle are known: ATAK and
     WinTAK draw it on the ground."""
-    event = _event(uid, DRONE_TYPE, now_ns, stale_s)
-    SubElement(
-        event,
-        "point",
-        {
-            "lat": f"{view.latitude_deg:.7f}",
-            "lon": f"{(view.longitude_deg + 180) % 360 - 180:.7f}",
-            "hae": _known(view.height_m, ".1f"),
-            "ce": _known(view.error_m, ".1f"),
-            "le": _UNKNOWN_M,
-        },
+    event, detail = begin_event(
+        uid,
+        DRONE_TYPE,
+        view.longitude_deg,
+        view.latitude_deg,
+        now_ns=now_ns,
+        stale_s=stale_s,
+        height=_known(view.height_m, ".1f"),
+        error_m=view.error_m,
+        callsign=_printable(callsign),
     )
-    detail = SubElement(event, "detail")
-    SubElement(detail, "contact", {"callsign": _printable(callsign)})
     if isfinite(view.course_deg):
         speed = f"{view.speed_m_s:.1f}" if isfinite(view.speed_m_s) else "0.0"
         SubElement(detail, "track", {"course": f"{view.course_deg % 360:.0f}", "speed": speed})
@@ -153,7 +142,7 @@ def cot_drone(view: DroneView, *, uid: str, callsign: str, now_ns: int, stale_s:
                 "fovAlpha": "0.3",
             },
         )
-    return bytes(tostring(event, encoding="utf-8"))
+    return event_bytes(event)
 
 
 def cot_spot(
@@ -169,27 +158,35 @@ def cot_spot(
     stale_s: float,
 ) -> bytes:
     """Something at a place as one event of the type `kind`; `words` are its remarks."""
-    event = _event(uid, kind, now_ns, stale_s)
-    SubElement(
-        event,
-        "point",
-        {
-            "lat": f"{latitude_deg:.7f}",
-            "lon": f"{(longitude_deg + 180) % 360 - 180:.7f}",
-            "hae": _UNKNOWN_M,
-            "ce": _known(error_m, ".1f"),
-            "le": _UNKNOWN_M,
-        },
+    event, detail = begin_event(
+        uid,
+        kind,
+        longitude_deg,
+        latitude_deg,
+        now_ns=now_ns,
+        stale_s=stale_s,
+        error_m=error_m,
+        callsign=_printable(callsign),
     )
-    detail = SubElement(event, "detail")
-    SubElement(detail, "contact", {"callsign": _printable(callsign)})
     SubElement(detail, "remarks").text = _printable(words)
-    return bytes(tostring(event, encoding="utf-8"))
+    return event_bytes(event)
 
 
-def _event(uid: str, kind: str, now_ns: int, stale_s: float) -> Element:
+def begin_event(
+    uid: str,
+    kind: str,
+    longitude_deg: float,
+    latitude_deg: float,
+    *,
+    now_ns: int,
+    stale_s: float,
+    height: str = UNKNOWN_M,
+    error_m: float = nan,
+    callsign: str = "",
+) -> tuple[Element, Element]:
+    """An event at a place, and its `<detail>`; `height` is in metres above the ellipsoid, with a decimal."""
     now = _milliseconds(now_ns)
-    return Element(
+    event = Element(
         "event",
         {
             "version": "2.0",
@@ -201,10 +198,30 @@ def _event(uid: str, kind: str, now_ns: int, stale_s: float) -> Element:
             "stale": _milliseconds(now_ns + round(stale_s * 1e9)),
         },
     )
+    SubElement(
+        event,
+        "point",
+        {
+            "lat": f"{latitude_deg:.7f}",
+            "lon": f"{wrapped_deg(longitude_deg):.7f}",
+            "hae": height,
+            "ce": _known(error_m, ".1f"),
+            "le": UNKNOWN_M,
+        },
+    )
+    detail = SubElement(event, "detail")
+    if callsign:
+        SubElement(detail, "contact", {"callsign": callsign})
+    return event, detail
+
+
+def event_bytes(event: Element) -> bytes:
+    """The event as streams of events want it: without a declaration."""
+    return bytes(tostring(event, encoding="utf-8"))
 
 
 def _known(value: float, form: str) -> str:
-    return format(value, form) if isfinite(value) else _UNKNOWN_M
+    return format(value, form) if isfinite(value) else UNKNOWN_M
 
 
 def _printable(text: str) -> str:
@@ -215,16 +232,13 @@ def _printable(text: str) -> str:
 
 def cot_removal(uid: str, *, type_: str, now_ns: int) -> bytes:
     """The event that takes another one, of this `uid` and type, off everyone's map: it turned out to be none."""
-    event = _event(f"{uid}.removed", "t-x-d-d", now_ns, 60.0)
-    SubElement(
-        event,
-        "point",
-        {"lat": "0", "lon": "0", "hae": _UNKNOWN_M, "ce": _UNKNOWN_M, "le": _UNKNOWN_M},
-    )
-    detail = SubElement(event, "detail")
+    event, detail = begin_event(f"{uid}.removed", "t-x-d-d", 0.0, 0.0, now_ns=now_ns, stale_s=60.0)
+    point = event[0]
+    point.set("lat", "0")
+    point.set("lon", "0")
     SubElement(detail, "link", {"uid": uid, "relation": "p-p", "type": type_})
     SubElement(detail, "__forcedelete")
-    return bytes(tostring(event, encoding="utf-8"))
+    return event_bytes(event)
 
 
 def _milliseconds(time_ns: int) -> str:

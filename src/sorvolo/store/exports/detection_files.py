@@ -21,7 +21,7 @@ from sorvolo.store.atomic import (
     writing,
 )
 from sorvolo.store.exports.placemarks import Placemark
-from sorvolo.store.exports.places import longitude_latitude
+from sorvolo.store.exports.places import longitude_latitude, place_deg
 from sorvolo.store.exports.plain import (
     NO_PLACE_FILES,
     feature_collection,
@@ -246,7 +246,6 @@ def track_placemarks(tracks: Iterable[Track], site: Site) -> list[Placemark]:
     """Confirmed tracks as placemarks, each where it was last; the site must have a place on Earth."""
     placemarks = []
     for each in tracks:
-        longitude, latitude = longitude_latitude(each.position_m[None], site)
         words = (
             f"score {each.score:.2f} (0 to 1), {each.views} views, last seen {time_words(each.last_seen_ns)}\n"
             f"position accuracy {each.sigma_m:.1f} m (1 sigma)"
@@ -256,8 +255,7 @@ def track_placemarks(tracks: Iterable[Track], site: Site) -> list[Placemark]:
             Placemark(
                 f"{each.label} {each.id}",
                 words,
-                float(longitude[0]),
-                float(latitude[0]),
+                *place_deg(each.position_m, site),
                 each.last_seen_ns,
             )
         )
@@ -356,10 +354,10 @@ def _collection(name: str, features: Sequence[Mapping[str, Any]], site: Site) ->
 def _place(position_m: Floats, site: Site) -> dict[str, Any]:
     if site.is_local:
         return {"x_px": rounded(position_m[0], 2), "y_px": rounded(position_m[1], 2)}
-    longitude, latitude = longitude_latitude(position_m[None], site)
+    longitude, latitude = place_deg(position_m, site)
     return {
-        "latitude": rounded(latitude[0], 8),
-        "longitude": rounded(longitude[0], 8),
+        "latitude": rounded(latitude, 8),
+        "longitude": rounded(longitude, 8),
         "east_m": rounded(position_m[0], 3),
         "north_m": rounded(position_m[1], 3),
     }

@@ -3,10 +3,8 @@
 from collections.abc import Iterable
 from typing import Any
 
-import numpy as np
-
 from sorvolo.store.exports.placemarks import Placemark
-from sorvolo.store.exports.places import longitude_latitude
+from sorvolo.store.exports.places import place_deg
 from sorvolo.store.exports.plain import feature_collection, rounded, time_words, utc_text
 from sorvolo.store.site.object_records import StoredObject
 from sorvolo.survey.flight import Site
@@ -35,7 +33,6 @@ def object_placemarks(objects: Iterable[StoredObject], site: Site) -> list[Place
     """The objects of a site with a place on Earth as placemarks."""
     placemarks = []
     for each in (stored.thing for stored in objects):
-        longitudes, latitudes = longitude_latitude(np.asarray(each.position_m)[None], site)
         words = (
             f"score {each.score:.2f} (0 to 1), {each.views} of {each.possible_views} frames, first seen "
             f"{time_words(each.first_seen_ns)}\nposition accuracy {each.sigma_m:.2f} m (1 sigma)"
@@ -45,8 +42,7 @@ def object_placemarks(objects: Iterable[StoredObject], site: Site) -> list[Place
             Placemark(
                 f"{each.id} {each.label}",
                 words,
-                float(longitudes[0]),
-                float(latitudes[0]),
+                *place_deg(each.position_m, site),
                 each.first_seen_ns,
             )
         )
@@ -76,8 +72,7 @@ def _feature(stored: StoredObject, site: Site, crops_from_site: bool) -> dict[st
     if site.is_local:
         coordinates = [rounded(east_m, 4), rounded(north_m, 4)]
     else:
-        longitudes, latitudes = longitude_latitude(np.asarray(each.position_m)[None], site)
-        coordinates = [rounded(longitudes[0], 8), rounded(latitudes[0], 8)]
+        coordinates = [rounded(degrees, 8) for degrees in place_deg(each.position_m, site)]
         properties |= {"latitude": coordinates[1], "longitude": coordinates[0]}
     properties |= {
         "east_m": rounded(east_m, 3),

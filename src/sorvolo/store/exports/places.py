@@ -16,6 +16,18 @@ def longitude_latitude(points_m: Floats, site: Site) -> tuple[Floats, Floats]:
     return near_longitudes(longitudes, site.origin.longitude_deg), latitudes
 
 
+def place_deg(point_m: Floats, site: Site) -> tuple[float, float]:
+    """WGS84 longitude and latitude of one site point, (2,) or (3,)."""
+    longitudes, latitudes = longitude_latitude(np.asarray(point_m)[None], site)
+    return float(longitudes[0]), float(latitudes[0])
+
+
+def ring(corners_m: Floats, site: Site, digits: int) -> list[list[float]]:
+    """The closed ring of GeoJSON around corners (N, 2), in degrees; of a local site in its own pixels."""
+    corners = corners_m if site.is_local else np.column_stack(longitude_latitude(corners_m, site))
+    return [[round(float(x), digits), round(float(y), digits)] for x, y in [*corners, corners[0]]]
+
+
 def near_longitudes(longitudes_deg: Floats, reference_deg: float) -> Floats:
     """The same longitudes within half a turn of the reference, so that none jumps at the antimeridian."""
     return np.asarray(longitudes_deg) + 360 * np.round(
@@ -35,8 +47,8 @@ def place_words(point_m: Floats, site: Site) -> dict[str, str]:
     """
     if site.is_local:
         return {"site": f"{point_m[0]:.1f}, {point_m[1]:.1f}"}
-    longitudes, latitudes = longitude_latitude(np.asarray(point_m, np.float64)[None, :2], site)
-    return degrees_words(float(latitudes[0]), float(longitudes[0]))
+    longitude_deg, latitude_deg = place_deg(np.asarray(point_m, np.float64)[:2], site)
+    return degrees_words(latitude_deg, longitude_deg)
 
 
 def degrees_words(latitude_deg: float, longitude_deg: float) -> dict[str, str]:

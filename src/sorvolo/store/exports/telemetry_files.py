@@ -10,12 +10,17 @@ from xml.etree.ElementTree import Element, SubElement, tostring
 
 from sorvolo.geometry.pose import body_nadir_angles_from_rotation, site_from_gimbal_rotation
 from sorvolo.geometry.units import DAY_NS
+from sorvolo.store.exports.cursor_on_target import (
+    DRONE_TYPE,
+    UNKNOWN_M,
+    begin_event,
+    event_bytes,
+)
+from sorvolo.store.exports.places import wrapped_deg
 from sorvolo.store.exports.plain import utc_text
 from sorvolo.survey.corrected import CorrectedFrame
 
-_UNKNOWN_M = "9999999.0"
-_DRONE = "a-f-A-M-H-Q"  # friendly, air, military, rotary wing, unmanned: how TAK shows small drones
-_STALE_NS = 30_000_000_000  # after which TAK shows a drone as lost; by choice
+_STALE_S = 30.0  # after which TAK shows a drone as lost; by choice
 _NADIR_DEG = -80.0  # pitch below which a camera hovering in wind may look to any side; by choice
 _EARTH_M = 6_371_000.0  # mean radius, good enough for a speed
 
@@ -74,7 +79,9 @@ def track_gpx(frames: Sequence[CorrectedFrame], name: str) -> bytes:
     segment, has_dates = SubElement(track, "trkseg"), is_dated(frames)
     for each in frames:
         point = SubElement(
-            segment, "trkpt", {"lat": f"{each.latitude_deg:.9f}", "lon": f"{_wrapped(each):.9f}"}
+            segment,
+            "trkpt",
+            {"lat": f"{each.latitude_deg:.9f}", "lon": f"{wrapped_deg(each.longitude_deg):.9f}"},
         )
         SubElement(point, "ele").text = f"{each.height_m:.3f}"
         if has_dates:
@@ -97,36 +104,22 @@ def cot_track(frames: Sequence[CorrectedFrame], name: str, *, is_ellipsoidal: bo
     """
     lines = []
     for number, each in enumerate(frames):
-        event = Element(
-            "event",
-            {
-                "version": "2.0",
-                "uid": f"sorvolo.{name}",
-                "type": _DRONE,
-                "how": "m-g",
-                "time": _moment(each.time_ns),
-                "start": _moment(each.time_ns),
-                "stale": _moment(each.time_ns + _STALE_NS),
-            },
+        event, detail = begin_event(
+            f"sorvolo.{name}",
+            DRONE_TYPE,
+            each.longitude_deg,
+            each.latitude_deg,
+            now_ns=each.time_ns,
+            stale_s=_STALE_S,
+            height=f"{each.height_m:.1f}" if is_ellipsoidal else UNKNOWN_M,
+            error_m=each.sigma_m,
         )
-        SubElement(
-            event,
-            "point",
-            {
-                "lat": f"{each.latitude_deg:.7f}",
-                "lon": f"{_wrapped(each):.7f}",
-                "hae": f"{each.height_m:.1f}" if is_ellipsoidal else _UNKNOWN_M,
-                "ce": _UNKNOWN_M if math.isnan(each.sigma_m) else f"{each.sigma_m:.1f}",
-                "le": _UNKNOWN_M,
-            },
-        )
-        detail = SubElement(event, "detail")
         SubElement(detail, "contact", {"callsign": name})
         SubElement(detail, "sensor", _sensor(each))
         if number:
             SubElement(detail, "track", _course(frames[number - 1], each))
         SubElement(detail, "remarks").text = f"frame {each.name}, corrected by Sorvolo"
-        lines.append(bytes(tostring(event, encoding="utf-8")))
+        lines.append(event_bytes(event))
     return b"\n".join(lines) + b"\n"
 
 
@@ -165,11 +158,3 @@ def _course(before: CorrectedFrame, now: CorrectedFrame) -> dict[str, str]:
         "course": f"{math.degrees(math.atan2(east_m, north_m)) % 360:.1f}",
         "speed": f"{speed:.2f}",
     }
-
-
-def _wrapped(each: CorrectedFrame) -> float:
-    return (each.longitude_deg + 180) % 360 - 180
-
-
-def _moment(time_ns: int) -> str:
-    return utc_text(time_ns)[:23] + "Z"

@@ -11,7 +11,7 @@ from sorvolo.errors import StoreError, UnavailableError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.store.atomic import TEMPORARY_PREFIX, writing
-from sorvolo.store.exports.coverage_files import COVERAGE
+from sorvolo.store.exports.ground_files import COVERAGE
 from sorvolo.store.exports.plain import features_name
 from sorvolo.store.images import image_from_jpeg
 from sorvolo.store.locks import take_lock

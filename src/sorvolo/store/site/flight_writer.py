@@ -20,7 +20,7 @@ from sorvolo.store.exports.change_files import (
     mask_name,
     write_view_masks,
 )
-from sorvolo.store.exports.frame_files import frames_geojson
+from sorvolo.store.exports.ground_files import frames_geojson
 from sorvolo.store.exports.object_files import CROPS, object_crops
 from sorvolo.store.exports.plain import features_name, geojson_bytes, json_bytes
 from sorvolo.store.freed_memory import give_back
