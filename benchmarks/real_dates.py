@@ -69,7 +69,7 @@ from sorvolo.lab.simulation.settings import (
 from sorvolo.missions.compare.flights import compare_flights
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.map.flights import map_flights
-from sorvolo.store.exports.flight_files import (
+from sorvolo.lab.simulate.flight_files import (
     video_writer,
     write_camera,
     write_photo,

@@ -16,6 +16,7 @@ from sorvolo.cli.main import main
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.homography import apply_homography, site_from_image_homography
 from sorvolo.geometry.level_ground import footprint
+from sorvolo.lab.simulate.flight_files import write_camera, write_photo
 from sorvolo.lab.simulation.flight import SimulatedFlight, simulate_flights
 from sorvolo.lab.simulation.settings import (
     ImagingSettings,
@@ -28,7 +29,6 @@ from sorvolo.lab.simulation.settings import (
 )
 from sorvolo.missions.map.painting import KnownKeyframes
 from sorvolo.missions.map.planar_run import PlanarRun
-from sorvolo.store.exports.flight_files import write_camera, write_photo
 from sorvolo.store.site.archive import Archive
 
 _DAY_NS = 86400 * 10**9

@@ -22,8 +22,8 @@ from sorvolo.lab.evaluation.detector import (
     read_sets,
     write_evaluation,
 )
+from sorvolo.lab.evaluation.detector_files import FoundSet, FoundSets, read_found, write_found
 from sorvolo.lab.train.holding_out import hold_out
-from sorvolo.store.exports.detector_files import FoundSet, FoundSets, read_found, write_found
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES, Detections
 

@@ -17,6 +17,7 @@ from sorvolo.lab.datasets.umcd import read_umcd_metadata
 from sorvolo.lab.datasets.umcd_folder import CHANGES, MOSAICKING, WITH, read_umcd_folder
 from sorvolo.lab.evaluation.change_metrics import Counts
 from sorvolo.lab.evaluation.mask_folders import frames_against_times
+from sorvolo.lab.simulate.flight_files import write_mask
 from sorvolo.lab.thesis.published import TABLE_4_3
 from sorvolo.lab.thesis.report import MARKDOWN, NUMBERS, PAGE, write_reproduction
 from sorvolo.lab.thesis.rows import Row
@@ -29,7 +30,6 @@ from sorvolo.lab.thesis.settings import (
 )
 from sorvolo.lab.thesis.simulated import simulated_dataset
 from sorvolo.lab.thesis.thesis_tables import tables_of
-from sorvolo.store.exports.flight_files import write_mask
 from sorvolo.store.exports.reproduction_sheets import reproduction_sheets
 
 SETTINGS, SIZE = quick(

@@ -68,7 +68,7 @@ WRITE_A_VIDEO = """
 import sys
 from pathlib import Path
 import numpy as np
-from sorvolo.store.exports.flight_files import video_writer
+from sorvolo.lab.simulate.flight_files import video_writer
 
 ground = np.random.default_rng(1).integers(0, 256, (60, 100, 3), np.uint8).repeat(4, axis=0).repeat(4, axis=1)
 with video_writer(Path(sys.argv[1]), (320, 180), 10.0, 0, 20) as write:

@@ -21,8 +21,8 @@ from hypothesis import strategies as st
 
 from mutations import mutated
 from sorvolo.errors import InputError, SettingsError, StoreError
+from sorvolo.lab.simulate.flight_files import read_orthophoto
 from sorvolo.store.atomic import atomic_write_bytes
-from sorvolo.store.exports.flight_files import read_orthophoto
 from sorvolo.store.images import image_from_jpeg, jpeg_from_image, rgba_from_png
 from sorvolo.store.nofollow import read_below
 from sorvolo.store.rasters.base_map import BaseMap

@@ -11,7 +11,7 @@ from fake_flights import SITE, frame, image
 
 from sorvolo.errors import StoreError
 from sorvolo.store.images import image_from_jpeg, jpeg_from_image
-from sorvolo.store.pages.objects import objects_section
+from sorvolo.store.pages.flight import objects_section
 from sorvolo.store.site import schema
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.map_objects import MapObject, ObjectSearch, SearchedFrames

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sorvolo.errors import InputError
+from sorvolo.lab.datasets.mask_pictures import MASK_ENDINGS
 from sorvolo.lab.datasets.umcd import looks_like_umcd
-from sorvolo.store.mask_pictures import MASK_ENDINGS
 
 WITH, WITHOUT = "Videos With Telemetry", "Videos Without Telemetry"
 MOSAICKING, CHANGES = "Mosaicking", "Change Detection"

@@ -24,7 +24,7 @@ from sorvolo.lab.evaluation.detection_scores import (
 )
 from sorvolo.lab.train.holding_out import hold_out
 from sorvolo.store.atomic import atomic_write_bytes, writing
-from sorvolo.store.exports.detector_files import (
+from sorvolo.lab.evaluation.detector_files import (
     FoundSet,
     FoundSets,
     mistake_picture,

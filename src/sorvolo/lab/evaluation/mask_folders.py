@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sorvolo.errors import InputError
+from sorvolo.lab.datasets.mask_pictures import MASK_ENDINGS, read_mask
 from sorvolo.lab.evaluation.change_metrics import Counts, frame_counts, pixel_counts
-from sorvolo.store.mask_pictures import MASK_ENDINGS, read_mask
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from sorvolo.lab.simulate.flight_files import read_orthophoto, write_json
 from sorvolo.lab.simulate.simulation_folder import (
     PICTURES_MARK,
     simulation_description,
@@ -16,7 +17,6 @@ from sorvolo.lab.simulation.pictures import PictureSettings, SimulatedPicture, s
 from sorvolo.lab.simulation.truth import coco_categories
 from sorvolo.store.ahead import in_order
 from sorvolo.store.atomic import atomic_write_bytes, writing
-from sorvolo.store.exports.flight_files import read_orthophoto, write_json
 from sorvolo.store.images import jpeg_from_image
 
 _MOST_THREADS = 8  # each holds a picture that is drawn, of tens of megabytes

@@ -11,8 +11,8 @@ from typing import Any
 
 from sorvolo import __version__
 from sorvolo.errors import SettingsError
+from sorvolo.lab.simulate.flight_files import write_json
 from sorvolo.store.atomic import writing
-from sorvolo.store.exports.flight_files import write_json
 
 MARK = "simulation.json"
 """The file that marks a folder that holds simulated flights, and may be replaced by another simulation."""

@@ -8,6 +8,15 @@ from typing import Any
 
 from sorvolo.geometry.geodesy import utm_epsg
 from sorvolo.geometry.grid import SiteGrid
+from sorvolo.lab.simulate.flight_files import (
+    read_orthophoto,
+    video_writer,
+    write_camera,
+    write_json,
+    write_mask,
+    write_photo,
+    write_telemetry,
+)
 from sorvolo.lab.simulate.simulation_folder import (
     MARK,
     simulation_description,
@@ -28,15 +37,6 @@ from sorvolo.lab.simulation.truth import (
 from sorvolo.lab.simulation.world import orthophoto
 from sorvolo.store.ahead import in_order
 from sorvolo.store.atomic import writing
-from sorvolo.store.exports.flight_files import (
-    read_orthophoto,
-    video_writer,
-    write_camera,
-    write_json,
-    write_mask,
-    write_photo,
-    write_telemetry,
-)
 from sorvolo.store.rasters.geotiff import write_cog
 
 _MOST_THREADS = 4  # each holds a frame that is drawn, of tens of megabytes

@@ -14,6 +14,7 @@ from sorvolo.change.pair.thesis import compare_thesis
 from sorvolo.change.pair.thesis_options import thesis_options
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, ImageRGB
+from sorvolo.lab.datasets.mask_pictures import read_mask
 from sorvolo.lab.datasets.umcd import read_umcd_metadata
 from sorvolo.lab.datasets.umcd_folder import UmcdVideo
 from sorvolo.lab.evaluation.change_metrics import Counts
@@ -31,7 +32,6 @@ from sorvolo.mosaic.frame_deviation import MapDeviation
 from sorvolo.store.atomic import writing
 from sorvolo.store.exports.annotated import with_outlines
 from sorvolo.store.images import jpeg_from_image
-from sorvolo.store.mask_pictures import read_mask
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.flight import Frame
 

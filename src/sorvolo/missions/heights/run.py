@@ -36,7 +36,7 @@ from sorvolo.store.rasters.heights import write_height_cog
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue_place import Catalogues
 from sorvolo.store.site.files import HeightFile
-from sorvolo.store.tile_folder import TileFolder
+from sorvolo.store.site.tiles import TileFolder
 from sorvolo.survey.flight import Site
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from sorvolo.errors import GeometryError, StoreError
 from sorvolo.geometry.arrays import ImageRGBA, frozen
 from sorvolo.geometry.grid import TileIndex
-from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, sync_file
+from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, sync_file, writing
 from sorvolo.store.images import png_from_rgba, rgba_from_png
 from sorvolo.store.nofollow import read_below
 from sorvolo.store.site.names import checked_sha256, is_sha256
@@ -352,3 +352,32 @@ def _missing(error: FileNotFoundError) -> StoreError:
     return StoreError(
         f"{error.filename} is missing; restore it from a copy of the site, or map again"
     )
+
+
+class TileFolder(Mapping[TileIndex, ImageRGBA]):
+    """A mapping whose pictures are files without compression; only `save` changes it. The folder is the caller's."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._known: set[TileIndex] = set()
+
+    def save(self, index: TileIndex, rgba: ImageRGBA) -> None:
+        """Keep a tile; raises StoreError on a full disk."""
+        path = self._path(index)
+        with writing(path):
+            np.save(path, rgba)
+        self._known.add(index)
+
+    def __getitem__(self, index: TileIndex) -> ImageRGBA:
+        if index not in self._known:
+            raise KeyError(index)
+        return np.asarray(np.load(self._path(index)), np.uint8)
+
+    def __iter__(self) -> Iterator[TileIndex]:
+        return iter(self._known)
+
+    def __len__(self) -> int:
+        return len(self._known)
+
+    def _path(self, index: TileIndex) -> Path:
+        return self._folder / f"{index[0]}_{index[1]}.npy"
