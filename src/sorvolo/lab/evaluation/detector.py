@@ -22,8 +22,6 @@ from sorvolo.lab.evaluation.detection_scores import (
     compare_arms,
     score_set,
 )
-from sorvolo.lab.train.holding_out import hold_out
-from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.lab.evaluation.detector_files import (
     FoundSet,
     FoundSets,
@@ -31,6 +29,8 @@ from sorvolo.lab.evaluation.detector_files import (
     read_found,
     write_found,
 )
+from sorvolo.lab.train.holding_out import hold_out
+from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.exports.plain import json_bytes
 from sorvolo.store.pages.detector import detector_page
 from sorvolo.survey.flight import Notice
