@@ -26,12 +26,12 @@ from sorvolo.lab.evaluation.detector import (
     evaluate_detector,
     write_evaluation,
 )
+from sorvolo.lab.evaluation.detector_files import FoundSet
 from sorvolo.lab.simulate.pictures import simulate_pictures
 from sorvolo.lab.simulation.flight import simulate_flight
 from sorvolo.lab.simulation.pictures import LEAST_VISIBLE, SMALLEST_PX, PictureSettings
 from sorvolo.lab.simulation.presets import preset
 from sorvolo.lab.simulation.truth import coco_boxes
-from sorvolo.lab.evaluation.detector_files import FoundSet
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.images import jpeg_from_image
 from sorvolo.survey.labels import LabelledPicture, LabelledSet

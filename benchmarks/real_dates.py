@@ -55,6 +55,12 @@ from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.geometry.homography import apply_homography, fit_similarity
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.lab.evaluation.frame_rows import map_frames
+from sorvolo.lab.simulate.flight_files import (
+    video_writer,
+    write_camera,
+    write_photo,
+    write_telemetry,
+)
 from sorvolo.lab.simulation.flight import SimulatedFlight, simulate_flight
 from sorvolo.lab.simulation.ground import orthophoto_ground
 from sorvolo.lab.simulation.settings import (
@@ -69,12 +75,6 @@ from sorvolo.lab.simulation.settings import (
 from sorvolo.missions.compare.flights import compare_flights
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.map.flights import map_flights
-from sorvolo.lab.simulate.flight_files import (
-    video_writer,
-    write_camera,
-    write_photo,
-    write_telemetry,
-)
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.frame_rows import FrameRow
 

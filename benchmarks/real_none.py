@@ -27,10 +27,10 @@ import cv2
 import numpy as np
 
 from provenance import commit, machine, note_scoring
-from sorvolo.lab.evaluation.change_metrics import ComparedGround, compared_ground
 from sorvolo.errors import InputError
 from sorvolo.geometry.geodesy import LocalFrame, Projection
 from sorvolo.geometry.polygons import points_inside
+from sorvolo.lab.evaluation.change_metrics import ComparedGround, compared_ground
 from sorvolo.lab.evaluation.frame_rows import map_frames
 from sorvolo.missions.compare.flights import compare_flights
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
