@@ -44,8 +44,6 @@ def test_what_all_views_show_surely_is_announced_with_its_score():
         ({"score_sum": 3.0}, Reason.UNSURE),
         ({"asked": 25}, Reason.UNSURE),
         ({"restless": 0.2, "score_sum": 7.0}, Reason.UNSURE),
-        ({"look": Look(1.0, 1.2, is_moved_shadow=True)}, Reason.SHADOW),
-        ({"look": Look(1.0, 1.2, may_be_relief=True)}, Reason.RELIEF),
         ({"score_sum": 5.0, "look": Look(3.0, 2.5)}, Reason.LARGE_AND_UNSURE),
     ],
 )

@@ -445,34 +445,6 @@ def test_a_thing_that_two_early_photos_show_is_not_forgotten_for_many_uncertain_
         assert not reported and [each.id for each in evidence.conclude()] == ids
 
 
-WALL = Thing(0, 2.0, (2.0, 0.4), 3.0, (90, 90, 140), on_map=True)
-STANDING = Thing(0, 1.5, height_m=2.5)
-
-
-@pytest.mark.parametrize(
-    ("thing", "eyes", "is_reported"),
-    [
-        (WALL, [(0.0, 0.3)], True),  # an earlier picture from near: nothing is asked for
-        (WALL, [(0.0, 3.0)], False),
-        (WALL, [(0.0, 3.0), (0.0, 4.5)], False),
-        (Thing(0, 1.5), [(0.0, 3.0)], True),  # later pictures show that it lies flat
-        (STANDING, [(0.0, 3.0)], False),
-        (
-            STANDING,
-            [(0.0, 3.0), (3.0, 3.0)],
-            True,
-        ),  # earlier pictures show that the ground was level
-    ],
-)
-def test_what_differs_where_earlier_pictures_look_from_aside_is_a_change_if_the_ground_is_level(
-    thing, eyes, is_reported
-):
-    evidence = EvidenceMap(M_PER_PX, EvidenceSettings(), "f", earlier_pictures(eyes, [thing]))
-    reported = [change for view in flight([thing]) for change in evidence.add(view)]
-    assert bool(evidence.conclude()) is bool(reported) is is_reported
-    assert bool(evidence.outcomes()["never_announced"].get(Reason.RELIEF.value)) is not is_reported
-
-
 def test_sigma_knows_that_a_thing_seen_from_aside_leans():
     above, aside = Thing(0, 0), Thing(0, 3.4)
     first, second = (collect(flight([each]))[0].conclude()[0] for each in (above, aside))

@@ -68,30 +68,22 @@ def truth():
     return seen(LATER)
 
 
-def test_from_where_earlier_pictures_show_a_place() -> None:
+def test_when_the_newest_picture_of_a_place_was_taken() -> None:
     pictures = []
-    for east_m in (0.0, 6.0):
+    for east_m, time_ns in ((0.0, 7), (6.0, 5)):
         pose = Pose(NADIR_CAMERA_NORTH_UP, EARLIER + np.array([east_m, 0, 0]))
-        pictures.append(EarlierPicture(CAMERA, site_from_image_homography(CAMERA, pose), pose))
+        homography = site_from_image_homography(CAMERA, pose)
+        pictures.append(EarlierPicture(CAMERA, homography, pose, time_ns))
     earlier = EarlierPictures(pictures, lambda _: with_known_pixels(seen(EARLIER)[0]))
     place = EARLIER[:2] + np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
-    cameras = EARLIER + np.array([[3.5, 4.0, 0], [9.0, 0, 5.0]])
-    both = earlier.vantage(place + np.array([1.0, 0]), cameras)
-    assert both is not None and both.shows == (1, 0) and both.apart_m == pytest.approx(3.0)
-    assert both.earlier_m == pytest.approx(EARLIER + np.array([6.0, 0, 0]))
-    assert both.later_m == pytest.approx(cameras[1])
+    assert earlier.time_ns(place) == 7
     corners_m = apply_homography(
-        pictures[0].site_from_image, np.array([[0.0, 0], [CAMERA.width_px, 0]])
+        pictures[1].site_from_image, np.array([[0.0, 0], [CAMERA.width_px, 0]])
     )
-    # 1.5 m from the west edge of the first, which the second one does not reach
-    first_alone = place - np.array([np.ptp(corners_m[:, 0]) / 2 - 1.5, 0])
-    alone = earlier.vantage(first_alone, cameras)
-    assert (
-        alone is not None
-        and alone.shows == (0,)
-        and alone.apart_m == pytest.approx(np.hypot(3.5, 4.0))
-    )
-    assert earlier.vantage(place + np.array([1000.0, 0]), cameras) is None
+    # 1.5 m from the east edge of the second, which the first one does not reach
+    east_m = 6.0 + np.ptp(corners_m[:, 0]) / 2 - 1.5
+    assert earlier.time_ns(place + np.array([east_m, 0])) == 5
+    assert earlier.time_ns(place + np.array([1000.0, 0])) is None
 
 
 def test_a_roof_is_rendered_where_the_later_camera_sees_it(truth) -> None:

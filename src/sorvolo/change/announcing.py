@@ -15,10 +15,6 @@ class Reason(StrEnum):
     TOO_FEW_VIEWS = "too few views show it"
     UNSURE = "its score is too low"
     LARGE_AND_UNSURE = "it is large and its score is low, like a wall that leans"
-    RELIEF = (
-        "earlier pictures show it from another side, where a wall or a roof would differ as well"
-    )
-    SHADOW = "it is the moved shadow of something that stays"
     MOVES = "most views that show it show something that moves"
 
 
@@ -59,16 +55,10 @@ _ONE_PLACE = 0.05  # flying heights: views no wider apart see the same ghost, an
 
 @dataclass(frozen=True)
 class Look:
-    """What a candidate's pictures and outline show.
-
-    `may_be_relief`: something tall that stands there unchanged would differ as well (`ReliefDoubt`).
-    `is_moved_shadow`: the shadow of something that stays lies elsewhere, and nothing else differs (`ShadowDoubt`).
-    """
+    """What a candidate's outline shows."""
 
     area_m2: float
     length_m: float
-    may_be_relief: bool = False
-    is_moved_shadow: bool = False
 
 
 @dataclass(frozen=True)
@@ -196,10 +186,6 @@ def _objection(tally: Tally) -> Reason | None:
 
 def _objection_to_look(look: Look, score: float, tally: Tally) -> Reason | None:
     """The first rule that what its pictures and outline show fails."""
-    if look.may_be_relief:
-        return Reason.RELIEF
-    if look.is_moved_shadow:
-        return Reason.SHADOW
     may_be_a_wall = (
         look.area_m2 >= _LARGE_M2 and look.length_m < tally.flying_height_m
     )  # snow is longer

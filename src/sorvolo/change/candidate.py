@@ -16,7 +16,6 @@ from sorvolo.change.ground import (
     pieces,
 )
 from sorvolo.change.kinds import kind_of
-from sorvolo.change.levelness import Sights
 from sorvolo.change.outlines import aside_of, measures, outline_of, overlap, place_sigma_m
 from sorvolo.change.patches import Cut, PatchWindow, cut, moved, patch_of, quality
 from sorvolo.change.things import things_of
@@ -291,7 +290,6 @@ class Candidate:
     def __init__(self, number: int, cells: CellWindow, first_seen_ns: int) -> None:
         self.number = number
         self.pictures = Pictures()
-        self.sights = Sights()
         self._cells = cells
         self._tally = Tally(first_seen_ns, first_seen_ns)
         self._places: list[Floats] = []
@@ -493,12 +491,6 @@ class Seeds:
     def __iter__(self) -> Iterator[Candidate]:
         return iter(self._seeds)
 
-    def sights_at(self, window: CellWindow) -> Sights | None:
-        """The pictures of the surroundings that a seed in a window has, of several the most; None where there is no
-        seed."""
-        there = (each.sights for each in self._seeds if 0 not in each.cells.overlap(window).shape)
-        return max(there, key=lambda each: len(each.pictures), default=None)
-
     def keep(
         self, view: ComparedView, kept_view: KeptView, evidence: CellEvidence, most_pictures: int
     ) -> None:
@@ -531,8 +523,7 @@ class Seeds:
             del sizes[0], self._seeds[0]
 
     def _ask(self, seed: Candidate, view: ComparedView, kept_view: KeptView) -> None:
-        if seed.ask(kept_view, self._grid.read(seed.cells).changed > 0, self._cell_m):
-            seed.sights.show(view, *seed.cells.box_m(self._cell_m), self._m_per_px)
+        seed.ask(kept_view, self._grid.read(seed.cells).changed > 0, self._cell_m)
 
     def _new(self, laid: LaidView, weak: Mask) -> list[CellWindow]:
         """The windows of large enough `weak` pieces, the surest first."""

@@ -6,8 +6,6 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sorvolo.change.levelness import MOST_PICTURES, LaidPicture, apart
-from sorvolo.change.patches import PatchWindow
 from sorvolo.change.relief import Relief
 from sorvolo.geometry.arrays import ImageBGR, ImageRGB, ImageRGBA, Mask, Matrix3, PointsM, Vector3
 from sorvolo.geometry.camera import Camera
@@ -26,20 +24,6 @@ class EarlierPicture(NamedTuple):
     site_from_image: Matrix3
     site_from_camera: Pose | None
     time_ns: int = 0
-
-
-class Vantage(NamedTuple):
-    """From where earlier pictures show a place: of their cameras and the later ones the two that lie nearest to each
-    other, (3,) each, and `shows`, the pictures that show it, the nearest one first."""
-
-    earlier_m: Vector3
-    later_m: Vector3
-    shows: tuple[int, ...]
-
-    @property
-    def apart_m(self) -> float:
-        """The level way between both cameras."""
-        return float(np.hypot(*(self.later_m - self.earlier_m)[:2]))
 
 
 class EarlierPictures:
@@ -85,53 +69,11 @@ class EarlierPictures:
             bgr = np.asarray(cv2.cvtColor(seen, cv2.COLOR_RGBA2BGR), np.uint8)
             yield bgr, np.asarray(cv2.extractChannel(seen, 3) == 255)
 
-    @property
-    def knows_relief(self) -> bool:
-        """Whether what stands on the ground is known."""
-        return self._relief is not None
-
-    def vantage(self, outline_m: PointsM, cameras_m: PointsM) -> Vantage | None:
-        """From where the pictures that show an outline, (N, 2), were taken, beside cameras, (V, 3), that show it
-        later; None where none shows it."""
-        shows = np.array([_shows(each, outline_m) for each in self._pictures], bool)
-        (shown,) = np.nonzero(shows & np.isfinite(self._cameras_m).all(axis=1))
-        if not len(shown) or not len(cameras_m):
-            return None
-        apart_m = np.linalg.norm(self._cameras_m[shown, None, :2] - cameras_m[None, :, :2], axis=-1)
-        order = np.argsort(apart_m.min(axis=1), kind="stable")
-        later_m = cameras_m[int(apart_m[order[0]].argmin())]
-        nearest = [int(shown[each]) for each in order]
-        return Vantage(self._cameras_m[nearest[0]], later_m, tuple(nearest))
-
     def time_ns(self, outline_m: PointsM) -> int | None:
         """When the newest picture that shows an outline, (N, 2), was taken, UTC; None where none shows it."""
         return max(
             (each.time_ns for each in self._pictures if _shows(each, outline_m)), default=None
         )
-
-    def laid(
-        self, vantage: Vantage, window: PatchWindow, most: int = MOST_PICTURES
-    ) -> list[LaidPicture]:
-        """At most so many pictures that show a place, taken apart from each other, laid on a window of level ground."""
-        found: list[LaidPicture] = []
-        for index in apart(self._cameras_m, vantage.shows, most):
-            picture = self._as_coarse(index, window.site_from_patch)
-            if picture is not None:
-                rgba, site_from_picture = picture
-                patch_from_picture = np.linalg.inv(window.site_from_patch) @ site_from_picture
-                seen = np.asarray(
-                    cv2.warpPerspective(rgba, patch_from_picture, window.size_px), np.uint8
-                )
-                found.append(
-                    LaidPicture.of(
-                        seen[..., :3],
-                        seen[..., 3] == 255,
-                        window,
-                        self._cameras_m[index],
-                        self._pictures[index].time_ns,
-                    )
-                )
-        return found
 
     def _as_coarse(self, index: int, site_from_other: Matrix3) -> tuple[ImageRGBA, Matrix3] | None:
         """A picture, and its (3, 3) place, made so much smaller that resampling it for another raster skips no pixels;

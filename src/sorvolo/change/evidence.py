@@ -31,8 +31,6 @@ from sorvolo.change.candidate import (
     Seeds,
     pictures_for,
 )
-from sorvolo.change.doubt import ReliefDoubt
-from sorvolo.change.earlier_pictures import EarlierPictures
 from sorvolo.change.ground import (
     CellEvidence,
     CellGrid,
@@ -43,7 +41,6 @@ from sorvolo.change.ground import (
 )
 from sorvolo.change.motion import BlobTracker, Movers, MovingBlobs
 from sorvolo.change.outlines import mask_of
-from sorvolo.change.shadows import ShadowDoubt, SunAt
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, Ints32, Mask, PointsM
 from sorvolo.survey.findings import Change, ComparedView
@@ -95,8 +92,7 @@ class EvidenceMap:
     """The changes of one flight while its views come in. `add` changes it; `conclude` settles what is left.
 
     `m_per_px` is a pixel of changes' pictures, `id_prefix` begins every change's id: the flight's name. Views must come
-    in order of time; the same views give the same changes and ids. `earlier` are the pictures of earlier flights, None
-    where there are none; `sun_at` gives the sun of either date.
+    in order of time; the same views give the same changes and ids.
     """
 
     def __init__(
@@ -104,15 +100,9 @@ class EvidenceMap:
         m_per_px: float,
         settings: EvidenceSettings,
         id_prefix: str,
-        earlier: EarlierPictures | None = None,
-        sun_at: SunAt = lambda _: None,
     ) -> None:
         self._settings, self._prefix = settings, id_prefix
         self._m_per_px = m_per_px
-        self._relief = (
-            None if earlier is None or earlier.knows_relief else ReliefDoubt(earlier, m_per_px)
-        )
-        self._shadows = None if earlier is None else ShadowDoubt(earlier, sun_at)
         self._cell_m = cell_side_m(m_per_px)
         self._join_m = max(_JOIN_M, 3 * self._cell_m) if _JOIN_M else 0.0
         self._gap = int(np.ceil(self._join_m / self._cell_m))
@@ -349,7 +339,6 @@ class EvidenceMap:
     ) -> int:
         candidate = Candidate(self._next_number(), window, view.time_ns)
         self._found[candidate.number] = candidate
-        candidate.sights = self._seeds.sights_at(window) or candidate.sights
         candidate.pictures.show(view, *window.box_m(self._cell_m), self._m_per_px)
         for each in earlier:
             candidate.recall(each, cells, self._cell_m)
@@ -418,7 +407,6 @@ class EvidenceMap:
                 self._give_up(candidate, passing, evidence, own, kept_view)
             if candidate.see(kept_view, own, self._cell_m):
                 shown.append(candidate)
-                candidate.sights.show(view, *candidate.cells.box_m(self._cell_m), self._m_per_px)
                 if candidate.pictures.wants_votes and number not in new:
                     candidate.pictures.vote(view.site_from_image, view.changed, view.valid)
         pictures = self._cut_pictures(view, shown, most_pictures)
@@ -500,20 +488,9 @@ class EvidenceMap:
         whole = self._record(candidate) if isinstance(verdict, Announce) else None
         if whole is None:
             return verdict, None
-        return judge(replace(tally, look=self._look(candidate, whole)), is_over=is_over), whole
-
-    def _look(self, candidate: Candidate, whole: Change) -> Look:
-        may_be_relief = self._relief is not None and self._relief.explains(
-            candidate.number, whole.outline_m, candidate.cameras_m, candidate.sights
-        )
-        is_shadow = (
-            not may_be_relief
-            and self._shadows is not None
-            and self._shadows.explains(
-                candidate.number, whole.outline_m, candidate.cameras_m, candidate.sights
-            )
-        )
-        return Look(whole.area_m2, whole.length_m, may_be_relief, is_shadow)
+        return judge(
+            replace(tally, look=Look(whole.area_m2, whole.length_m)), is_over=is_over
+        ), whole
 
     def _restlessness(self, candidate: Candidate) -> float:
         return restlessness(self._grid, candidate.cells, self._cells_of(candidate), self._cell_m)

@@ -10,7 +10,6 @@ from sorvolo.change.ground import GroundSums
 from sorvolo.change.kinds import kind_of
 from sorvolo.change.learned import learned_difference
 from sorvolo.change.outlines import mask_of, measures, outline_of, overlap, place_sigma_m
-from sorvolo.change.shadows import share_moved
 from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, Mask, PointsM
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Shade
@@ -144,7 +143,7 @@ class GatheredThings:
         for name, other, along in (("came", "left", step), ("left", "came", -step)):
             shade = own & shades[name]
             if np.count_nonzero(shade) > _IS_MOVED * np.count_nonzero(own):
-                return share_moved(shade, shades[other], along, _TALLEST_M) > _IS_MOVED
+                return _share_moved(shade, shades[other], along, _TALLEST_M) > _IS_MOVED
         return False
 
     def _around(
@@ -308,3 +307,21 @@ def _going_on(thing: Change, known: Change) -> Change:
         last_seen_ns=known.last_seen_ns,
         announced_ns=known.announced_ns,
     )
+
+
+def _share_moved(own: Mask, other: Mask, step: Floats, most: float) -> float:
+    """The greatest share of a shade, `own` (h, w), that lies on the `other` date's shade when it is moved by a multiple
+    up to `most` of `step`, (2,) columns and rows."""
+    rows, columns = np.nonzero(own)
+    longest = float(np.abs(step).max()) * most
+    if not len(rows) or longest < 1:
+        return 0.0
+    best = 0
+    for times in np.arange(1.0, longest + 1) / longest * most:
+        x, y = (
+            np.rint(each + times * along).astype(int)
+            for each, along in ((columns, step[0]), (rows, step[1]))
+        )
+        inside = (x >= 0) & (y >= 0) & (x < other.shape[1]) & (y < other.shape[0])
+        best = max(best, int(np.count_nonzero(other[y[inside], x[inside]])))
+    return best / len(rows)

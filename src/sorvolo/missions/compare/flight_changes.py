@@ -3,7 +3,6 @@
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 from sorvolo.capture.source import LiveSource, Source
@@ -85,8 +84,6 @@ class FlightChanges:
                 self._views.change_m_per_px(view),
                 EvidenceSettings(k=self._settings.votes, n=self._settings.voters),
                 self._flight,
-                self._views.earlier_pictures,
-                partial(sun_over, self._site),
             )
         announced = self._evidence.add(view)
         if self._settings.method != "thesis":
