@@ -1,7 +1,5 @@
 """People and cars that move while they are seen: reported once as moving, never as changes of the ground."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from blob_world import CAMERA_HEIGHT_M, M_PER_PX, Thing, flight, view_of
@@ -14,7 +12,6 @@ from sorvolo.change.motion import (
     BlobTracker,
     TrackPoint,
     motion,
-    shown_alone,
 )
 from sorvolo.survey.findings import ChangeKind
 
@@ -131,20 +128,6 @@ def test_a_walker_in_a_long_shadow_is_one_event_though_the_shadow_seems_to_stay(
     )
 
 
-def test_one_view_of_a_walker_joined_with_another_thing_is_no_view_of_the_walker():
-    lengths_m = (0.5, 0.52, 1.4, 0.49, 0.5, 0.5)
-    points = [
-        replace(each, blob=replace(each.blob, length_m=length_m))
-        for length_m, each in zip(lengths_m, (point(0.2 * i, (i, 0), (0, 0)) for i in range(6)))
-    ]
-    assert shown_alone(points) == (*points[:2], *points[3:])
-    grows = [
-        replace(each, blob=replace(each.blob, length_m=0.5 * 1.5**i))
-        for i, each in enumerate(points)
-    ]
-    assert shown_alone(grows) == tuple(grows)
-
-
 def test_a_mover_seen_again_for_one_view_stays_where_it_was_seen_to_move():
     walks, last = Thing(-3, -2, (0.5, 0.5), velocity_m_s=(0.9, 0.3)), 20
     shown = {*range(last), 45}
@@ -234,13 +217,3 @@ def test_a_walker_seen_from_aside_is_placed_where_the_feet_are(north_m):
     feet_m = thing.outline_m((change.last_seen_ns - flight_start_ns()) * 1e-9).mean(axis=0)
     assert np.hypot(*(change.outline_m.mean(axis=0) - feet_m)) < 0.12
     assert change.length_m < 1.0
-
-
-@pytest.mark.parametrize("speed_m_s", [0.8, 1.2])
-def test_what_is_long_and_slow_has_the_views_that_it_needs_to_go_its_length(speed_m_s):
-    lorry = Thing(
-        -1.0, -2.7 * speed_m_s, (1.6, 3.6), colour=(60, 200, 60), velocity_m_s=(0, speed_m_s)
-    )
-    _, final = events(flight([lorry], seconds=8.0, speed_m_s=1.2, start_m=(-5.0, 0.0)))
-    assert [each.kind for each in final] == [ChangeKind.MOVING]
-    assert np.abs(final[0].velocity_m_s - [0, speed_m_s]).max() < 0.2

@@ -3,7 +3,6 @@
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 
@@ -132,19 +131,6 @@ def floats(points: Sequence[TrackPoint], move: Motion, length_m: float) -> bool:
     return _way_m(points) > _RIGID_LENGTHS * length_m and float(np.median(apart_m)) > length_m
 
 
-def shown_alone(points: Sequence[TrackPoint]) -> tuple[TrackPoint, ...]:
-    """The points less those of single views in which the blob has another length than just before and after, where it
-    has one length: its shadow or a neighbour was joined with it there, and its place is not the thing's."""
-    kept = list(points[:1])
-    for point, after in pairwise(points[1:]):
-        before_m, here_m, after_m = (each.blob.length_m for each in (kept[-1], point, after))
-        around = sorted((before_m, after_m))
-        is_other = not around[1] / _STEADY_LENGTH <= here_m <= around[0] * _STEADY_LENGTH
-        if not is_other or around[1] >= _STEADY_LENGTH * around[0]:
-            kept.append(point)
-    return (*kept, *points[1:][-1:])
-
-
 def _way_m(points: Sequence[TrackPoint]) -> float:
     """How far a blob's last points lead over the ground."""
     return float(np.hypot(*(points[-1].blob.place_m - points[0].blob.place_m)))
@@ -177,15 +163,14 @@ _MOST_SPEED_M_S = 3.0  # of something small ...
 _MOST_LENGTHS_S = 4.0  # ... and lengths a second more: a car of 4 m may go 19 m/s
 _FORGET_S = 2.5  # what was not seen for so long is judged anew ...
 _FORGET_VIEWS = 2  # ... and for so many views
-_POINTS = 12  # of a track are judged, the last ones ...
-_SLOW_POINTS = 36  # ... or, as something long may need so many views to go its own length, so many
+_POINTS = 12  # of a track are judged, the last ones
 
 
 @dataclass(frozen=True, eq=False)
 class BlobTrack:
     """One blob over time, by its number: its first point, the last few, how many, and the sum of their scores.
 
-    `older` are those before the last few. `leg` numbers how often anything came into view: this track and others.
+    `leg` numbers how often anything came into view: this track and others.
     `moves` as soon as it was once seen to, `moves_now` on this leg.
     """
 
@@ -197,7 +182,6 @@ class BlobTrack:
     leg: int = 0
     moves: bool = False
     moves_now: bool = False
-    older: tuple[TrackPoint, ...] = ()
 
     @property
     def last(self) -> TrackPoint:
@@ -211,12 +195,10 @@ class BlobTrack:
 
     def with_point(self, point: TrackPoint, oldest_ns: int) -> "BlobTrack":
         """The track, one view longer; points from before a gap, last seen before `oldest_ns`, are judged no more."""
-        known = (*self.older, *self.points) if self.last.time_ns >= oldest_ns else ()
-        points = (*known, point)[-_SLOW_POINTS:]
+        known = self.points if self.last.time_ns >= oldest_ns else ()
         return replace(
             self,
-            points=points[-_POINTS:],
-            older=points[:-_POINTS],
+            points=(*known, point)[-_POINTS:],
             count=self.count + 1,
             score_sum=self.score_sum + point.blob.score,
             moves_now=self.moves_now and bool(known),
@@ -234,7 +216,6 @@ class BlobTrack:
             last.leg,
             self.moves or gone.moves,
             last.moves_now,
-            last.older,
         )
 
 
@@ -307,7 +288,7 @@ class BlobTracker:
         track = known.with_point(point, oldest_ns)
         if len(track.points) == 1:
             return replace(track, leg=self._next_leg())
-        moves_now = track.moves_now or self._is_mover(track)
+        moves_now = track.moves_now or self._moves(track.points, self._are_photos(track))
         return replace(track, moves=track.moves or moves_now, moves_now=moves_now)
 
     def _next_leg(self) -> int:
@@ -321,20 +302,6 @@ class BlobTracker:
             for number, each in self._tracks.items()
             if each.moves or each.last.time_ns >= oldest_ns
         }
-
-    def _is_mover(self, track: BlobTrack) -> bool:
-        """Whether enough views show a plausible thing that moves steadily, by more than parallax explains."""
-        are_photos, alone = (
-            self._are_photos(track),
-            shown_alone(track.points),
-        )
-        if self._moves(track.points, are_photos) or (
-            len(alone) < len(track.points) and self._moves(alone, are_photos)
-        ):
-            return True
-        slow = (*track.older, *track.points)
-        length_m = float(np.median([each.blob.length_m for each in track.points]))
-        return bool(track.older) and self._goes_its_length(slow, motion(slow), length_m)
 
     def _moves(self, points: Sequence[TrackPoint], are_photos: bool) -> bool:
         """Whether points show it: a motion of its own, or a size that keeps what leans could not keep."""
