@@ -187,7 +187,7 @@ def test_what_leans_over_a_thing_for_some_views_is_no_part_of_it(first, last, co
 @pytest.mark.parametrize("score", [0.55, 0.95])
 @pytest.mark.parametrize("colour", [(60, 60, 60), (200, 60, 60)])
 def test_a_small_dark_thing_is_announced_as_a_bright_one_is(colour, score):
-    """Decision 0045 took out the rule for specks of shade: whether it is a moved shadow is decided by the sun."""
+    """Specks of shade have no rule of their own."""
     views = [
         view_of(
             i,

@@ -58,8 +58,8 @@ _CHANGED_ITSELF = 0.5  # of its views: ground that more of them flag is changed 
 
 
 # How views become cells, and cells candidates.
-_MOVED_HEIGHTS = 0.01  # flying heights that the camera moves until a view counts anew (before 0014)
-_ALL_CHANGED = 0.5  # share of a frame beyond which nothing in it can be followed (before 0014)
+_MOVED_HEIGHTS = 0.01  # flying heights that the camera moves until a view counts anew
+_ALL_CHANGED = 0.5  # share of a frame beyond which nothing in it can be followed
 # what the same ground shows for so long stands there, however unsteady its blobs are
 _STANDS_S = 2.0
 
@@ -68,7 +68,7 @@ _LEAST_VIEWS = 2  # where fewer than n ever see it
 _LEAST_VIEWS_APART_S = 0.1  # frames nearer in time see the same thing and are no news
 _LEAST_AREA_M2 = 0.02  # 14 cm a side: smaller things are not looked for
 _JOIN_M = 0.3  # a smaller gap does not make two things of one
-# what one view shows, and no other could, must be so sure, and confirmed: 0048
+# what one view shows, and no other could, must be so sure, and confirmed
 _SINGLE_VIEW_SCORE = 0.9
 
 

@@ -106,7 +106,7 @@ class GatheredThings:
     def standing_at(
         self, place_m: Floats, length_m: float, others: Sequence[Change]
     ) -> Change | None:
-        """What an object of this length at a place (2,) changed, a change without an id (0086): the ground within half
+        """What an object of this length at a place (2,) changed, a change without an id: the ground within half
         a length that lies farthest apart. None where `others` hold it, or two views did not see it, or its ground is
         the same by its features."""
         around_m = place_m + 0.5 * length_m * _CIRCLE
@@ -179,7 +179,7 @@ class GatheredThings:
 
         A thing that holds others goes on as the one it holds most of, with its id and times; others get
         the next of `numbers`. Left out is also, of `others`, what lies on ground that is the same by its features.
-        What moves and areas are left as they are (0085).
+        What moves and areas are left as they are.
         """
         if self._ground.is_empty:
             return list(others)

@@ -1,4 +1,4 @@
-"""Photos that are not found on the map by themselves, placed there with all others of their flight (0087)."""
+"""Photos that are not found on the map by themselves, placed there with all others of their flight."""
 
 from collections.abc import Mapping
 from types import TracebackType
