@@ -22,8 +22,8 @@ from sorvolo.lab.simulation.settings import (
     SensorSettings,
     SimulationSettings,
 )
-from sorvolo.missions.compare.area_heights import with_height_changes
 from sorvolo.missions.compare.flights import _without_heights
+from sorvolo.missions.compare.report import with_height_changes
 from sorvolo.missions.compare.run import _earlier_pictures
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.heights.measure import (

@@ -22,7 +22,6 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Mask, PointsM
 from sorvolo.geometry.summary import median_of_known
 from sorvolo.heights.field import standing
-from sorvolo.missions.compare.area_heights import with_height_changes
 from sorvolo.missions.compare.extension import MapExtension
 from sorvolo.missions.compare.flight_changes import ComparePlan, FlightChanges
 from sorvolo.missions.compare.objects import ComparisonObjects
@@ -32,6 +31,7 @@ from sorvolo.missions.compare.report import (
     comparison_warnings,
     flight_notices,
     flight_summary,
+    with_height_changes,
 )
 from sorvolo.missions.compare.whole_flight import WholeFlight
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
