@@ -86,7 +86,9 @@ def compare(folder: Path, name: str, length_m: int, m_per_px: float | None, seed
     )
     simulation, site = folder / "simulation", folder / "site"
     list(simulate_site(simulation, settings))
-    flights = [next(path.glob("*.mp4"), path) for path in sorted(simulation.glob("flight*"))]
+    flights = [
+        next(path.glob("*.mp4"), path / "photos") for path in sorted(simulation.glob("flight*"))
+    ]
     camera, mapping = simulation / "camera.xml", MapSettings(model="none", m_per_px=m_per_px)
     list(map_flights(flights[:1], site, mapping, camera=camera))
     with mock.patch.object(run, "FlightChanges", Recorder):

@@ -287,7 +287,10 @@ class EvidenceMap:
                 continue
             window = laid.window.part(part)
             if owners:
-                number = self._all_in_one(owners)
+                # several whose ground has become one are one candidate, the oldest
+                for younger in owners[1:]:
+                    self._merge(owners[0], younger)
+                number = owners[0]
             elif self._may_begin(kept_view, earlier, evidence, part, cells):
                 number = self._forgotten_at(window, cells)
                 if not number:
@@ -343,12 +346,6 @@ class EvidenceMap:
         for each in earlier:
             candidate.recall(each, cells, self._cell_m)
         return candidate.number
-
-    def _all_in_one(self, numbers: Sequence[int]) -> int:
-        """Make one candidate, under the lowest number, of several whose ground has become one."""
-        for younger in numbers[1:]:
-            self._merge(numbers[0], younger)
-        return numbers[0]
 
     def _merge(self, number: int, gone: int) -> None:
         older, younger = self._found[number], self._found[gone]

@@ -37,7 +37,9 @@ def object_at(change: Change, objects: Sequence[MapObject]) -> str:
     "" where there is none; what moves is left out.
     """
     best, best_cost = "", np.inf
-    centre_m = _middle(change.outline_m)
+    centre_m = np.asarray(
+        (change.outline_m.min(axis=0) + change.outline_m.max(axis=0)) / 2, np.float64
+    )
     for each in objects:
         if each.moving:
             continue
@@ -104,7 +106,11 @@ def class_of_change(
     changed_px += [left_px, top_px, left_px, top_px]
     best, best_score = "", 0.0
     for box_px, name, score in zip(seen.boxes_px, seen.names, seen.scores):
-        share = _common_share(np.asarray(box_px, np.float64), changed_px)
+        # What two boxes have in common, as a share of the smaller one.
+        one = np.asarray(box_px, np.float64)
+        low, high = np.maximum(one[:2], changed_px[:2]), np.minimum(one[2:], changed_px[2:])
+        areas = np.prod(one[2:] - one[:2]), np.prod(changed_px[2:] - changed_px[:2])
+        share = float(np.prod(np.clip(high - low, 0, None)) / max(min(areas), 1e-9))
         if score < LENIENT * thresholds[name] or share < _LEAST_SHARE:
             continue
         if share * score > best_score:
@@ -117,17 +123,6 @@ def _outside_m(outline_m: PointsM, place_m: Floats) -> float:
     ring = np.ascontiguousarray(outline_m - outline_m[0], np.float32)
     east, north = place_m - outline_m[0]
     return -float(cv2.pointPolygonTest(ring, (float(east), float(north)), True))
-
-
-def _middle(outline_m: PointsM) -> Floats:
-    return np.asarray((outline_m.min(axis=0) + outline_m.max(axis=0)) / 2, np.float64)
-
-
-def _common_share(one: Floats, other: Floats) -> float:
-    """What two boxes have in common, as a share of the smaller one."""
-    low, high = np.maximum(one[:2], other[:2]), np.minimum(one[2:], other[2:])
-    areas = np.prod(one[2:] - one[:2]), np.prod(other[2:] - other[:2])
-    return float(np.prod(np.clip(high - low, 0, None)) / max(min(areas), 1e-9))
 
 
 _HAS_BEFORE = (ChangeKind.DISAPPEARED, ChangeKind.REPLACED)
