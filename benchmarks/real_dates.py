@@ -9,7 +9,7 @@ from 117 m, or a video of a shorter way, 5 frames/s; tilt of 2 degrees rms, GPS 
 without) and compared with that map. What
 changed is real; the pictures hold no relief, for orthophotos are flat. Photos state the date, and the hour at which
 the sun stands at the simulated place where the orthophoto's shadows have it (by the edges of an office's shadow, to
-about 5 degrees; 2024-03-12 was overcast, its hour is a guess). Runs before decision 0056 stated other times, by which
+about 5 degrees; 2024-03-12 was overcast, its hour is a guess). Earlier runs stated other times, by which
 the sun moved 2 degrees from date to date.
 
 **Views.** Where each later photo is on the earlier orthophoto is known: from the simulated camera to the later
@@ -25,8 +25,8 @@ pixels of the earlier orthophoto, drawn by hand with the later one laid over the
 large, before anything was scored. On the second pair they are boxes mostly, and not all that changed was drawn. On the
 third all soil was driven over and most sunlight comes from another side: tracks, shadows and leaves were not drawn;
 what a later photo shows less than half of was left out. The fourth pair, 2023-10-14/2024-02-24, is held out (for
-changes; its views were looked at for decision 0087): 582
-changes, drawn after decision 0085 by someone who saw the pictures alone and no report; a building rose in these four
+changes; its views were looked at during development): 582
+changes, drawn by someone who saw the pictures alone and no report; a building rose in these four
 months, and small goods were drawn one by one, so that most of the ground is changed and shares are lower. A thing is
 found when an event overlaps it by at least a quarter of the smaller of the two areas and is at most ten times as
 large. An area (over 100 m2) is found when one event covers at least 40 % of it; the share that all events together

@@ -1,7 +1,7 @@
-"""What MkDocs does beside docs/: the README is the front page, links to other files of the repository are checked.
+"""Hooks of MkDocs: the README becomes the front page, and links to files of the repository are checked.
 
-Pages that lie beside docs/ (README, ARCHITECTURE, CONTRIBUTING, CHANGELOG) become pages of the site. Any other link out
-of docs/ must lead to something in the repository, else it is a broken link; on the site its text stays.
+README, ARCHITECTURE, CONTRIBUTING and CHANGELOG become pages of the site. Any other link out of docs/ must name a file of
+the repository, else it is broken; on the site its text stays.
 """
 
 import logging
@@ -35,7 +35,7 @@ def on_config(config: Any) -> Any:
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Add the pages that lie beside docs/."""
+    """Add the pages that are not in docs/."""
     for name, page in PAGES.items():
         text = _relinked((ROOT / name).read_text(encoding="utf-8"), "", page)
         files.append(File.generated(config, page, content=text))
@@ -52,7 +52,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 
 def _relinked(markdown: str, folder: str, page: str) -> str:
-    """The text of a page whose source lies in `folder` of the repository, its links made for `page` of the site."""
+    """Return the text of a page in `folder` of the repository with its links made for `page` of the site."""
 
     def relink(found: re.Match[str]) -> str:
         mark, text, target = found.groups()
@@ -63,7 +63,7 @@ def _relinked(markdown: str, folder: str, page: str) -> str:
         inside = PAGES.get(name) or (name.removeprefix("docs/") if name.startswith("docs/") else "")
         if inside and (ROOT / name).is_file():
             return f"{mark}[{text}]({posixpath.relpath(inside, posixpath.dirname(page) or '.')}{hash_mark}{anchor})"
-        if name == "docs/decisions":
+        if name in {"docs", "docs/decisions"}:
             return text
         if not (ROOT / name).exists():
             _log.warning("%s links to %s, which is not in the repository", page, target)

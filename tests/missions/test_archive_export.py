@@ -154,7 +154,7 @@ def test_the_rows_are_stac_items_again(table: Path) -> None:
 
 
 def _queries() -> Iterator[str]:
-    text = (ROOT / "docs/archive-search.md").read_text()
+    text = (ROOT / "docs/archives.md").read_text()
     return (each[1] for each in re.finditer(r"```sql\n(.*?)```", text, re.DOTALL))
 
 

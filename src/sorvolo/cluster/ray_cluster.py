@@ -175,7 +175,7 @@ def _demand_listening(name: str, address: str) -> None:
             else "`ray start` noted it, or RAY_ADDRESS names it: `ray stop` forgets one that is gone"
         )
         raise SettingsError(
-            f"--executor {name}: no Ray cluster answers at {address} ({first_line(error)}); {how} (docs/cluster.md)"
+            f"--executor {name}: no Ray cluster answers at {address} ({first_line(error)}); {how} (docs/batch.md)"
         ) from None
 
 

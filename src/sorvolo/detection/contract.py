@@ -13,7 +13,7 @@ METADATA_KEY = "sorvolo"
 """The key among an ONNX file's `metadata_props` under which the JSON lies."""
 
 FORMAT = 2
-"""The newest contract that this version reads; docs/detector.md lists its fields. 2 brought `calibration`."""
+"""The newest contract that this version reads; docs/model-file.md lists its fields. 2 brought `calibration`."""
 
 # px: what a picture's sides are multiples of, in a model whose file does not state it
 _FALLBACK_STRIDE = 32
@@ -134,7 +134,7 @@ def info_from_metadata(metadata: Mapping[str, str], where: str) -> ModelInfo:
     if text is None:
         raise InputError(
             f"{where} is an ONNX model, but none of Sorvolo's: it has no '{METADATA_KEY}' metadata that names its "
-            "classes; train and export one with `sorvolo train`, or add the metadata as docs/detector.md shows"
+            "classes; train and export one with `sorvolo train`, or add the metadata as docs/model-file.md shows"
         )
     try:
         fields = json.loads(text)

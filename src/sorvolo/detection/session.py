@@ -66,7 +66,7 @@ class Session:
         """What is in one picture, (H, W, 3) RGB of any size, shown `scale` times as large; in its own pixels.
 
         A model of one input size sees it no larger than that. Raises InputError where the model's answer breaks the
-        contract of docs/detector.md.
+        contract of docs/model-file.md.
         """
         height, width = picture.shape[:2]
         with self._lock:

@@ -1,5 +1,5 @@
 """What stands between features and proposals: the standard convolution, the thesis's nine Inception modules, and
-residual stacks of ours (docs/detector.md describes how Table 3.2 was read)."""
+residual stacks of ours (docs/thesis.md describes how Table 3.2 was read)."""
 
 from collections.abc import Sequence
 from typing import Literal

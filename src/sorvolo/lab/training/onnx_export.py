@@ -46,7 +46,7 @@ class ExportCheck:
 
 
 def export_onnx(model: FasterRCNN, info: dict[str, Any], *, regions: int | None = None) -> bytes:
-    """The model as an ONNX file's bytes, with `info` as its "sorvolo" metadata (docs/detector.md has the fields).
+    """The model as an ONNX file's bytes, with `info` as its "sorvolo" metadata (docs/model-file.md has the fields).
 
     `regions`: how many the head looks at in a picture, None for as many as the model's own `Reach` has. The file
     finds no more objects than that. Raises SettingsError when `info` names no classes or `regions` is below 1.

@@ -26,7 +26,7 @@ _RATIOS = (0.5, 1.0, 2.0)  # of height to width: Faster R-CNN's (Ren et al. 2015
 _ACCURATE_ANCHORS = tuple(
     AnchorSettings(sizes, _RATIOS) for sizes in ((10, 16), (25, 40), (63, 100), (160, 250))
 )
-_THESIS_REGIONS = 75  # for six frames a second on two cores; crowds need more (docs/detector.md)
+_THESIS_REGIONS = 75  # for six frames a second on two cores; crowds need more (docs/train.md)
 _THESIS_ANCHORS = (
     AnchorSettings((16, 32, 64, 128, 256), _RATIOS),
 )  # of Faster R-CNN, an octave finer on either side
