@@ -32,7 +32,7 @@ _VERSION = "1.1.0"  # of stac-geoparquet and of GeoParquet
 _ROWS = 20_000  # in a row group: a reader skips those whose boxes lie elsewhere
 _BOX = ("xmin", "ymin", "xmax", "ymax")
 _ASSETS = ("map", "preview", "report", "frames", "heights", "orthophoto", "before", "after", "crop")
-_PROPERTIES = {  # the items' own, with their types (docs/archive-search.md)
+_PROPERTIES = {  # the items' own, with their types (docs/archives.md)
     "sorvolo:kind": "string",
     "sorvolo:site": "string",
     "sorvolo:flight": "string",
