@@ -1,13 +1,8 @@
-"""What tests and benchmarks of batches share: flights that differ though their pictures do not, sites compared, and
-which processes write which sites."""
+"""What tests and benchmarks of batches share: flights that differ though their pictures do not, and sites compared."""
 
 import json
-import os
 import shutil
-from contextlib import suppress
 from pathlib import Path
-
-from sorvolo.store.site.files import LOCK
 
 _EFFORT = (  # of report.json
     "seconds",
@@ -44,26 +39,3 @@ def content(site: Path) -> dict[str, bytes]:
             ).encode()
         found[str(path.relative_to(site))] = data
     return found
-
-
-def descendants(pids: set[int]) -> set[int]:
-    """The processes that these started, and those that they started."""
-    parents = {}
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        with suppress(OSError):  # it has ended
-            parents[int(path.parent.name)] = int(path.read_text().rpartition(")")[2].split()[1])
-    found = set(pids)
-    while more := {child for child, parent in parents.items() if parent in found} - found:
-        found |= more
-    return found - pids
-
-
-def written_sites(pid: int, root: Path) -> set[Path]:
-    """The sites below `root` whose lock a process has open."""
-    sites = set()
-    for link in Path(f"/proc/{pid}/fd").glob("*"):
-        with suppress(OSError):
-            opened = Path(os.readlink(link))
-            if opened.name == LOCK and root in opened.parents:
-                sites.add(opened.parent)
-    return sites

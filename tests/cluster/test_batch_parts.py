@@ -7,12 +7,11 @@ from pathlib import Path
 import pytest
 
 from sorvolo.cli.main import main
-from sorvolo.cluster.cost import cost_of
-from sorvolo.cluster.orders import Ending, Outcome, Scouted, answer_of
-from sorvolo.cluster.scout import Unreadable, find_flights, scout
-from sorvolo.cluster.sites import Placed, SiteBy, sites_of
-from sorvolo.cluster.table import TABLE, BatchTable, Row, State
+from sorvolo.cluster.batch import TABLE, BatchTable, Row
+from sorvolo.cluster.executors import Ending
+from sorvolo.cluster.flights import Scouted, find_flights, sites_of
 from sorvolo.errors import InputError, StoreError
+from sorvolo.store.exports.detection_files import claimed_folder
 
 
 def _touch(*paths: Path) -> None:
@@ -67,27 +66,24 @@ def test_folders_without_flights_are_an_error(tmp_path: Path) -> None:
         find_flights([tmp_path / "gone"], tmp_path / "maps")
 
 
-def test_what_cannot_be_read_is_named_in_its_place(tmp_path: Path) -> None:
-    _touch(tmp_path / "1.mp4", tmp_path / "2.mp4")
-    found = scout([tmp_path / "1.mp4", tmp_path / "2.mp4", tmp_path / "gone.mp4"], "", most_tries=3)
-    assert all(isinstance(each, Unreadable) and not each.crashed for each in found)
-    assert [each.words.split()[0] for each in found if isinstance(each, Unreadable)] == [
-        "1.mp4",
-        "2.mp4",
-        "no",
-    ]
+def test_crops_of_a_watch_are_no_flight(tmp_path: Path) -> None:
+    with claimed_folder(tmp_path / "one-watch", "one", "abc"):
+        pass
+    _touch(*(tmp_path / name / f"{n}.jpg" for name in ("in", "one-watch/objects") for n in (1, 2)))
+    found = find_flights([tmp_path], tmp_path / "maps")
+    assert [each.path.name for each in found] == ["in"]
 
 
-def _placed(name: str, hour: int, south: float, west: float) -> Placed:
+def _placed(name: str, hour: int, south: float, west: float) -> tuple[Path, Scouted]:
     box = (south, west, south + 0.001, west + 0.001)
-    return Placed(Path(f"/flights/{name}.mp4"), Scouted(name, 10, hour * 3_600_000_000_000, box))
+    return Path(f"/flights/{name}.mp4"), Scouted(name, 10, hour * 3_600_000_000_000, box)
 
 
 def test_by_flight_each_has_a_site_of_its_own_name() -> None:
-    one = Placed(Path("/monday/DJI_1.mp4"), Scouted("a", 10, 1, None))
-    other = Placed(Path("/tuesday/DJI_1.mp4"), Scouted("b", 10, 2, None))
-    third = Placed(Path("/tuesday/DJI_2.mp4"), Scouted("c", 10, 3, None))
-    assert sites_of([other, one, third], SiteBy.FLIGHT, {}, {}, ["DJI_2"]) == {
+    one = (Path("/monday/DJI_1.mp4"), Scouted("a", 10, 1, None))
+    other = (Path("/tuesday/DJI_1.mp4"), Scouted("b", 10, 2, None))
+    third = (Path("/tuesday/DJI_2.mp4"), Scouted("c", 10, 3, None))
+    assert sites_of([other, one, third], {}, {}, ["DJI_2"], by_place=False) == {
         "a": "DJI_1",
         "b": "tuesday_DJI_1",
         "c": "tuesday_DJI_2",
@@ -101,8 +97,8 @@ def test_by_place_flights_near_each_other_share_the_site_of_the_first() -> None:
         _placed("far", 7, 45.0, 9.01),
     )
     beside = _placed("beside", 10, 45.0018, 9.0)  # 33 m north of what `later` covers
-    nowhere = Placed(Path("/flights/nowhere.mp4"), Scouted("nowhere", 10, 0, None))
-    assert sites_of([later, first, far, beside, nowhere], SiteBy.PLACE, {}, {}) == {
+    nowhere = (Path("/flights/nowhere.mp4"), Scouted("nowhere", 10, 0, None))
+    assert sites_of([later, first, far, beside, nowhere], {}, {}, by_place=True) == {
         "nowhere": "nowhere",
         "far": "far",
         "first": "first",
@@ -113,10 +109,10 @@ def test_by_place_flights_near_each_other_share_the_site_of_the_first() -> None:
 
 def test_by_place_flights_join_sites_that_exist_and_stay_where_they_are() -> None:
     first, later = _placed("first", 8, 45.0, 9.0), _placed("later", 9, 45.0, 9.0)
-    assert sites_of([later], SiteBy.PLACE, {}, {"field": (45.0, 9.0, 45.01, 9.01)}) == {
+    assert sites_of([later], {}, {"field": (45.0, 9.0, 45.01, 9.01)}, by_place=True) == {
         "later": "field"
     }
-    found = sites_of([first, later], SiteBy.PLACE, {"first": "its-own"}, {})
+    found = sites_of([first, later], {"first": "its-own"}, {}, by_place=True)
     assert found == {"first": "its-own", "later": "its-own"}
 
 
@@ -129,22 +125,22 @@ def _row(fingerprint: str, **values: object) -> Row:
 def test_a_table_holds_the_newest_row_of_each_flight_whatever_was_torn(tmp_path: Path) -> None:
     with BatchTable.open(tmp_path) as table:
         table.put(_row("a"))
-        done = table.put(_row("a", state=State.DONE, words="8 of 8 frames matched", cpu_s=2.5))
-        table.put(_row("b", state=State.RUNNING))
+        done = table.put(_row("a", state="done", words="8 of 8 frames matched", cpu_s=2.5))
+        table.put(_row("b", state="running"))
     with (tmp_path / TABLE).open("ab") as file:
         file.write(b'{"source": "/flights/c.mp4", "mis')
     with BatchTable.open(tmp_path) as table:
         assert table.get(("map", "a")) == done
-        assert [row.state for row in table] == [State.DONE, State.RUNNING]
+        assert [row.state for row in table] == ["done", "running"]
     assert len((tmp_path / TABLE).read_bytes().splitlines()) == 3
 
 
 def test_a_flight_that_can_be_read_now_has_one_row(tmp_path: Path) -> None:
     with BatchTable.open(tmp_path) as table:
-        table.put(replace(_row("a"), scouted=None, state=State.FAILED))
+        table.put(replace(_row("a"), scouted=None, state="failed"))
         table.put(_row("a"))
     with BatchTable.open(tmp_path) as table:
-        assert [row.state for row in table] == [State.WAITING]
+        assert [row.state for row in table] == ["waiting"]
 
 
 @pytest.mark.parametrize(
@@ -181,30 +177,12 @@ def test_roots_that_cannot_be_used(tmp_path: Path) -> None:
         BatchTable.open(tmp_path / "maps")
 
 
-def test_costs_are_those_of_flights_so_far_and_double_after_a_crash() -> None:
-    ended = [
-        _row("a", state=State.DONE, peak_memory_mb=500.0, cpu_s=20.0, seconds=10.0),
-        _row("b", state=State.DOUBTFUL, peak_memory_mb=1500.0, cpu_s=20.0, seconds=10.0),
-        _row("c", state=State.SET_ASIDE, peak_memory_mb=9000.0, cpu_s=1.0, seconds=10.0),
-    ]
-    assert cost_of(_row("d"), []).memory_mb == 1000
-    assert (cost_of(_row("d"), ended).cpus, cost_of(_row("d"), ended).memory_mb) == (
-        2.0,
-        pytest.approx(1800),
-    )
-    assert cost_of(_row("d", crashes=2), ended).memory_mb == pytest.approx(7200)
-    live = _row("e", source="rtsp://drone/live")
-    assert cost_of(live, ended).cpus == 1  # none was live
-    watched = replace(live, state=State.DONE, peak_memory_mb=230.0, cpu_s=9.0, seconds=60.0)
-    idle = replace(watched, cpu_s=0.1)
-    assert [cost_of(live, [*ended, each]).cpus for each in (watched, idle)] == [0.2, 0.1]
-    assert cost_of(_row("d"), [*ended, watched]).cpus == 2
-
-
 def test_the_tries_of_a_flight_add_up() -> None:
-    crashed = Ending(Outcome.CRASHED, "killed", "", 3.0, 2.0, 900.0, "one")
-    row = _row("a", tries=1).after(crashed, State.WAITING, "killed")
-    row = row.after(Ending(Outcome.DONE, "fine", "a", 4.0, 3.0, 400.0, "two"), State.DONE, "fine")
+    crashed = Ending("crashed", "killed", "", 3.0, 2.0, 900.0, "one")
+    row = _row("a", tries=1).after(crashed)
+    assert (row.state, row.crashes) == ("waiting", 1)
+    assert row.after(crashed).state == "set aside"
+    row = row.after(Ending("done", "fine", "a", 4.0, 3.0, 400.0, "two"))
     assert (row.seconds, row.cpu_s, row.peak_memory_mb, row.host, row.flight) == (
         7.0,
         5.0,
@@ -214,22 +192,16 @@ def test_the_tries_of_a_flight_add_up() -> None:
     )
 
 
-def test_what_libraries_print_is_no_answer() -> None:
-    assert answer_of(b'{"ended": {"outcome": "done"}}') == ("ended", {"outcome": "done"})
-    assert [answer_of(each) for each in (b"[h264] error", b"{}", b'{"alive": 1}', b"[1]", b"")] == [
-        None
-    ] * 5
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
         (["--executor", "slurm"], "--executor slurm: give local, ray, or ray://HOST:PORT"),
         (["--workers", "0"], "--workers 0: at least 1 is needed"),
-        (["--tries", "0"], "--tries 0: at least 1 is needed"),
-        (["--stall", "0"], "--stall 0: more than 0"),
         (["--gsd", "-1"], "--gsd"),
         (["--model", "nosuch"], "nosuch"),
+        (["--mission", "watch", "--site-by", "place"], "--mission watch makes no sites"),
+        (["--mission", "watch", "--model", "none"], "--mission watch needs a detector"),
+        (["--mission", "watch", "--gsd", "0.1"], "--gsd is for maps"),
     ],
 )
 def test_options_out_of_range(

@@ -19,8 +19,8 @@ from sorvolo.capture.live.growing import ENDED_SUFFIX
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.station.client import StreamClient, StreamSettings, stream_url
 from sorvolo.station.footage import open_footage
-from sorvolo.station.incomplete import cut_off
-from sorvolo.station.orders import Order
+from sorvolo.station.orders import RunOrder
+from sorvolo.station.run_process import cut_off
 from sorvolo.station.settings import StationLimits
 from sorvolo.station.spool import Spool
 from waiting import wait_for
@@ -221,8 +221,10 @@ def is_announced(station: Served) -> bool:
     return any('"is_low":true' in row["data"] for row in rows)
 
 
-def order_of(source: str, floor_gb: float) -> Order:
-    return Order("1", "map", "new", "new", source, "", "", "", "scout", {}, floor_gb=floor_gb)
+def order_of(source: str, floor_gb: float) -> RunOrder:
+    return RunOrder(
+        run="1", mission="map", site="new", source=source, stream="scout", floor_gb=floor_gb
+    )
 
 
 def test_what_a_cut_flight_lacks(tmp_path: Path) -> None:

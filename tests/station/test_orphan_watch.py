@@ -11,9 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from sorvolo.station import worker
-from sorvolo.station.orders import MissionOptions, Order
-from sorvolo.station.orphan_watch import ended_when_orphaned, why_orphaned
+from sorvolo.missions.worker import Done
+from sorvolo.station import run_process
+from sorvolo.station.orders import MissionOptions, RunOrder
+from sorvolo.station.run_process import ended_when_orphaned, why_orphaned
 from sorvolo.station.state import StationState
 from waiting import wait_for
 
@@ -26,17 +27,13 @@ def folder(tmp_path: Path) -> Path:
     found = tmp_path / "station" / "runs" / RUN
     found.mkdir(parents=True)
     options = MissionOptions(model="none").model_dump(mode="json")
-    Order(
-        RUN,
-        "map",
-        "new",
-        str(tmp_path / "new"),
-        f"follow:{tmp_path}",
-        "",
-        "",
-        str(found),
-        "",
-        options,
+    RunOrder(
+        run=RUN,
+        mission="map",
+        site=str(tmp_path / "new"),
+        source=f"follow:{tmp_path}",
+        folder=str(found),
+        options=options,
     ).write(found)
     with closing(StationState.open(tmp_path / "station")) as state, state.changing() as connection:
         connection.execute(
@@ -84,7 +81,7 @@ def test_a_process_without_a_record_states_why_it_ended(folder: Path) -> None:
     forget(folder)
     with (folder / "log.txt").open("wb") as log:
         process = subprocess.Popen(
-            [sys.executable, "-m", "sorvolo.station.worker", str(folder)],
+            [sys.executable, "-m", "sorvolo.station.run_process", str(folder)],
             stderr=log,
             start_new_session=True,
         )
@@ -104,11 +101,11 @@ def test_a_mission_that_fails_because_its_folder_is_gone_states_that(
     """Its own writing may fail before the missing folder is noticed: a traceback would hide the reason."""
     monkeypatch.setattr(signal, "signal", lambda *_: None)  # those of the tests stay
 
-    def writing(*_: object) -> tuple[str, str]:
+    def writing(*_: object) -> Done:
         shutil.rmtree(folder)
         (folder / "detections.jsonl").write_text("{}")
-        return "", ""
+        return Done("")
 
-    monkeypatch.setattr(worker, "_flown", writing)
-    assert worker.main(folder) == 1
+    monkeypatch.setattr(run_process, "fly", writing)
+    assert run_process.main(folder) == 1
     assert capsys.readouterr().err == "the folder of this run was taken away; stopped\n"

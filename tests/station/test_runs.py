@@ -20,7 +20,7 @@ from small_flights import simulate_into, small_flight
 from sorvolo.errors import StoreError
 from sorvolo.station import runs as runs_module
 from sorvolo.station.app import station_app
-from sorvolo.station.orders import InputWish, Order, RunWish
+from sorvolo.station.orders import InputWish, RunOrder, RunWish
 from sorvolo.station.runs import Run, Runs
 from sorvolo.station.settings import StationLimits, StationSettings
 from sorvolo.station.state import utc_now
@@ -195,7 +195,7 @@ def test_a_mission_that_cannot_be_noted_does_not_run(
     spawned: list[subprocess.Popen[bytes]] = []
     started = runs_module._spawned
 
-    def spawn(folder: Path, order: Order) -> "subprocess.Popen[bytes]":
+    def spawn(folder: Path, order: RunOrder) -> "subprocess.Popen[bytes]":
         spawned.append(started(folder, order))
         return spawned[-1]
 

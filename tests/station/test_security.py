@@ -1,11 +1,11 @@
 """Tests that try to get in: forged hosts and origins, guessed tokens, paths, links, streams of the own network."""
 
 import os
+import signal
 import socket
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -15,9 +15,9 @@ from typer.testing import CliRunner
 
 from sorvolo.cli.main import app as command
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.station import worker
+from sorvolo.station import run_process
 from sorvolo.station.app import station_app
-from sorvolo.station.orders import SOURCE_VARIABLE, Order
+from sorvolo.station.orders import SOURCE_VARIABLE, RunOrder
 from sorvolo.station.problems import Problem
 from sorvolo.station.security import address_group
 from sorvolo.station.server import server_config
@@ -583,19 +583,15 @@ def test_a_missions_error_holds_no_password(
 ) -> None:
     """FFmpeg's own errors state the whole address, and every viewer reads why a mission failed."""
     source = "rtsp://me:secretword@93.184.216.34/live?token=hidden"
-    Order("r", "watch", "field", str(tmp_path), source, "", "", str(tmp_path), "", {}).write(
-        tmp_path
-    )
+    RunOrder(run="r", mission="watch", site=str(tmp_path), source=source).write(tmp_path)
 
     def fail(*_: object) -> str:
         raise ValueError(f"Invalid data found when processing input: {source!r}")
 
-    monkeypatch.setitem(worker._MISSIONS, "watch", fail)
-    monkeypatch.setattr(
-        worker, "_Stop", lambda _: SimpleNamespace(until=None, at_once=None, why="")
-    )
+    monkeypatch.setitem(run_process.MISSIONS, "watch", fail)
+    monkeypatch.setattr(signal, "signal", lambda *_: None)  # those of the tests stay
     monkeypatch.setenv(SOURCE_VARIABLE, source)
-    assert worker.main(tmp_path) == 1
+    assert run_process.main(tmp_path) == 1
     text = (tmp_path / "journal.jsonl").read_text() + capsys.readouterr().err
     assert (
         text.count("93.184.216.34/live") == 2 and "secretword" not in text and "hidden" not in text
@@ -607,12 +603,12 @@ def test_a_mission_gets_a_streams_password_by_its_environment_alone(
 ) -> None:
     """Its children do not; what the environment holds of another order is left alone."""
     source = "rtsp://me:secretword@93.184.216.34/live?token=hidden"
-    order = Order("r", "watch", "field", str(tmp_path), source, "", "", str(tmp_path), "", {})
+    order = RunOrder(run="r", mission="watch", site=str(tmp_path), source=source)
     order.write(tmp_path)
     assert (
         "secretword" not in (text := (tmp_path / "order.json").read_text()) and "hidden" not in text
     )
     monkeypatch.setenv(SOURCE_VARIABLE, source)
-    assert Order.read(tmp_path).source == source and SOURCE_VARIABLE not in os.environ
+    assert RunOrder.read(tmp_path).source == source and SOURCE_VARIABLE not in os.environ
     monkeypatch.setenv(SOURCE_VARIABLE, "rtsp://me:pw@192.0.2.1/else")
-    assert Order.read(tmp_path).source == "rtsp://93.184.216.34/live"
+    assert RunOrder.read(tmp_path).source == "rtsp://93.184.216.34/live"

@@ -1,476 +1,518 @@
-"""A mission over many flights: each is one retried task; a table keeps its result through any kill."""
+"""A mission over many flights, a process each. A table keeps what became of each flight through any kill.
+
+`batch.jsonl` holds a row for each change, the newest of a flight last; `docs/formats.md` has its fields.
+"""
 
 import hashlib
+import json
+import os
+import socket
 import time
 from collections import Counter
-from collections.abc import Callable, Generator, Mapping, Sequence, Set
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TypeGuard
+from typing import Any, Literal, Self
 
 import sorvolo
-from sorvolo.cluster.cost import CostSettings, cost_of
-from sorvolo.cluster.executor import Executor, Key
-from sorvolo.cluster.orders import Ending, FlightWish, Mission, Order, Outcome, Scouted, WatchWish
-from sorvolo.cluster.scout import FoundFlight, Unreadable, find_flights, scout
-from sorvolo.cluster.sites import Placed, SiteBy, existing_site, existing_sites, sites_of
-from sorvolo.cluster.table import FINAL, BatchTable, Row, State
-from sorvolo.cluster.watches import (
-    ENDING,
-    existing_watches,
-    is_watched,
-    watch_outputs,
-    watch_settings,
+from sorvolo.cluster.executors import LOCK, Ending, Executor
+from sorvolo.cluster.flights import (
+    FoundFlight,
+    Scouted,
+    existing_site,
+    find_flights,
+    sites_of,
 )
-from sorvolo.detection.models import demand_searching, find_model
-from sorvolo.detection.session import read_info
-from sorvolo.errors import SettingsError
+from sorvolo.errors import SettingsError, StoreError
 from sorvolo.missions.flight.software import software
+from sorvolo.missions.worker import Order
+from sorvolo.store.atomic import atomic_write_bytes, writing
+from sorvolo.store.exports.detection_files import REPORT, find_watched
+from sorvolo.store.locks import take_lock
+from sorvolo.store.site.catalogue import utc_now
+from sorvolo.store.site.catalogue_place import is_site
 
+TABLE = "batch.jsonl"
+WATCH_ENDING = "-watch"
+"""Of the folder of a watch's results, after the flight's name."""
 
-@dataclass(frozen=True)
-class RestartSettings:
-    """When the process of a live stream that died is started again, and a flight whose database was out of reach."""
+_HEAD = {"made_by": "sorvolo batch", "format": 1}
+_MOST_TRIES = 2  # that end a flight's process; then it is set aside
+_ENDING_S = 10.0  # how long missions of a batch that was killed may take to end
 
-    settled_s: float = (
-        60.0  # one that lived so long did not die of its beginning: its tries are counted anew
-    )
-    longest_wait_s: float = 60.0  # before the next start; the waits are 1 s, 2 s, 4 s and so on
-    patience_s: float = (
-        900.0  # a database or store that is restored from its backup; then the flight has failed
-    )
-
-    def wait_s(self, starts: int) -> float:
-        """The wait after this many starts in a row that ended badly."""
-        return min(self.longest_wait_s, 2.0 ** (starts - 1))
+FINAL = frozenset({"done", "doubtful", "set aside"})
+"""States that stand as long as the flight's files and what is asked for of it are the same."""
 
 
 @dataclass(frozen=True)
 class BatchSettings:
-    """How a batch treats its flights."""
+    """What a batch does with each flight; everything else is as the mission's own defaults.
 
-    wish: FlightWish = FlightWish()  # noqa: RUF009 (frozen)
-    site_by: SiteBy = SiteBy.FLIGHT
-    most_tries: int = 3  # that end the process of a flight's worker; then it is set aside
-    stall_s: float = 300.0  # without an answer or any work: the worker is ended
-    retries: bool = False  # flights that were set aside before are tried again
-    near_m: float = (
-        50.0  # from a site's ground: a drone sees no less than half of that beside its track
-    )
-    costs: CostSettings = CostSettings()  # noqa: RUF009 (frozen)
-    restarts: RestartSettings = RestartSettings()
+    `camera` is what --camera takes, `m_per_px` the ground resolution of new maps (None: the frames' own). `by_place`:
+    flights near each other share a site. `retries`: flights that were set aside are tried again.
+    """
+
+    mission: Literal["map", "compare", "search", "watch"] = "map"
+    camera: str = ""
+    model: str = "default"
+    m_per_px: float | None = None
+    by_place: bool = False
+    retries: bool = False
 
     def __post_init__(self) -> None:
-        if self.most_tries < 1:
-            raise SettingsError(f"--tries {self.most_tries}: at least 1 is needed")
-        if not self.stall_s > 0:
-            raise SettingsError(f"--stall {self.stall_s:g}: more than 0 seconds are needed")
-        self._check_watch()
-        if self.wish.m_per_px is not None:
-            from sorvolo.missions.flight.settings import MapSettings  # which takes long to import
+        from sorvolo.detection.models import demand_searching, find_model
+        from sorvolo.detection.session import read_info
+        from sorvolo.missions.flight.settings import MapSettings
 
-            MapSettings(m_per_px=self.wish.m_per_px)  # states what is out of range
-        if self.wish.model not in ("none", "default"):
-            demand_searching(read_info(find_model(self.wish.model)))
-        if self.wish.copy_to:
-            from sorvolo.missions.site.copy import open_end
-
-            open_end(f"{self.wish.copy_to}/site")
-
-    def _check_watch(self) -> None:
-        wish = self.wish
-        if wish.mission is not Mission.WATCH:
-            if wish.watch != WatchWish():
-                raise SettingsError(
-                    "--classes, --least-score, --fps, --save, --cot and --alert-... are for --mission watch; leave "
-                    f"them out, --mission {wish.mission} takes none"
-                )
+        MapSettings(m_per_px=self.m_per_px)  # states what is out of range
+        if self.model not in ("none", "default"):
+            demand_searching(read_info(find_model(self.model)))
+        if self.mission != "watch":
             return
-        if self.site_by is not SiteBy.FLIGHT:
+        if self.by_place:
             raise SettingsError("--mission watch makes no sites: leave --site-by out")
-        if wish.model == "none":
+        if self.model == "none":
             raise SettingsError("--mission watch needs a detector: leave --model none out")
-        if wish.m_per_px is not None or wish.copy_to:
-            raise SettingsError("--gsd and --copy-to are for maps; --mission watch makes none")
-        watch_settings(wish.model, wish.watch)
-        watch_outputs(wish.watch, Path())
+        if self.m_per_px is not None:
+            raise SettingsError("--gsd is for maps; --mission watch makes none")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One flight: its files, its site, and what became of it.
+
+    `request` is what is asked for, `stamp` its files', `tries` how often it was begun for this request, of which
+    `crashes` ended its process. Seconds and processor time are of all tries together, the memory is the largest, MB.
+    `state` is "waiting", "running", "done", "doubtful" (to be checked before use), "duplicate" (of another flight),
+    "skipped" (no flight, though it may be taken for one), "failed", or "set aside" (it ended its process each time).
+    """
+
+    source: str
+    mission: str
+    stamp: str
+    request: str
+    scouted: Scouted | None
+    site: str = ""
+    flight: str = ""
+    state: str = "waiting"
+    words: str = ""
+    tries: int = 0
+    crashes: int = 0
+    seconds: float = 0.0
+    cpu_s: float = 0.0
+    peak_memory_mb: float = 0.0
+    host: str = ""
+    changed_utc: str = ""
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """The mission and the flight, by its fingerprint, or by its path while that is unknown."""
+        return self.mission, self.scouted.fingerprint if self.scouted else self.source
+
+    def after(self, ending: Ending) -> Self:
+        """The row after a try; it waits for another one after its first crash."""
+        crashes = self.crashes + (ending.outcome == "crashed")
+        state, words = ending.outcome, ending.words
+        if state == "crashed":
+            state = "set aside" if crashes >= _MOST_TRIES else "waiting"
+        if state == "set aside":
+            words = f"set aside after {crashes} tries: {words}"
+        return replace(
+            self,
+            state=state,
+            words=words,
+            crashes=crashes,
+            flight=ending.flight or self.flight,
+            seconds=round(self.seconds + ending.seconds, 3),
+            cpu_s=round(self.cpu_s + ending.cpu_s, 3),
+            peak_memory_mb=max(self.peak_memory_mb, ending.peak_memory_mb),
+            host=ending.host,
+        )
+
+
+class BatchTable:
+    """The rows of a folder of sites, by `Row.key`. Only `put` changes them. A context manager; made by `open`."""
+
+    def __init__(self, root: Path, lock: int, rows: dict[tuple[str, str], Row]) -> None:
+        self.root, self.lock, self._rows = root, lock, rows
+        self._file = (root / TABLE).open("ab")
+
+    @classmethod
+    def open(cls, root: Path) -> Self:
+        """Open the table of a folder, which is made if it is not there, as its only batch.
+
+        Raises StoreError for a folder that another batch works in, that is a site itself or cannot be written, and for
+        a table of another format.
+        """
+        if is_site(root):
+            raise StoreError(
+                f"{root} is a site itself; a batch makes several: name the folder above it, or a new one"
+            )
+        try:
+            with writing(root):
+                root.mkdir(parents=True, exist_ok=True)
+        except (FileExistsError, NotADirectoryError) as error:
+            raise StoreError(
+                f"{root} is a file, a folder was needed; choose another name"
+            ) from error
+        lock = _lock(root)
+        try:
+            rows = _read(root / TABLE)
+            lines = [_HEAD, *map(asdict, rows.values())]
+            atomic_write_bytes(root / TABLE, b"".join(map(_line, lines)))
+            return cls(root, lock, rows)
+        except BaseException:
+            os.close(lock)
+            raise
+
+    def close(self) -> None:
+        """Let go of the folder."""
+        self._file.close()
+        os.close(self.lock)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __iter__(self) -> Iterator[Row]:
+        return iter(list(self._rows.values()))
+
+    def get(self, key: tuple[str, str]) -> Row | None:
+        """The newest row of a flight."""
+        return self._rows.get(key)
+
+    def put(self, row: Row) -> Row:
+        """Keep the newest row of a flight: on the disk when this returns; the row as it is kept."""
+        row = replace(row, changed_utc=utc_now())
+        with writing(self.root / TABLE):
+            self._file.write(_line(asdict(row)))
+            self._file.flush()
+            os.fsync(self._file.fileno())
+        self._rows[row.key] = row
+        return row
+
+
+def _lock(root: Path) -> int:
+    """The right to work in the folder, as a descriptor; a batch that was killed has it until its missions are gone."""
+    path = root / LOCK
+    with writing(path):
+        lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
+    until_s = time.monotonic() + _ENDING_S
+    while not take_lock(lock):
+        holder = os.pread(lock, 1000, 0).decode("utf-8", "replace").strip()
+        pid, _, host = holder.removeprefix("process ").partition(",")[0].partition(" on ")
+        is_gone = host == socket.gethostname() and not Path("/proc", pid).exists()
+        if not is_gone or time.monotonic() > until_s:
+            os.close(lock)
+            raise StoreError(
+                f"another batch is running in {root}: {holder or 'its name is not known'}; wait until it ends, or stop it"
+            )
+        time.sleep(0.1)
+    os.ftruncate(lock, 0)
+    words = f"process {os.getpid()} on {socket.gethostname()}, since {utc_now()}"
+    os.pwrite(lock, words.encode(), 0)
+    return lock
+
+
+def _read(path: Path) -> dict[tuple[str, str], Row]:
+    """The newest row of each flight; a last line that a kill tore is passed over."""
+    rows: dict[tuple[str, str], Row] = {}
+    try:
+        lines = path.read_bytes().split(b"\n")
+    except FileNotFoundError:
+        return rows
+    except OSError as error:
+        raise StoreError(f"{path} cannot be read ({error.strerror})") from error
+    for number, line in enumerate(lines):
+        try:
+            plain = json.loads(line) if line else None
+            if number == 0:
+                _check_head(path, plain)
+            elif plain is not None:
+                if (seen := plain["scouted"]) is not None:
+                    seen = Scouted(**{**seen, "box": tuple(seen["box"]) if seen["box"] else None})
+                row = Row(**{**plain, "scouted": seen})
+                rows.pop((row.mission, row.source), None)  # from when its files could not be read
+                rows[row.key] = row
+        except (ValueError, TypeError, KeyError) as error:
+            if number >= len(lines) - 1:
+                break
+            raise StoreError(
+                f"{path}: line {number + 1} is no row of a batch ({error}); move the file away"
+            ) from error
+    return rows
+
+
+def _check_head(path: Path, head: Any) -> None:
+    if not isinstance(head, dict) or head.get("made_by") != _HEAD["made_by"]:
+        raise StoreError(
+            f"{path} is not a table of sorvolo batch; move it away, or choose another --root"
+        )
+    if head != _HEAD:
+        raise StoreError(
+            f"{path} has format {head.get('format')}, this version reads {_HEAD['format']}; use the version that wrote it"
+        )
+
+
+def _line(content: Mapping[str, Any]) -> bytes:
+    return json.dumps(content, ensure_ascii=False).encode("utf-8", "surrogateescape") + b"\n"
 
 
 @dataclass(frozen=True)
 class BatchUpdate:
-    """One event of a batch: its flight, how many of how many are finished, and the names of those that run.
-
-    `found` is what the row's watch has just found, in words.
-    """
+    """One event of a batch: the row that changed, how many flights of how many are through, and what runs."""
 
     task: str
     done: int
     total: int
     row: Row | None = None
-    is_known: bool = False  # it was finished before this batch
+    is_known: bool = False  # it was through before this batch
     running: tuple[str, ...] = ()
-    found: str = ""
 
 
 @dataclass(frozen=True)
 class BatchReport:
-    """All flights of a batch and their results; those in `known` were finished before it began."""
+    """All flights of a batch and their results; those in `known` were through before it began."""
 
     rows: tuple[Row, ...]
-    known: frozenset[Key]
+    known: frozenset[tuple[str, str]]
     seconds: float
     tries: int
     crashes: int
 
     def counts(self) -> dict[str, int]:
-        """How many flights ended in each state; "known" are those that were finished before."""
-        found = Counter(
-            "known" if row.key in self.known and row.state is State.DONE else row.state.value
+        """How many flights ended in each state; "known" are those that were through before."""
+        names = [
+            "known" if row.key in self.known and row.state == "done" else row.state
             for row in self.rows
-        )
-        return {name: found[name] for name in ("known", *State) if found[name]}
+        ]
+        return dict(sorted(Counter(names).items()))
 
 
 def run_batch(
     places: Sequence[Path],
     root: Path,
     settings: BatchSettings,
-    executor_of: Callable[[BatchTable], AbstractContextManager[Executor]],
+    open_executor: Callable[[BatchTable], AbstractContextManager[Executor]],
 ) -> Generator[BatchUpdate, None, BatchReport]:
     """Do the mission over all flights in these folders, each in a site below `root`; yields what happens.
 
-    `executor_of` makes what runs the tries, once the table is open. A flight that was through before, with the same
-    files, wish and version, is left out. Killed, or closed, at any moment, the same call goes on: what was through is
-    known, what ran is taken up from its journal. Raises InputError for folders without flights, StoreError for a root
-    that cannot be used or that another batch works in, SettingsError for an executor that is not there.
+    A flight that was through before, with the same files, request and version, is left out. Killed, or closed, at any
+    moment, the same call goes on: what ran is taken up from its journal. Raises InputError for folders without
+    flights, StoreError for a root that cannot be used, SettingsError for an executor that is not there.
     """
-    started_s = time.monotonic()
+    started_s, tries, crashes = time.monotonic(), 0, 0
     found = find_flights(places, root)
-    with BatchTable.open(root) as table, executor_of(table) as executor:
-        through = frozenset(row.key for row in table if row.state in FINAL)
-        rows = yield from _listed(found, table, settings)
-        rows = _with_sites(rows, table, settings)
-        known = frozenset(row.key for row in rows if row.state in FINAL and row.key in through)
-        run = _Run(rows, table, settings, executor)
-        for row in rows:
-            if row.state is not State.WAITING:
-                yield run.update(row, is_known=row.key in known)
-        yield from run.through()
-        return BatchReport(
-            tuple(run.rows[row.key] for row in rows),
-            known,
-            round(time.monotonic() - started_s, 3),
-            run.tries,
-            run.crashes,
-        )
-
-
-class _Run:
-    """The flights on their way: those of one site one after the other, sites beside each other."""
-
-    def __init__(
-        self, rows: Sequence[Row], table: BatchTable, settings: BatchSettings, executor: Executor
-    ) -> None:
-        self.rows = {row.key: row for row in rows}
-        self.tries = self.crashes = 0
-        self._table, self._settings, self._executor = table, settings, executor
-        self._late = _Latecomers(settings.restarts)
-        self._waiting: dict[str, list[Row]] = {}  # by site, in order of time
-        for row in sorted(rows, key=_moment):
-            if row.state is State.WAITING:
-                self._waiting.setdefault(row.site, []).append(row)
-
-    def update(self, row: Row | None = None, *, is_known: bool = False) -> BatchUpdate:
-        """How far the batch is."""
-        done = sum(each.state not in (State.WAITING, State.RUNNING) for each in self.rows.values())
-        running = tuple(_name(each) for each in self.rows.values() if each.state is State.RUNNING)
-        return BatchUpdate("flights", done, len(self.rows), row, is_known, running)
-
-    def through(self) -> Generator[BatchUpdate]:
-        """Try each flight until it is through. Closed on the way, those that run are marked as waiting again."""
-        try:
-            while self._waiting or self._executor.running:
-                if not self._executor.running and not self._due():  # all that wait are out of reach
-                    time.sleep(self._late.wait_s or 0.0)
-                else:
-                    yield from self._side_by_side()
-        finally:
-            for row in [each for each in self.rows.values() if each.state is State.RUNNING]:
-                self._keep(replace(row, state=State.WAITING, words="the batch was stopped"))
-
-    def _side_by_side(self) -> Generator[BatchUpdate]:
-        """Begin what there is room for; one flight, at most, is over when this ends."""
-        while (row := self._next()) is not None:
-            self._start(row)
-            yield self.update()
-        if (ended := self._executor.next_ended(self._late.wait_s)) is not None:
-            key, ending = ended
-            yield self.update(self._end(self.rows[key], ending))
-
-    def _next(self) -> Row | None:
-        """The flight to begin, if there is room for it."""
-        due = self._due()
-        has_room = bool(due) and self._executor.has_room(
-            cost_of(due[0], self._table, self._settings.costs)
-        )
-        return due[0] if has_room else None
-
-    def _due(self) -> list[Row]:
-        """The next flight of each site that nobody writes and that is in reach, that with most frames before it first."""
-        busy = {self.rows[key].site for key in self._executor.running}
-        free = [
-            queue
-            for site, queue in self._waiting.items()
-            if site not in busy and self._late.is_due(queue[0].key)
+    with BatchTable.open(root) as table, open_executor(table) as executor:
+        # look into the flights that are new, or whose files changed
+        seen = {(row.source, row.stamp): row.scouted for row in table if row.scouted is not None}
+        rows = [_new_row(flight, settings, seen) for flight in found]
+        given_up = [
+            before
+            for row in rows
+            if (before := table.get(row.key))
+            and before.state == "set aside"
+            and before.request == row.request
+            and not settings.retries
         ]
-        return [queue[0] for queue in sorted(free, key=_all_frames, reverse=True)]
+        left_out = {row.source for row in given_up}
+        queues = {
+            row.source: [row]
+            for row in rows
+            if row.state == "waiting" and row.scouted is None and row.source not in left_out
+        }
+        yield BatchUpdate("looking into flights", 0, len(queues))
+        looked = {row.source: row for row in given_up}
+        for row, ending in _run(queues, _inspecting(settings), executor):
+            if ending is None or row.state == "waiting":
+                continue
+            if row.state == "done":
+                box = ending.inspected["box"]
+                scouted = Scouted(**{**ending.inspected, "box": tuple(box) if box else None})
+                row = replace(_new_row_of(row), scouted=scouted)
+            looked[row.source] = row
+        rows = [looked.get(row.source, row) for row in rows]
 
-    def _take(self, row: Row) -> Row:
-        """The row, no longer waiting."""
-        self._waiting[row.site].remove(row)
-        if not self._waiting[row.site]:
-            del self._waiting[row.site]
-        self.tries += 1
-        return self._keep(replace(row, state=State.RUNNING, tries=row.tries + 1, words=""))
+        # what was through before stands; copies of a flight are named; each flight has its site
+        through = {row.key for row in table if row.state in FINAL}
+        rows = [_continued(row, table, settings) for row in rows]
+        rows = _place(_without_duplicates(rows, through), table, settings)
+        current = {row.key: table.put(row) for row in rows if row.state != "duplicate"}
+        rows = [current.get(row.key, row) if row.state != "duplicate" else row for row in rows]
+        known = frozenset(row.key for row in rows if row.state in FINAL and row.key in through)
 
-    def _order(self, row: Row) -> Order:
-        return Order(
-            row.source,
-            str((self._table.root / row.site).resolve()),
-            self._settings.wish,
-            self._executor.cache_mb,
-        )
+        def update(row: Row, *, is_known: bool = False) -> BatchUpdate:
+            done = sum(each.state not in ("waiting", "running") for each in current.values())
+            copies = sum(each.state == "duplicate" for each in rows)
+            running = [
+                Path(each.source).stem for each in current.values() if each.state == "running"
+            ]
+            return BatchUpdate("flights", done + copies, len(rows), row, is_known, tuple(running))
 
-    def _start(self, row: Row) -> None:
-        cost = cost_of(row, self._table, self._settings.costs)
-        row = self._take(row)
-        self._executor.start(row.key, self._order(row), cost)
-
-    def _end(self, row: Row, ending: Ending) -> Row:
-        if ending.outcome is Outcome.WAITS:
-            if self._late.put_off(row.key):
-                return self._again(row.after(ending, State.WAITING, ending.words))
-            return self._keep(row.after(ending, State.FAILED, ending.words))
-        self._late.forget(row.key)
-        if ending.outcome is not Outcome.CRASHED:
-            return self._keep(row.after(ending, State(ending.outcome.value), ending.words))
-        self.crashes += 1
-        row = replace(row, crashes=row.crashes + 1)
-        if row.crashes >= self._settings.most_tries:
-            words = f"set aside after {row.crashes} tries: {ending.words}"
-            return self._keep(row.after(ending, State.SET_ASIDE, words))
-        return self._again(row.after(ending, State.WAITING, ending.words))
-
-    def _again(self, row: Row) -> Row:
-        """The row, waiting before the others of its site."""
-        row = self._keep(row)
-        self._waiting.setdefault(row.site, []).insert(0, row)
-        return row
-
-    def _keep(self, row: Row) -> Row:
-        row = self._table.put(row)
-        self.rows[row.key] = row
-        return row
-
-
-class _Latecomers:
-    """Flights whose database, store or site was out of reach: when each is due again. `put_off`, `forget` change it."""
-
-    def __init__(self, settings: RestartSettings) -> None:
-        self._settings = settings
-        self._since_s: dict[Key, float] = {}
-        self._starts: Counter[Key] = Counter()
-        self._due_s: dict[Key, float] = {}
-
-    def put_off(self, key: Key) -> bool:
-        """Have a flight wait longer than the last time; False where it has waited long enough."""
-        now_s = time.monotonic()
-        if now_s - self._since_s.setdefault(key, now_s) > self._settings.patience_s:
-            self.forget(key)
-            return False
-        self._starts[key] += 1
-        self._due_s[key] = now_s + self._settings.wait_s(self._starts[key])
-        return True
-
-    def forget(self, key: Key) -> None:
-        """It was in reach."""
-        for each in (self._since_s, self._starts, self._due_s):
-            each.pop(key, None)
-
-    def is_due(self, key: Key) -> bool:
-        """Whether the flight may begin."""
-        return self._due_s.get(key, 0.0) <= time.monotonic()
-
-    @property
-    def wait_s(self) -> float | None:
-        """How long until the next of them is due; None where none waits for that."""
-        now_s = time.monotonic()
-        return min((due_s - now_s for due_s in self._due_s.values() if due_s > now_s), default=None)
+        queues = {}
+        for row in sorted(rows, key=_moment):
+            if row.state == "waiting":
+                queues.setdefault(row.site, []).append(row)
+            else:
+                yield update(row, is_known=row.key in known)
+        # the flights of a site one after another; sites with most frames first, beside each other
+        queues = dict(sorted(queues.items(), key=lambda each: -sum(map(_frames, each[1]))))
+        try:
+            for row, ending in _run(queues, lambda row: _order(row, root, settings), executor):
+                tries += ending is None
+                crashes += ending is not None and ending.outcome == "crashed"
+                current[row.key] = table.put(row)
+                yield update(row)
+        finally:
+            for row in current.values():
+                if row.state == "running":
+                    table.put(replace(row, state="waiting", words="the batch was stopped"))
+        rows = [current[row.key] if row.state != "duplicate" else row for row in rows]
+        seconds = round(time.monotonic() - started_s, 3)
+        return BatchReport(tuple(rows), known, seconds, tries, crashes)
 
 
-def _listed(
-    found: Sequence[FoundFlight], table: BatchTable, settings: BatchSettings
-) -> Generator[BatchUpdate, None, list[Row]]:
-    """The flights as rows, in the order found: looked into where that is new, each as it is asked for now."""
-    seen = {(row.source, row.stamp): row.scouted for row in table if row.scouted is not None}
-    new = [
-        each.path
-        for each in found
-        if not each.why_not
-        and (str(each.path), each.stamp) not in seen
-        and not _is_set_aside(table, each, settings)
-    ]
-    yield BatchUpdate("looking into flights", 0, len(new))
-    answers = dict(zip(new, scout(new, settings.wish.camera, settings.most_tries, [table.lock])))
-    rows = [
-        _row_of(
-            each, answers.get(each.path) or seen.get((str(each.path), each.stamp)), table, settings
-        )
-        for each in found
-    ]
-    return _without_duplicates(rows, table)
+def _run(
+    queues: Mapping[str, Sequence[Row]], order_of: Callable[[Row], Order], executor: Executor
+) -> Iterator[tuple[Row, Ending | None]]:
+    """Run the rows of each queue one after another, queues beside each other: each row as it begins, and as it ends.
+
+    A row whose process crashed is tried once more.
+    """
+    waiting = {name: list(rows) for name, rows in queues.items()}
+    running: dict[str, Row] = {}
+    while waiting or running:
+        for name in [name for name in waiting if name not in running]:
+            if len(running) >= executor.slots:
+                break
+            row = waiting[name].pop(0)
+            row = replace(row, state="running", tries=row.tries + 1, words="")
+            executor.start(name, order_of(row))
+            running[name] = row
+            yield row, None
+        name, ending = executor.next_ended()
+        row = running.pop(name).after(ending)
+        if row.state == "waiting":
+            waiting[name].insert(0, row)
+        elif not waiting[name]:
+            del waiting[name]
+        yield row, ending
 
 
-def _row_of(
-    found: FoundFlight,
-    answer: Scouted | Unreadable | None,
-    table: BatchTable,
-    settings: BatchSettings,
-) -> Row:
-    """A flight's row: the one to go on with, or a new one; None for an answer if nobody looked into it again."""
-    scouted = answer if isinstance(answer, Scouted) else None
-    wish = settings.wish
-    fresh = Row(str(found.path), wish.mission.value, found.stamp, _request(found, wish), scouted)
-    if found.why_not:
-        return table.put(replace(fresh, scouted=None, state=State.SKIPPED, words=found.why_not))
-    if isinstance(answer, Unreadable):
-        state = State.SET_ASIDE if answer.crashed else State.FAILED
-        return table.put(replace(fresh, state=state, words=answer.words))
-    before = table.get(fresh.key)
-    return fresh if before is None else _continued(fresh, before, table.root, settings)
+def _inspecting(settings: BatchSettings) -> Callable[[Row], Order]:
+    return lambda row: Order("inspect", "", row.source, camera=settings.camera)
 
 
-def _is_set_aside(table: BatchTable, found: FoundFlight, settings: BatchSettings) -> bool:
-    """Whether nobody could look into it before, and it is not to be tried again."""
-    row = table.get((settings.wish.mission.value, str(found.path)))
-    if row is None or row.state is not State.SET_ASIDE or settings.retries:
-        return False
-    return row.request == _request(found, settings.wish)
-
-
-def _request(found: FoundFlight, wish: FlightWish) -> str:
-    """What is asked for of a flight, as one number: files, options and program."""
-    camera = Path(wish.camera)
-    stamp = (
-        (camera.stat().st_size, camera.stat().st_mtime_ns)
-        if wish.camera and camera.is_file()
-        else None
+def _order(row: Row, root: Path, settings: BatchSettings) -> Order:
+    """One try at a flight; the first flight over a site is mapped where flights are compared."""
+    site, mission = root.resolve() / row.site, settings.mission
+    if mission == "compare":
+        there = existing_site(site)
+        if there is None or row.scouted is None or there.founder in ("", row.scouted.fingerprint):
+            mission = "map"
+    folder = site.with_name(f"{site.name}-search") if mission == "search" else site
+    options = {"model": settings.model, "m_per_px": settings.m_per_px}
+    return Order(
+        mission, str(site), row.source, camera=settings.camera, folder=str(folder), options=options
     )
-    text = repr((sorvolo.__version__, software(), found.stamp, wish, stamp))
-    return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:32]
 
 
-def _continued(fresh: Row, before: Row, root: Path, settings: BatchSettings) -> Row:
+def _new_row(
+    found: FoundFlight,
+    settings: BatchSettings,
+    seen: Mapping[tuple[str, str], Scouted],
+) -> Row:
+    """A flight as it is asked for now; `scouted` where somebody looked into the same files before."""
+    camera = Path(settings.camera)
+    facts = None
+    if settings.camera and camera.is_file():
+        facts = camera.stat().st_size, camera.stat().st_mtime_ns
+    wish = replace(settings, by_place=False, retries=False)
+    text = repr((sorvolo.__version__, software(), found.stamp, wish, facts))
+    request = hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:32]
+    row = Row(str(found.path), settings.mission, found.stamp, request, None)
+    if found.why_not:
+        return replace(row, state="skipped", words=found.why_not)
+    return replace(row, scouted=seen.get((row.source, row.stamp)))
+
+
+def _new_row_of(row: Row) -> Row:
+    """The row before it was begun."""
+    return Row(row.source, row.mission, row.stamp, row.request, row.scouted)
+
+
+def _continued(fresh: Row, table: BatchTable, settings: BatchSettings) -> Row:
     """The row to go on with: the earlier one where the same is asked for and stands, else one that waits."""
-    moved = replace(before, source=fresh.source, stamp=fresh.stamp, scouted=fresh.scouted)
+    before = table.get(fresh.key)
+    if before is None or fresh.state != "waiting":
+        return fresh
     if before.request != fresh.request:
         return replace(fresh, site=before.site)
-    if before.state is State.SET_ASIDE and settings.retries:
-        return replace(moved, state=State.WAITING, crashes=0)
-    if before.state in FINAL and (before.state is State.SET_ASIDE or _has_results(before, root)):
+    moved = replace(before, source=fresh.source, stamp=fresh.stamp, scouted=fresh.scouted)
+    if before.state == "set aside" and settings.retries:
+        return replace(moved, state="waiting", crashes=0)
+    if before.state == "set aside" or (before.state in FINAL and _has_results(before, table.root)):
         return moved
-    crashes = 0 if before.state is State.FAILED else before.crashes
-    return replace(moved, state=State.WAITING, crashes=crashes)
+    return replace(
+        moved, state="waiting", crashes=0 if before.state == "failed" else before.crashes
+    )
 
 
 def _has_results(row: Row, root: Path) -> bool:
     """Whether the site has the flight, or the folder a complete watch of it."""
     if row.scouted is None:
         return False
-    if row.mission == Mission.WATCH:
-        return is_watched(root / row.site, row.scouted.fingerprint)
-    found = existing_site(root / row.site)
-    return found is not None and row.scouted.fingerprint in found.flights
+    folder = root / row.site
+    if row.mission == "watch":
+        return find_watched(folder) == row.scouted.fingerprint and (folder / REPORT).is_file()
+    site = existing_site(folder)
+    return site is not None and row.scouted.fingerprint in site.flights
 
 
-def _without_duplicates(rows: Sequence[Row], table: BatchTable) -> list[Row]:
-    """Of rows that are one flight, the one that was through before, else the one with most frames.
-
-    The others are named as duplicates, and so is a flight that was through under another name that is still there.
-    """
-    chosen: dict[Key, Row] = {}
+def _without_duplicates(rows: Sequence[Row], through: set[tuple[str, str]]) -> list[Row]:
+    """Of rows that are one flight, the one with most frames, and of these the first; the others name it."""
+    own: dict[tuple[str, str], Row] = {}
     for row in rows:
-        other = chosen.setdefault(row.key, row)
-        if row is not other and _rank(row, table) > _rank(other, table):
-            chosen[row.key] = row
-    sources = {row.source for row in rows}
-    return [_named(row, chosen[row.key], sources, table) for row in rows]
+        if row.key not in own or _frames(row) > _frames(own[row.key]):
+            own[row.key] = row
+    named = []
+    for row in rows:
+        if (other := own[row.key]) is not row:
+            fewer = f", which has {_frames(other)} frames" if _frames(row) < _frames(other) else ""
+            words = f"the same flight as {other.source}{fewer}"
+            row = replace(_new_row_of(row), scouted=None, state="duplicate", words=words)
+        named.append(row)
+    return named
 
 
-def _named(row: Row, own: Row, sources: Set[str], table: BatchTable) -> Row:
-    """The row itself where it is `own`, the one that is used; else as a duplicate of it."""
-    before = table.get(row.key)
-    if _is_used(before) and before.source not in sources and Path(before.source).exists():
-        own = before
-    if row.source == own.source:
-        return row
-    frames = f", which has {_frames(own)} frames" if _frames(row) < _frames(own) else ""
-    words = f"the same flight as {own.source}{frames}"
-    return table.put(
-        Row(
-            row.source,
-            row.mission,
-            row.stamp,
-            row.request,
-            None,
-            state=State.DUPLICATE,
-            words=words,
-        )
-    )
-
-
-def _rank(row: Row, table: BatchTable) -> tuple[bool, int]:
-    before = table.get(row.key)
-    return _is_used(before) and before.source == row.source, _frames(row)
-
-
-def _is_used(row: Row | None) -> TypeGuard[Row]:
-    return row is not None and row.state in (State.DONE, State.DOUBTFUL)
-
-
-def _with_sites(rows: Sequence[Row], table: BatchTable, settings: BatchSettings) -> list[Row]:
+def _place(rows: Sequence[Row], table: BatchTable, settings: BatchSettings) -> list[Row]:
     """The rows with the site of each flight, or the folder of its watch; one that has a place already stays there."""
-    placed, names = _placed(rows), [each.name for each in table.root.iterdir()]
-    if settings.wish.mission is Mission.WATCH:
-        known = existing_watches(table.root) | _placed_before(table, are_watches=True)
-        sites = sites_of(placed, SiteBy.FLIGHT, known, {}, names, ending=ENDING)
-    else:
-        there = existing_sites(table.root, with_ground=settings.site_by is SiteBy.PLACE)
-        known = {fingerprint: name for name, site in there.items() for fingerprint in site.flights}
-        grounds = {name: site.ground for name, site in there.items() if site.ground is not None}
-        known |= _placed_before(table, are_watches=False)
-        sites = sites_of(placed, settings.site_by, known, grounds, names, settings.near_m)
-    return [_at_site(row, sites, table) for row in rows]
-
-
-def _placed_before(table: BatchTable, *, are_watches: bool) -> dict[str, str]:
-    """The sites, or the folders of watches, of flights that the table knows, by the flight's fingerprint."""
-    return {
+    is_watch, root = settings.mission == "watch", table.root
+    flights = [(Path(row.source), row.scouted) for row in rows if row.scouted is not None]
+    names = [path.name for path in sorted(root.iterdir()) if path.is_dir()]
+    known, grounds = {}, {}
+    for name in names:
+        if is_watch and (watched := find_watched(root / name)) is not None:
+            known[watched] = name
+        site = None if is_watch else existing_site(root / name, with_ground=settings.by_place)
+        if site is not None:
+            known |= dict.fromkeys(site.flights, name)
+            if site.ground is not None:
+                grounds[name] = site.ground
+    known |= {
         row.scouted.fingerprint: row.site
         for row in table
-        if row.scouted is not None and row.site and (row.mission == Mission.WATCH) == are_watches
+        if row.scouted is not None and row.site and (row.mission == "watch") == is_watch
     }
-
-
-def _placed(rows: Sequence[Row]) -> list[Placed]:
-    return [Placed(Path(row.source), row.scouted) for row in rows if row.scouted is not None]
-
-
-def _at_site(row: Row, sites: Mapping[str, str], table: BatchTable) -> Row:
-    if row.scouted is None or row.site == sites[row.scouted.fingerprint]:
-        return row
-    return table.put(replace(row, site=sites[row.scouted.fingerprint]))
+    ending = WATCH_ENDING if is_watch else ""
+    sites = sites_of(flights, known, grounds, names, by_place=settings.by_place, ending=ending)
+    return [
+        row if row.scouted is None else replace(row, site=sites[row.scouted.fingerprint])
+        for row in rows
+    ]
 
 
 def _moment(row: Row) -> tuple[int, str]:
@@ -479,12 +521,3 @@ def _moment(row: Row) -> tuple[int, str]:
 
 def _frames(row: Row) -> int:
     return row.scouted.frames if row.scouted is not None else 0
-
-
-def _all_frames(rows: Sequence[Row]) -> int:
-    return sum(_frames(each) for each in rows)
-
-
-def _name(row: Row) -> str:
-    path = Path(row.source)
-    return path.stem if path.suffix else path.name

@@ -20,7 +20,7 @@ from sorvolo.capture.live.growing import ENDED_SUFFIX
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.child_process import python_command
 from sorvolo.errors import InputError, SorvoloError
-from sorvolo.station.orders import Order
+from sorvolo.station.orders import RunOrder
 
 _SPOOL_BYTES = 512_000_000  # what waits for a station that is away
 _STATION_AWAY_S = 300.0  # to wait for the flight's first picture at the station
@@ -44,13 +44,13 @@ class CameraJob:
 class OpenedCamera:
     """An order whose camera is being read; `left` is asked for when that is over."""
 
-    order: Order
+    order: RunOrder
     left: Callable[[], int] = lambda: 0
     """How many pictures the camera sent that the station's disk has not."""
 
 
 @contextmanager
-def camera_opened(order: Order, folder: Path, until: threading.Event) -> Iterator[OpenedCamera]:
+def camera_opened(order: RunOrder, folder: Path, until: threading.Event) -> Iterator[OpenedCamera]:
     """The order with the flight that the station keeps of its camera as the source, while the camera is read.
 
     An order without a camera's door stays as it is; so does one whose camera sends what no browser plays, but for its
@@ -80,7 +80,7 @@ def camera_opened(order: Order, folder: Path, until: threading.Event) -> Iterato
 class _Camera:
     """The process that reads a camera, seen from the mission. `end` ends it; it ends by itself with the mission."""
 
-    def __init__(self, order: Order, folder: Path) -> None:
+    def __init__(self, order: RunOrder, folder: Path) -> None:
         job = CameraJob(
             order.source, order.telemetry, order.stream, order.door, str(folder.resolve() / "spool")
         )

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 
 from sorvolo.capture.live.growing import ENDED_SUFFIX
 from sorvolo.errors import InputError, StoreError
+from sorvolo.missions.worker import BOXES, MOTION
 from sorvolo.station.access_units import begins_decoding, has_picture
 from sorvolo.station.disk_room import shortage
 from sorvolo.station.messages import (
@@ -25,7 +26,6 @@ from sorvolo.station.messages import (
     message_from_bytes,
     sample_from_json,
 )
-from sorvolo.station.orders import BOXES, MOTION
 from sorvolo.station.problems import Problem
 from sorvolo.station.transport_stream import FlightFile
 from sorvolo.station.video import VideoHub

@@ -2,14 +2,14 @@
 
 import json
 import os
-from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from sorvolo.capture.live.addresses import shown_address
+from sorvolo.missions.worker import Order
 from sorvolo.store.atomic import atomic_write_bytes
 
 ORDER_FILE, JOURNAL_FILE, LOG_FILE, LOCK_FILE = (
@@ -20,18 +20,11 @@ ORDER_FILE, JOURNAL_FILE, LOG_FILE, LOCK_FILE = (
 )
 """The files of a run's folder: what it is to do, what it did line by line, what it printed, who is at it."""
 
-BOXES, MOTION = "frame.boxes", "frame.motion"
-"""The types of a journal's lines for what was detected in one frame, and how the picture moved since another: both are
-shown with the video, and not kept as events."""
-
 LOCK_VARIABLE = "SORVOLO_RUN_LOCK"
 """Of the environment of a run's process: the number of its lock's descriptor, which its own children must not have."""
 
 SOURCE_VARIABLE = "SORVOLO_RUN_SOURCE"
 """Of the same: the input, whose password no file is to hold."""
-
-TO_CHECK = 3
-"""The exit code of a mission whose flight is incomplete, as of commands whose result has to be checked."""
 
 Mission = Literal["map", "compare", "watch", "search"]
 
@@ -110,30 +103,19 @@ class RunWish(BaseModel):
         return self
 
 
-@dataclass(frozen=True)
-class Order:
-    """What a mission's process is to do: everything resolved to paths and addresses; read by it alone.
+@dataclass(frozen=True, kw_only=True)
+class RunOrder(Order):
+    """What the process of a run does.
 
-    `source` is a path or an address with its password, which the order's file leaves out; `stream` is the name of the
+    `source` is a path or an address with its password, which the order's file leaves out. `stream` is the name of the
     stream behind it, if any: a drone's, or the one as which the station keeps a camera's in `streams`, taken at the
-    socket `door`. A disk with less than `floor_gb` free is full; a stream of which nothing comes for `away_s` is over.
-    `folder` is where a watch or a search puts its results.
+    socket `door`. A disk with less than `floor_gb` free is full.
     """
 
     run: str
-    mission: str
-    site_id: str
-    site: str
-    source: str
-    telemetry: str
-    camera: str
-    folder: str
-    stream: str
-    options: Mapping[str, Any]
     door: str = ""
     streams: str = ""
     floor_gb: float = 0.0
-    away_s: float = 900.0
 
     def write(self, folder: Path) -> None:
         """Put it into a run's folder, without a stream's password. Raises StoreError on a full disk."""
@@ -142,21 +124,11 @@ class Order:
         (folder / ORDER_FILE).chmod(0o600)
 
     @classmethod
-    def read(cls, folder: Path) -> "Order":
+    def read(cls, folder: Path) -> "RunOrder":
         """The order in a run's folder; the whole address of a stream comes from the process's environment."""
         order = cls(**json.loads((folder / ORDER_FILE).read_bytes()))
         source = os.environ.pop(SOURCE_VARIABLE, order.source)
         return replace(order, source=source) if without_password(source) == order.source else order
-
-    @property
-    def choices(self) -> MissionOptions:
-        """The options, checked."""
-        return MissionOptions(**self.options)
-
-    @property
-    def classes(self) -> Sequence[str]:
-        """What is looked for; nothing: what the model usually reports."""
-        return self.choices.classes
 
 
 def without_password(source: str) -> str:

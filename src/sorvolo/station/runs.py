@@ -21,22 +21,20 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from sorvolo.child_process import python_command
+from sorvolo.missions.worker import BOXES, MOTION, TO_CHECK
 from sorvolo.station.camera_door import door_path
 from sorvolo.station.collections import SEARCH_FOLDER
 from sorvolo.station.disk_room import Reserve, shortage
 from sorvolo.station.events import EventLog, NewEvent
 from sorvolo.station.inputs import Inputs
 from sorvolo.station.orders import (
-    BOXES,
     JOURNAL_FILE,
     LOCK_FILE,
     LOCK_VARIABLE,
     LOG_FILE,
-    MOTION,
     ORDER_FILE,
     SOURCE_VARIABLE,
-    TO_CHECK,
-    Order,
+    RunOrder,
     RunWish,
     writes,
 )
@@ -68,6 +66,7 @@ _MOST_LOG_BYTES = 4000  # some forty lines, enough for an error's trace
 _LOOK_EVERY_S = 0.1  # at all that runs
 _GLANCE_EVERY_S = 0.02  # whether a journal has grown: the boxes of a picture are in it
 _LOG = logging.getLogger("sorvolo.station.disk")
+_LIVE_S = 0.5  # how often the growing map is shown: a browser waits for it
 _DISK_EVERY = 50  # looks between two at the disk
 
 
@@ -484,7 +483,7 @@ class Runs:
                 507, f"{short}; delete uploads, recordings or flights that you no longer need"
             )
 
-    def _order(self, wish: RunWish, run_id: str, site: Path, folder: Path) -> Order:
+    def _order(self, wish: RunWish, run_id: str, site: Path, folder: Path) -> RunOrder:
         options = wish.options
         given = {
             name: "" if each is None else self._inputs.source(each)
@@ -499,21 +498,20 @@ class Runs:
         is_camera = (
             wish.input is not None and wish.input.stream_url is not None and door.is_socket()
         )
-        return Order(
-            run_id,
-            wish.mission,
-            wish.site,
-            str(site.resolve()),
-            given["source"],
-            given["telemetry"],
-            given["camera"] or options.camera or "",
-            str(results.resolve()),
-            _stream_of_camera(given["source"], run_id) if is_camera else stream,
-            options.model_dump(mode="json"),
-            str(door.resolve()) if is_camera else "",
-            str((self._settings.root / STREAMS_FOLDER).resolve()),
-            self._settings.free_floor_gb,
-            self._settings.limits.away_s,
+        return RunOrder(
+            run=run_id,
+            mission=wish.mission,
+            site=str(site.resolve()),
+            source=given["source"],
+            telemetry=given["telemetry"],
+            camera=given["camera"] or options.camera or "",
+            folder=str(results.resolve()),
+            stream=_stream_of_camera(given["source"], run_id) if is_camera else stream,
+            away_s=self._settings.limits.away_s,
+            options=options.model_dump(mode="json") | {"live_s": _LIVE_S},
+            door=str(door.resolve()) if is_camera else "",
+            streams=str((self._settings.root / STREAMS_FOLDER).resolve()),
+            floor_gb=self._settings.free_floor_gb,
         )
 
 
@@ -593,7 +591,7 @@ def _kill(pid: int | None) -> None:
             os.killpg(pid, signal.SIGKILL)
 
 
-def _spawned(folder: Path, order: Order) -> "subprocess.Popen[bytes]":
+def _spawned(folder: Path, order: RunOrder) -> "subprocess.Popen[bytes]":
     """A process that does the order in a folder, apart from the server's own fate.
 
     It holds the folder's lock from before its first moment on to its last: who can lock it knows that it has ended.
@@ -604,7 +602,7 @@ def _spawned(folder: Path, order: Order) -> "subprocess.Popen[bytes]":
         take_lock(lock)
         with (folder / LOG_FILE).open("ab") as log:
             return subprocess.Popen(
-                python_command("sorvolo.station.worker", str(folder.resolve())),
+                python_command("sorvolo.station.run_process", str(folder.resolve())),
                 cwd=folder,
                 stdin=subprocess.DEVNULL,
                 stdout=log,
