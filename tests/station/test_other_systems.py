@@ -19,10 +19,9 @@ from test_stream_messages import units
 from test_stream_routes import HELLO, WS
 
 from sorvolo.station.app import station_app
-from sorvolo.station.cot_relay import view_of_frame, view_of_sample
 from sorvolo.station.events import NewEvent
-from sorvolo.station.logs import JsonLines
-from sorvolo.station.outward import OutwardSettings
+from sorvolo.station.metrics import JsonLines
+from sorvolo.station.outward import OutwardSettings, view_of_frame, view_of_sample
 from sorvolo.station.settings import StationSettings
 from sorvolo.store.exports.cursor_on_target import cot_drone
 

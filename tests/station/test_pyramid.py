@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sorvolo.station.map_overview import MapOverview
 from sorvolo.station.pyramid import BytesCache, Pyramid, halved
+from sorvolo.station.tiles import MapOverview
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.tiles import TileView
 

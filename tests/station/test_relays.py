@@ -19,11 +19,9 @@ from paho.mqtt.enums import CallbackAPIVersion
 
 from sorvolo.errors import SettingsError
 from sorvolo.station.events import EventLog, NewEvent
-from sorvolo.station.mqtt import MqttSender, mqtt_place
 from sorvolo.station.outward import OutwardSettings
-from sorvolo.station.relays import Relay
+from sorvolo.station.relays import SIGNATURE, MqttSender, Relay, mqtt_place, webhook, webhook_name
 from sorvolo.station.state import StationState
-from sorvolo.station.webhooks import SIGNATURE, webhook, webhook_name
 from waiting import wait_for
 
 FOUND = NewEvent(

@@ -9,11 +9,11 @@ import pytest
 
 from sorvolo.errors import StoreError
 from sorvolo.station.app import Station
-from sorvolo.station.root_lock import RootLock
 from sorvolo.station.settings import StationSettings
+from sorvolo.station.state import RootLock
 
 HOLDS = (
-    "import sys, time; from pathlib import Path; from sorvolo.station.root_lock import RootLock; "
+    "import sys, time; from pathlib import Path; from sorvolo.station.state import RootLock; "
     "lock = RootLock(Path(sys.argv[1])); print('held', flush=True); time.sleep(60)"
 )
 

@@ -16,14 +16,13 @@ from typer.testing import CliRunner
 from sorvolo.cli.main import app as command
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.station import run_process
-from sorvolo.station.app import station_app
+from sorvolo.station.app import server_config, station_app
+from sorvolo.station.inputs import checked_stream
 from sorvolo.station.orders import SOURCE_VARIABLE, RunOrder
 from sorvolo.station.problems import Problem
 from sorvolo.station.security import address_group
-from sorvolo.station.server import server_config
 from sorvolo.station.settings import StationLimits, StationSettings, check_exposure
 from sorvolo.station.state import StationState
-from sorvolo.station.stream_addresses import checked_stream
 from sorvolo.station.tokens import Guesses, Role, holder_of, list_tokens, make_token, revoke_token
 
 HOST = "http://127.0.0.1:8750"

@@ -12,15 +12,17 @@ from stream_flights import write_video
 from sorvolo.capture.live.klv import local_sets
 from sorvolo.capture.live.klv_telemetry import columns_of
 from sorvolo.errors import InputError
-from sorvolo.station.access_units import begins_decoding, codec_string, with_parameter_sets
 from sorvolo.station.messages import (
     Hello,
     Kind,
     Message,
     Sample,
+    begins_decoding,
+    codec_string,
     hello_from_json,
     message_from_bytes,
     sample_from_json,
+    with_parameter_sets,
 )
 from sorvolo.station.transport_stream import FlightFile, local_set
 

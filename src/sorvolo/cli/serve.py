@@ -124,8 +124,8 @@ def serve(
     """
     demand_extra()
     from sorvolo.missions.watch.cot_sender import CotTls
+    from sorvolo.station.app import run_station
     from sorvolo.station.outward import OutwardSettings
-    from sorvolo.station.server import run_station
     from sorvolo.station.settings import StationSettings
 
     # secrets come from the environment: every user of the machine sees arguments

@@ -1,54 +1,61 @@
 """The station as one web application: its parts joined, its routes, the page."""
 
 import asyncio
+import logging
 import shutil
-from collections.abc import AsyncIterator
+import socket
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import uvicorn
 from fastapi import APIRouter, Body, Depends, FastAPI, Request, Response
 from fastapi.responses import FileResponse, JSONResponse
 from starlette.staticfiles import StaticFiles
 
 from sorvolo import __version__
+from sorvolo.errors import SettingsError
 from sorvolo.station.camera_door import CameraDoor, door_path
 from sorvolo.station.cogs import answer_raster_errors, cog_routes
-from sorvolo.station.collections import SiteCollections
-from sorvolo.station.crops import crop_routes
+from sorvolo.station.collections import Findings, SiteCollections
+from sorvolo.station.crops import FlightVideos, crop_routes, video_routes
 from sorvolo.station.drawings import Drawings, drawing_routes
-from sorvolo.station.event_routes import event_routes
-from sorvolo.station.events import EventLog
+from sorvolo.station.events import EventLog, event_routes
 from sorvolo.station.exports import export_routes
-from sorvolo.station.flight_videos import FlightVideos, video_routes
 from sorvolo.station.ingest import Ingest, IngestLimits
 from sorvolo.station.inputs import Inputs
-from sorvolo.station.logs import Observer
 from sorvolo.station.map_watch import MapWatch
+from sorvolo.station.metrics import (
+    Observer,
+    StationMetrics,
+    log_as_json,
+    memory_bytes,
+    metrics_routes,
+)
 from sorvolo.station.ogc_features import feature_routes, landing_links
 from sorvolo.station.outward import Outward, OutwardSettings
-from sorvolo.station.place import place_routes
-from sorvolo.station.place_index import PlaceIndex
+from sorvolo.station.place import PlaceIndex, place_routes
 from sorvolo.station.problems import PROBLEM_ANSWERS, Problem, answer_problems
-from sorvolo.station.prometheus import StationMetrics, memory_bytes, metrics_routes
 from sorvolo.station.reviews import Reviews, review_routes
-from sorvolo.station.root_lock import RootLock
-from sorvolo.station.run_routes import run_routes
-from sorvolo.station.runs import Runs
+from sorvolo.station.runs import Runs, run_routes
 from sorvolo.station.security import COOKIE, Doorkeeper, holder_in, needs
-from sorvolo.station.settings import DELETED_FOLDER, RUNS_FOLDER, STREAMS_FOLDER, StationSettings
+from sorvolo.station.settings import (
+    DELETED_FOLDER,
+    RUNS_FOLDER,
+    STREAMS_FOLDER,
+    StationSettings,
+    check_exposure,
+)
 from sorvolo.station.site_deletion import SiteDeletion, site_deletion_routes
 from sorvolo.station.sites import SiteShelf, readable, site_detail
 from sorvolo.station.stac import stac_routes
-from sorvolo.station.state import StationState
+from sorvolo.station.state import RootLock, StationState
 from sorvolo.station.stream_routes import announcing, stream_routes
-from sorvolo.station.tiles import WebTiles
-from sorvolo.station.tokens import Role
-from sorvolo.station.upload_routes import upload_routes
-from sorvolo.station.uploads import Uploads
-from sorvolo.station.watch_findings import Findings
-from sorvolo.station.wmts import wmts_routes
+from sorvolo.station.tiles import WebTiles, wmts_routes
+from sorvolo.station.tokens import Role, has_tokens
+from sorvolo.station.uploads import Uploads, upload_routes
 
 PAGE_FOLDER = Path(__file__).parent / "page"
 _FOR_EVER = "public, max-age=31536000, immutable"
@@ -185,7 +192,7 @@ def station_app(
         crop_routes(station.shelf, station.findings),
         stream_routes(station.ingest, station.runs),
         metrics_routes(metrics),
-        upload_routes(station.uploads, station.runs),
+        upload_routes(station.uploads, station.runs.unused),
         run_routes(station.runs, station.inputs, station.ingest),
         place_routes(
             station.shelf, station.collections, station.reviews, station.videos, station.place_index
@@ -369,3 +376,86 @@ def _doorkeeper(request: Request) -> Doorkeeper:
     keeper = request.scope["state"]["doorkeeper"]
     assert isinstance(keeper, Doorkeeper)
     return keeper
+
+
+_MOST_MESSAGE_BYTES = 16_000_000  # of one WebSocket message: a key frame of 4K video takes a tenth
+
+
+def run_station(
+    settings: StationSettings,
+    announce: Callable[[], None],
+    receivers: OutwardSettings = OutwardSettings(),
+    *,
+    logs_json: bool = False,
+) -> None:
+    """Serve until Ctrl-C or SIGTERM; `announce` is called once it listens.
+
+    Raises SettingsError where others could reach it unprotected or the port is taken, StoreError as `Station.open`.
+    """
+    if logs_json:
+        log_as_json()
+    app = station_app(settings, receivers)
+    station: Station = app.state.station
+    try:
+        check_exposure(settings, has_tokens=has_tokens(station.state))
+        listening = _listening(settings)
+        server = _Announcing(server_config(app, settings), announce)
+        logging.getLogger("uvicorn.error").setLevel(logging.ERROR)
+        with listening:
+            asyncio.run(server.serve([listening]))
+    finally:
+        station.close()
+
+
+def server_config(app: FastAPI, settings: StationSettings) -> uvicorn.Config:
+    """How the application is served. Who asked is taken from a proxy's word only where the settings name one."""
+    return uvicorn.Config(
+        app,
+        settings.host,
+        settings.port,
+        log_level="warning",
+        access_log=False,
+        server_header=False,
+        log_config=None,
+        ws="websockets-sansio",
+        ws_max_size=_MOST_MESSAGE_BYTES,
+        proxy_headers=bool(settings.public_url),
+        forwarded_allow_ips=["127.0.0.1", "::1"],
+        limit_concurrency=settings.limits.most_connections,
+        timeout_graceful_shutdown=2,
+        ssl_certfile=settings.tls_cert,
+        ssl_keyfile=settings.tls_key,
+        h11_max_incomplete_event_size=64_000,
+    )
+
+
+def _listening(settings: StationSettings) -> socket.socket:
+    """The socket to listen at. Raises SettingsError where it cannot be had."""
+    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+    # the protocol is named: asyncio sends small answers at once (TCP_NODELAY) only where it is
+    listening = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+    try:
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listening.bind((settings.host, settings.port))
+        listening.listen(256)
+        return listening
+    except OSError as error:
+        listening.close()
+        raise SettingsError(
+            f"cannot listen at {settings.host}:{settings.port} ({error.strerror}): another program does, or the "
+            "address is not this machine's; choose another --port or --host"
+        ) from error
+
+
+class _Announcing(uvicorn.Server):
+    """A server that announces that it listens."""
+
+    def __init__(self, config: uvicorn.Config, announce: Callable[[], None]) -> None:
+        super().__init__(config)
+        self._announce = announce
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Listen, then announce it."""
+        await super().startup(sockets)
+        if self.started:
+            self._announce()

@@ -28,8 +28,14 @@ from sorvolo.capture.sync import tie_clocks
 from sorvolo.capture.telemetry.nmea import Epoch
 from sorvolo.errors import InputError
 from sorvolo.geometry.camera import Camera
-from sorvolo.station.access_units import has_picture, parameter_sets, with_parameter_sets
-from sorvolo.station.messages import CODECS, Kind, Sample
+from sorvolo.station.messages import (
+    CODECS,
+    Kind,
+    Sample,
+    has_picture,
+    parameter_sets,
+    with_parameter_sets,
+)
 from sorvolo.survey.flight import CameraModel
 
 _JUMP_US = 10_000_000  # a clock that leaps so far was set anew

@@ -13,20 +13,21 @@ from typing import Any, Protocol
 from sorvolo.capture.live.growing import ENDED_SUFFIX
 from sorvolo.errors import InputError, StoreError
 from sorvolo.missions.worker import BOXES, MOTION
-from sorvolo.station.access_units import begins_decoding, has_picture
-from sorvolo.station.disk_room import shortage
 from sorvolo.station.messages import (
     Hello,
     Kind,
     Message,
     Sample,
+    begins_decoding,
     check_stream,
+    has_picture,
     hello_from_json,
     is_stream,
     message_from_bytes,
     sample_from_json,
 )
 from sorvolo.station.problems import Problem
+from sorvolo.station.state import shortage
 from sorvolo.station.transport_stream import FlightFile
 from sorvolo.station.video import VideoHub
 from sorvolo.store.atomic import atomic_write_bytes

@@ -11,13 +11,13 @@ from pydantic import BaseModel, Field
 
 from sorvolo.errors import SorvoloError, StoreError
 from sorvolo.missions.site.review import review_changes, withdraw_reviews
+from sorvolo.station.collections import Findings
 from sorvolo.station.events import EventLog, NewEvent
 from sorvolo.station.problems import Problem
 from sorvolo.station.security import needs
 from sorvolo.station.sites import SiteShelf
 from sorvolo.station.state import StationState, utc_now
 from sorvolo.station.tokens import Holder, Role
-from sorvolo.station.watch_findings import Findings
 from sorvolo.survey.findings import Verdict
 
 NO_VERDICT = "none"

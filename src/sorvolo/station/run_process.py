@@ -17,9 +17,8 @@ from sorvolo.capture.live.growing import ENDED_SUFFIX
 from sorvolo.errors import SorvoloError
 from sorvolo.missions.worker import MISSIONS, Done, Journal, Stop, work
 from sorvolo.station.camera import camera_opened
-from sorvolo.station.disk_room import shortage
 from sorvolo.station.orders import JOURNAL_FILE, LOCK_VARIABLE, ORDER_FILE, RunOrder
-from sorvolo.station.state import STATE_FILE
+from sorvolo.station.state import STATE_FILE, shortage
 from sorvolo.store.freed_memory import share_arenas
 from sorvolo.survey.wording import counted
 

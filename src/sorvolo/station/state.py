@@ -1,16 +1,19 @@
-"""The station's own memory: one small SQLite file with events, runs, tokens and reviews."""
+"""What the station keeps on its disk: its own database, the lock of its root, room for a full disk."""
 
 import json
+import os
+import shutil
 import sqlite3
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 from sorvolo.errors import StoreError
 from sorvolo.store.atomic import writing
+from sorvolo.store.locks import take_lock
 
 STATE_FILE = "station.db"
 """The file of the station's memory, in its own folder."""
@@ -132,3 +135,68 @@ def utc_after(seconds: float) -> str:
 def compact_json(value: Any) -> str:
     """The value as one line of JSON."""
     return json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+
+
+_RESERVE_BYTES = 8_000_000  # some hundred runs' last states, with SQLite's journal
+
+
+def shortage(folder: Path, floor_gb: float) -> str:
+    """How little of the folder's disk is free where that is less than the floor; "" where there is room."""
+    free_gb = shutil.disk_usage(folder).free / 1e9
+    return (
+        ""
+        if free_gb >= floor_gb
+        else f"{free_gb:.2f} GB are free, and {floor_gb:.2f} GB must stay so"
+    )
+
+
+class Reserve:
+    """A file that holds some room on the disk, so that what a full disk did can still be written down."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def hold(self) -> None:
+        """Take the room, where it is not held and the disk has it."""
+        if self._path.exists() or shutil.disk_usage(self._path.parent).free < 2 * _RESERVE_BYTES:
+            return
+        with suppress(OSError), self._path.open("wb") as file:
+            if hasattr(os, "posix_fallocate"):
+                os.posix_fallocate(file.fileno(), 0, _RESERVE_BYTES)
+            else:
+                file.write(bytes(_RESERVE_BYTES))
+
+    def give(self) -> bool:
+        """Give the room back to the disk; whether there was any."""
+        was_held = self._path.exists()
+        self._path.unlink(missing_ok=True)
+        return was_held
+
+
+_FILE = "station.lock"
+
+
+class RootLock:
+    """The lock of a station's folder, held until `close`. A file that a killed station left locks nobody out."""
+
+    def __init__(self, folder: Path) -> None:
+        """Raises StoreError where another station holds it, or it cannot be written."""
+        with writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            self._file = os.open(folder / _FILE, os.O_RDWR | os.O_CREAT, 0o600)
+        if not take_lock(self._file):
+            holder = os.pread(self._file, 20, 0).decode("ascii", "replace").strip()
+            self.close()
+            raise StoreError(
+                f"{folder.parent}: another station serves this folder already (process {holder or 'unknown'}); end "
+                "that one first, or serve another folder"
+            )
+        with writing(folder):
+            os.ftruncate(self._file, 0)
+            os.pwrite(self._file, f"{os.getpid()}\n".encode(), 0)
+
+    def close(self) -> None:
+        """Let another station in; again: nothing."""
+        if self._file >= 0:
+            os.close(self._file)
+            self._file = -1

@@ -1,20 +1,32 @@
 """Tiles of a site's map for web maps: any version, and the growing one, warped from the site's grid to Web Mercator."""
 
+import os
 import re
 import threading
 from dataclasses import dataclass
 from io import BytesIO
+from pathlib import Path
+from urllib.parse import quote
+from xml.sax.saxutils import escape, quoteattr
 
 import cv2
 import numpy as np
+from fastapi import APIRouter, Depends, Request, Response
 from PIL import Image
+from rasterio import DatasetReader
+from rasterio.enums import Resampling
+from rasterio.errors import RasterioError
+from rasterio.windows import Window
 
+from sorvolo.errors import SorvoloError
 from sorvolo.geometry.arrays import Floats, Floats32, ImageRGBA
-from sorvolo.geometry.grid import SiteGrid
-from sorvolo.station.map_overview import MapOverview
+from sorvolo.geometry.grid import Grid, SiteGrid, TileIndex
 from sorvolo.station.problems import Problem
 from sorvolo.station.pyramid import BytesCache, Pyramid
+from sorvolo.station.security import needs
 from sorvolo.station.sites import SiteShelf, bounds_lonlat
+from sorvolo.station.tokens import Role
+from sorvolo.store.rasters.gdal import crs_of_epsg, open_raster, quiet_gdal
 from sorvolo.store.site.archive import Archive
 
 TILE_PX = 256  # a side, as web maps have it
@@ -218,3 +230,164 @@ def _resampled(source: ImageRGBA, places_px: Floats32) -> ImageRGBA:
     mixed = cv2.remap(weighted, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
     colours = mixed[..., :3] / np.maximum(mixed[..., 3:], 1e-3)
     return np.clip(np.round(np.dstack([colours, 255 * mixed[..., 3]])), 0, 255).astype(np.uint8)
+
+
+_DEEPEST = 9  # beyond it a tile is wider than the file's blocks are aligned
+
+
+class MapOverview:
+    """The GeoTIFF of one state of a map, as it lies on the disk now; once it was replaced it gives nothing any more."""
+
+    def __init__(self, path: Path, grid: Grid) -> None:
+        self._path, self._grid = path, grid
+        self._mark = _mark(path)
+
+    def tile(self, level: int, index: TileIndex) -> ImageRGBA | None:
+        """A tile of a level, (tile_px, tile_px, 4); None where the file cannot give it."""
+        if not 0 < level <= _DEEPEST or not self._grid.crs or self._mark is None:
+            return None
+        try:
+            with quiet_gdal(), open_raster(self._path, "the map's GeoTIFF") as source:
+                left, top = self._corner(source)
+                if left is None or top is None or _mark(self._path) != self._mark:
+                    return None
+                if max(source.overviews(1), default=1) < 2 ** (level - 1):  # it would be read whole
+                    return None
+                return self._read(source, level, index, left, top)
+        except (
+            RasterioError,
+            SorvoloError,
+            OSError,
+        ):  # damaged or taken away: the tiles themselves have it all
+            return None
+
+    def _corner(self, source: DatasetReader) -> tuple[int | None, int | None]:
+        """Grid pixel of the file's first pixel; None where the file lies on another grid."""
+        transform, grid = source.transform, self._grid
+        if (
+            source.crs != crs_of_epsg(grid.crs)
+            or abs(transform.a - grid.m_per_px) > 1e-6 * grid.m_per_px
+        ):
+            return None, None
+        left = (transform.c - grid.origin_m[0]) / grid.m_per_px + 0.5
+        top = (grid.origin_m[1] - transform.f) / grid.m_per_px + 0.5
+        if max(abs(left - round(left)), abs(top - round(top))) > 0.01:
+            return None, None
+        return round(left), round(top)
+
+    def _read(
+        self, source: DatasetReader, level: int, index: TileIndex, left: int, top: int
+    ) -> ImageRGBA:
+        size = self._grid.tile_px
+        side = size << level
+        x0, y0 = index[0] * side, index[1] * side
+        low_x, low_y = max(x0, left), max(y0, top)
+        high_x, high_y = min(x0 + side, left + source.width), min(y0 + side, top + source.height)
+        result = np.zeros((size, size, 4), np.uint8)
+        width, height = (high_x - low_x) >> level, (high_y - low_y) >> level
+        if width > 0 and height > 0:
+            window = Window(low_x - left, low_y - top, high_x - low_x, high_y - low_y)
+            how = {"window": window, "resampling": Resampling.average}
+            colours = source.read((1, 2, 3), out_shape=(3, height, width), **how)
+            alpha = source.dataset_mask(out_shape=(height, width), **how)
+            column, row = (low_x - x0) >> level, (low_y - y0) >> level
+            result[row : row + height, column : column + width] = np.dstack([*colours, alpha])
+        result.setflags(write=False)
+        return result
+
+
+def _mark(path: Path) -> tuple[int, int] | None:
+    """What is another once the file was replaced."""
+    try:
+        about = os.stat(path)
+    except OSError:
+        return None
+    return about.st_ino, about.st_mtime_ns
+
+
+_FIRST_SCALE = (
+    559082264.0287178  # of zoom 0 at 0.28 mm a pixel: WMTS 1.0.0, annex E.4 (GoogleMapsCompatible)
+)
+_EDGE_M = 20037508.342789244  # half of the equator's length on the sphere of web maps (EPSG:3857)
+_ZOOMS = range(8, 25)
+_SET = "GoogleMapsCompatible"
+
+
+class XmlResponse(Response):
+    """An XML document."""
+
+    media_type = "application/xml"
+
+
+def wmts_routes(shelf: SiteShelf) -> APIRouter:
+    """The capabilities of each site's tiles."""
+    router = APIRouter(
+        prefix="/api/sites/{site}", tags=["rasters"], dependencies=[Depends(needs(Role.VIEW))]
+    )
+
+    @router.get("/WMTSCapabilities.xml", response_class=XmlResponse)
+    def capabilities(request: Request, site: str) -> XmlResponse:
+        """Layers of a WMTS: every version of the map, and the growing one (`live`)."""
+        base = f"{str(request.base_url).rstrip('/')}/api/sites/{quote(site)}"
+        return XmlResponse(document(shelf.open(site), base))
+
+    return router
+
+
+def document(archive: Archive, base: str) -> str:
+    """The capabilities of a site whose address is `base`."""
+    layers = []
+    if archive.has_site:
+        names = {
+            str(
+                each.id
+            ): f"version {each.id}, {each.flown_utc or each.created_utc}, {each.flight_id}"
+            for each in archive.versions()
+            if each.complete
+        }
+        bounds = bounds_lonlat(list(archive.live_tiles()), archive.site_grid())
+        layers = [
+            _layer(name, title, bounds, base)
+            for name, title in {"live": "the newest map", **names}.items()
+        ]
+    name = archive.site().name if archive.has_site else archive.folder.name
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?>\n'
+        '<Capabilities xmlns="http://www.opengis.net/wmts/1.0" xmlns:ows="http://www.opengis.net/ows/1.1" '
+        'xmlns:xlink="http://www.w3.org/1999/xlink" version="1.0.0">\n'
+        f"<ows:ServiceIdentification><ows:Title>{escape(name)}</ows:Title><ows:ServiceType>OGC WMTS</ows:ServiceType>"
+        "<ows:ServiceTypeVersion>1.0.0</ows:ServiceTypeVersion></ows:ServiceIdentification>\n"
+        f"<Contents>\n{''.join(layers)}{_matrix_set()}</Contents>\n"
+        f"<ServiceMetadataURL xlink:href={quoteattr(base + '/WMTSCapabilities.xml')}/>\n</Capabilities>\n"
+    )
+
+
+def _layer(name: str, title: str, bounds: list[float] | None, base: str) -> str:
+    corners = ""
+    if bounds is not None:
+        corners = (
+            f"<ows:WGS84BoundingBox><ows:LowerCorner>{bounds[0]} {bounds[1]}</ows:LowerCorner>"
+            f"<ows:UpperCorner>{bounds[2]} {bounds[3]}</ows:UpperCorner></ows:WGS84BoundingBox>"
+        )
+    template = f"{base}/tiles/{name}/{{TileMatrix}}/{{TileCol}}/{{TileRow}}.png"
+    return (
+        f"<Layer><ows:Title>{escape(title)}</ows:Title>{corners}<ows:Identifier>{name}</ows:Identifier>"
+        '<Style isDefault="true"><ows:Identifier>default</ows:Identifier></Style><Format>image/png</Format>'
+        f"<TileMatrixSetLink><TileMatrixSet>{_SET}</TileMatrixSet></TileMatrixSetLink>"
+        f'<ResourceURL format="image/png" resourceType="tile" template={quoteattr(template)}/></Layer>\n'
+    )
+
+
+def _matrix_set() -> str:
+    matrices = "".join(
+        f"<TileMatrix><ows:Identifier>{zoom}</ows:Identifier><ScaleDenominator>{_FIRST_SCALE / 2**zoom!r}"
+        f"</ScaleDenominator><TopLeftCorner>-{_EDGE_M!r} {_EDGE_M!r}</TopLeftCorner><TileWidth>{TILE_PX}</TileWidth>"
+        f"<TileHeight>{TILE_PX}</TileHeight><MatrixWidth>{2**zoom}</MatrixWidth><MatrixHeight>{2**zoom}"
+        "</MatrixHeight></TileMatrix>\n"
+        for zoom in _ZOOMS
+    )
+    return (
+        f"<TileMatrixSet><ows:Identifier>{_SET}</ows:Identifier>"
+        "<ows:SupportedCRS>urn:ogc:def:crs:EPSG::3857</ows:SupportedCRS>"
+        f"<WellKnownScaleSet>urn:ogc:def:wkss:OGC:1.0:{_SET}</WellKnownScaleSet>\n{matrices}</TileMatrixSet>\n"
+    )

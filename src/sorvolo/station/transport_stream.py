@@ -11,8 +11,7 @@ from typing import BinaryIO
 
 from sorvolo.capture.live.klv import ITEMS, encode
 from sorvolo.errors import StoreError
-from sorvolo.station.access_units import with_delimiter
-from sorvolo.station.messages import Kind, Message, Sample, sample_from_json
+from sorvolo.station.messages import Kind, Message, Sample, sample_from_json, with_delimiter
 
 _PACKET, _BODY = 188, 184
 _PAT, _PMT, _VIDEO, _METADATA, _MARK = 0x0000, 0x1000, 0x0100, 0x0101, 0x1FE0

@@ -12,8 +12,7 @@ from typing import Any, Literal
 
 import av
 
-from sorvolo.station.access_units import codec_string, is_delimiter, nal_units
-from sorvolo.station.messages import Hello, Message
+from sorvolo.station.messages import Hello, Message, codec_string, is_delimiter, nal_units
 
 _LOG = logging.getLogger("sorvolo.station.video")
 
