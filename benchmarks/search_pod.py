@@ -25,7 +25,7 @@ import numpy as np
 
 from provenance import commit, machine, seeds_or_drawn
 from sorvolo.detection.detector import Detector
-from sorvolo.detection.turning import is_from_above
+from sorvolo.detection.fusing import is_from_above
 from sorvolo.geometry.calibration_bins import calibration_bins
 from sorvolo.geometry.geodesy import utm_epsg
 from sorvolo.geometry.grid import SiteGrid

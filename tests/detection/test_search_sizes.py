@@ -11,8 +11,9 @@ from toy_models import draw, rectangle_model
 
 from sorvolo.detection.contract import Pyramid
 from sorvolo.detection.detector import Detector
-from sorvolo.detection.pyramid import PyramidSettings, agreed_in_sizes, closer_for, trust
+from sorvolo.detection.fusing import agreed_in_sizes, trust
 from sorvolo.detection.session import Seen, Session
+from sorvolo.detection.tiling import MOST_MAGNIFIED_PX, closer_for
 from sorvolo.errors import InputError
 
 _BOXES = [(20, 40, 60, 80), (140, 60, 170, 90)]
@@ -179,7 +180,7 @@ def test_a_large_picture_is_not_magnified(tmp_path: Path, monkeypatch: pytest.Mo
         provider="cpu",
         threads=1,
     )
-    side_px = math.isqrt(PyramidSettings().most_px // 4) + 8
+    side_px = math.isqrt(MOST_MAGNIFIED_PX // 4) + 8
     detector.detect(np.zeros((side_px, side_px, 3), np.uint8), tiles="auto")
     assert set(shown) == {0.5, 1.0}
 
@@ -188,7 +189,7 @@ def test_a_class_of_which_no_other_size_is_left_keeps_its_scores(tmp_path: Path)
     magnified, smaller = _SIZES | {"times": [3], "shift": 2}, _SIZES | {"times": [0.5], "shift": 2}
     model = rectangle_model(tmp_path / "toy.onnx", pyramid={"person": magnified, "car": smaller})
     detector = Detector.load(model, provider="cpu", threads=1)
-    side_px = math.isqrt(PyramidSettings().most_px // 9) + 8
+    side_px = math.isqrt(MOST_MAGNIFIED_PX // 9) + 8
     picture = draw((side_px, side_px), _BOXES, labels=[0, 1], scores=[200, 200])
     once, found = (detector.detect(picture, tiles=tiles) for tiles in (None, "auto"))
     person, car = (found.names.index(name) for name in ("person", "car"))

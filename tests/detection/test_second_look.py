@@ -11,7 +11,16 @@ from toy_models import draw, rectangle_model
 from sorvolo.detection.contract import SecondLook
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import find_model
-from sorvolo.detection.second_look import SheetSettings, cut_out, looked_again, opinions
+from sorvolo.detection.second_look import (
+    CELL_PX,
+    SAME_IOU,
+    SHARE,
+    SUREST,
+    UNSEEN,
+    cut_out,
+    looked_again,
+    opinions,
+)
 from sorvolo.detection.session import Seen, Session, read_info
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import ImageRGB
@@ -75,21 +84,18 @@ def test_weak_reports_stay_behind_those_that_were_looked_at() -> None:
 def test_no_report_is_so_sure_that_the_second_look_cannot_overrule_it() -> None:
     boxes = np.array([[20, 10, 40, 60], [80, 10, 100, 60], [140, 10, 160, 60]], np.float32)
     seen = Seen(boxes, np.array([0.9999, 0.99, 0.9]), np.zeros(3, np.int64))
-    settings, how = (
-        SheetSettings(),
-        SecondLook((34.0,), own=1.0, again=1.0, shift=0.0, least=0.5, enlarged=9.0),
-    )
+    how = SecondLook((34.0,), own=1.0, again=1.0, shift=0.0, least=0.5, enlarged=9.0)
     none = Seen(np.zeros((0, 4), np.float32), np.zeros(0), np.zeros(0, np.int64))
     after = looked_again(seen, np.zeros((300, 300, 3), np.uint8), lambda sheet: none, {0: how})
-    unseen = math.log(settings.unseen / (1 - settings.unseen))
-    most = 1 / (1 + math.exp(-math.log(settings.surest / (1 - settings.surest)) - unseen))
+    unseen = math.log(UNSEEN / (1 - UNSEEN))
+    most = 1 / (1 + math.exp(-math.log(SUREST / (1 - SUREST)) - unseen))
     np.testing.assert_allclose(after.scores[:2], most)
     assert after.scores[2] < most, "below that, the first look's order stays"
 
 
 def test_the_packaged_opinion_answers_for_each_cut_out_in_its_cell() -> None:
     """A report of any shape overlaps one of its cell's boxes enough, and each cell has an answer of its own."""
-    session, settings = Session(find_model("second-opinion"), "cpu", 1), SheetSettings()
+    session = Session(find_model("second-opinion"), "cpu", 1)
     (look_px,) = read_info(find_model("default")).second_look["person"].looks_px
     rng = np.random.default_rng(3)
     picture = rng.integers(0, 255, (400, 500, 3), np.uint8)
@@ -100,15 +106,13 @@ def test_the_packaged_opinion_answers_for_each_cut_out_in_its_cell() -> None:
             size = np.array([longer, longer * aspect] if is_wide else [longer * aspect, longer])
             corner = rng.uniform(0, np.array([500, 400]) - size)
             cuts.append(cut_out(picture, np.concatenate([corner, corner + size]), look_px))
-        cells = np.stack([shown for shown, _ in cuts]).reshape(
-            rows, columns, settings.cell_px, settings.cell_px, 3
-        )
+        cells = np.stack([shown for shown, _ in cuts]).reshape(rows, columns, CELL_PX, CELL_PX, 3)
         seen = session.see(np.concatenate(np.concatenate(cells, axis=1), axis=1))
         for number, (_, box_px) in enumerate(cuts):
             row, column = divmod(number, columns)
-            there = box_px + settings.cell_px * np.array([column, row, column, row])
+            there = box_px + CELL_PX * np.array([column, row, column, row])
             overlaps = iou_matrix(there.astype(np.float32)[None], seen.boxes_px)[0]
-            answers = set(seen.scores[overlaps >= settings.same_iou].tolist())
+            answers = set(seen.scores[overlaps >= SAME_IOU].tolist())
             assert len(answers) == 1, "one answer, its own"
         assert len(set(seen.scores.tolist())) == rows * columns
 
@@ -134,14 +138,14 @@ def test_a_crowd_costs_no_more_than_its_share() -> None:
         shown.append(sheet.shape)
         return Seen(np.zeros((0, 4), np.float32), np.zeros(0), np.zeros(0, np.int64))
 
-    how, settings = {0: SecondLook((34.0, 17.0), 0.5, 0.5, 0.0, 0.5, 9.0)}, SheetSettings()
+    how = {0: SecondLook((34.0, 17.0), 0.5, 0.5, 0.0, 0.5, 9.0)}
     boxes = np.array([[10 * n, 10, 10 * n + 8, 30] for n in range(60)], np.float32)
     crowd = Seen(boxes, np.linspace(0.99, 0.6, 60), np.zeros(60, np.int64))
     for size, cuts in {(640, 640): 8, (720, 1280): 14, (1500, 2000): 45, (3000, 4000): 96}.items():
         again = opinions(crowd, np.zeros((*size, 3), np.uint8), sees, how)
         assert sorted(again) == list(range(cuts // 2)), "the best reports"
         height, width, _ = shown.pop()
-        assert height * width <= max(settings.share * size[0] * size[1], 8 * 128**2) + 8 * 128**2
+        assert height * width <= max(SHARE * size[0] * size[1], 8 * 128**2) + 8 * 128**2
     lone = looked_again(crowd, np.zeros((640, 640, 3), np.uint8), sees, how)
     assert len(lone.scores) == 60 and (np.diff(lone.scores) <= 0).all()
     none = Seen(boxes[:0], np.zeros(0), np.zeros(0, np.int64))

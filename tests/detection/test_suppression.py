@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from sorvolo.detection.fusing import SeenTile, merge_tiles
 from sorvolo.detection.session import Seen
-from sorvolo.detection.suppression import SeenTile, merge_tiles
 from sorvolo.geometry.box_overlap import cover_matrix, iou_matrix
 
 _SIZE = (100, 180)

@@ -7,8 +7,8 @@ import pytest
 from toy_models import draw, rectangle_model
 
 from sorvolo.detection.detector import Detector
+from sorvolo.detection.fusing import agreed, is_from_above, turned, turned_back
 from sorvolo.detection.session import Seen
-from sorvolo.detection.turning import agreed, is_from_above, turned, turned_back
 from sorvolo.errors import InputError
 from sorvolo.geometry.pose import site_from_gimbal_rotation
 

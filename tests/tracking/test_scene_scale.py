@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sorvolo.detection.contract import ModelInfo
-from sorvolo.detection.scene import ProbeSettings, SceneMagnifier
+from sorvolo.detection.scene import SceneMagnifier
 from sorvolo.detection.tiling import scale_for
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.survey.flight import Frame
@@ -116,12 +116,12 @@ def test_things_too_small_as_they_are_are_found_in_the_enlarged_middle() -> None
     picture = np.zeros((*SIZE_PX, 3), np.uint8)
     look = FromSize(24.0)
     assert not len(look(picture))
-    magnifier = SceneMagnifier(INFO, CLASSES[:2], ProbeSettings(first_again=3))
+    magnifier = SceneMagnifier(INFO, CLASSES[:2])
     look.looks = 0
     m_per_px = magnifier.m_per_px(picture, look)
     assert m_per_px == pytest.approx(1 / 3, rel=0.15)
     assert scale_for(INFO, m_per_px, CLASSES[:2]) == 3.0
-    for _ in range(3):
+    for _ in range(30):
         magnifier.m_per_px(picture, look)
     assert look.looks == 6  # three when the flight begins, three some frames later
 

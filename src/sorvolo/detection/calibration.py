@@ -6,7 +6,6 @@ import numpy as np
 from scipy.optimize import minimize
 
 from sorvolo.detection.contract import Calibration, ModelInfo
-from sorvolo.detection.log_odds import log_odds
 from sorvolo.detection.session import Seen
 from sorvolo.geometry.arrays import Floats, Mask
 
@@ -70,3 +69,9 @@ def scaled_thresholds(
         name: float(platt_scaled(least, calibration[name])) if name in calibration else least
         for name, least in own.items()
     }
+
+
+def log_odds(scores: Floats | float, least: float) -> Floats:
+    """log(p / (1 - p)) of scores p of any shape, which count for `least` at least and for 1 - `least` at most."""
+    inside = np.clip(scores, least, 1 - least)
+    return np.asarray(np.log(inside / (1 - inside)))

@@ -13,16 +13,30 @@ import numpy as np
 from sorvolo.detection.calibration import calibrated
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.engine import Provider
+from sorvolo.detection.fusing import (
+    LOOK_QUARTERS,
+    SeenTile,
+    agreed,
+    agreed_in_sizes,
+    merge_tiles,
+    turned,
+    turned_back,
+)
 from sorvolo.detection.light import Picture, is_thermal, rgb_from_picture
 from sorvolo.detection.models import demand_searching, find_model, thermal_model
-from sorvolo.detection.pyramid import agreed_in_sizes, closer_for, sizes_for
 from sorvolo.detection.second_look import looked_again
 from sorvolo.detection.session import Seen, Session
-from sorvolo.detection.suppression import SeenTile, merge_tiles
-from sorvolo.detection.tiling import COARSEST_M, Tiles, is_too_small, looks_for, plan_tiles
-from sorvolo.detection.turning import LookSettings, agreed, turned, turned_back
+from sorvolo.detection.tiling import (
+    COARSEST_M,
+    Tiles,
+    closer_for,
+    is_too_small,
+    looks_for,
+    plan_tiles,
+    sizes_for,
+)
 from sorvolo.errors import SettingsError
-from sorvolo.geometry.arrays import Floats, ImageRGB, Labels
+from sorvolo.geometry.arrays import ImageRGB, Labels
 from sorvolo.survey.flight import Notice
 from sorvolo.survey.objects import Detections, Early, no_detections
 
@@ -34,6 +48,88 @@ class _SizedLook:
     seen: Seen
     scale: float
     names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Search:
+    """How one picture is searched, and by which model; `names` are the classes looked for."""
+
+    session: Session
+    names: tuple[str, ...]
+    tiles: Tiles
+    m_per_px: float  # NaN: not known
+    is_thermal: bool
+    overlapping: bool
+
+    def groups(self) -> Sequence[tuple[str, ...]]:
+        """The classes by the look that finds them, that of large ones last."""
+        if self.tiles != "auto":
+            return (self.names,)
+        return looks_for(self.session.info, self.m_per_px, self.names, self.is_thermal)
+
+    def see(
+        self, picture: ImageRGB, early: Callable[[tuple[str, ...], Seen], None] | None = None
+    ) -> Seen:
+        """What all looks at a picture (H, W, 3) see; `early` is given those that have classes of their own, first."""
+        groups = self.groups()
+        looks: dict[tuple[str, ...], Seen] = {}
+        for names in reversed(groups):  # the smaller look first: it is known soon
+            looks[names] = self._in_sizes(picture, names)
+            if early is not None and names != groups[0]:
+                early(names, looks[names])
+        return _together([looks[names] for names in groups], groups, self.session.info.classes)
+
+    def _in_sizes(self, picture: ImageRGB, names: Sequence[str]) -> Seen:
+        """What the looks of all sizes at a picture see together, best first."""
+        info = self.session.info
+        size_px = picture.shape[0], picture.shape[1]
+        looks = [self._look(picture, names)]
+        if self.overlapping:
+            return looks[0].seen
+        sizes = sizes_for(size_px, info, names, self.tiles, self.m_per_px)
+        if not sizes:
+            return looks[0].seen
+        looks += [self._look(picture, some, times) for times, some in sizes.items()]
+        seen, scales = [look.seen for look in looks], [look.scale for look in looks]
+        closer = closer_for(size_px, info, names, self.tiles, self.m_per_px, seen, scales)
+        looks += [self._look(picture, some, times) for times, some in closer.items()]
+        # the first look was for all classes
+        several = [name for name in names if any(name in look.names for look in looks[1:])]
+        groups, fused = [[name for name in names if name not in several]], [looks[0].seen]
+        for name in several:
+            own = [look for look in looks if name in look.names]
+            groups.append([name])
+            fused.append(
+                agreed_in_sizes(
+                    [look.seen for look in own],
+                    [look.scale for look in own],
+                    info.classes.index(name),
+                    info.pyramid[name],
+                )
+            )
+        return _together(fused, groups, info.classes)
+
+    def _look(self, picture: ImageRGB, names: Sequence[str], times: float = 1.0) -> _SizedLook:
+        """What the model sees in all tiles of a picture that is shown `times` as large as planned."""
+        size_px = picture.shape[0], picture.shape[1]
+        plan = plan_tiles(
+            size_px,
+            self.session.info,
+            names,
+            tiles=self.tiles,
+            m_per_px=self.m_per_px,
+            fixed_px=self.session.fixed_px,
+            thermal=self.is_thermal,
+            times=times,
+        )
+        tiles = []
+        for place in plan.places_px:
+            left, top, right, bottom = place
+            seen = self.session.see(picture[top:bottom, left:right], plan.scale)
+            corner = np.array([left, top, left, top], np.float32)
+            tiles.append(SeenTile(place, Seen(seen.boxes_px + corner, seen.scores, seen.labels)))
+        merged = tiles[0].seen if len(tiles) == 1 else merge_tiles(tiles, size_px)
+        return _SizedLook(merged, plan.scale, tuple(names))
 
 
 class Detector:
@@ -260,84 +356,78 @@ class Detector:
         is_part: bool,
         early: Early | None = None,
     ) -> Detections:
+        # which model looks, and for what
         thermal = is_thermal(picture)
         session = self._session if self._is_own(thermal=thermal) else self._night_session()
-        self._looks[session.info.name] += session is not self._session
+        info = session.info
+        self._looks[info.name] += session is not self._session
         rgb = rgb_from_picture(picture)
-        asked = [name for name in wanted if name in session.info.classes]
-        small = _too_small(asked, m_per_px, thermal=thermal, from_above=from_above)
+        names = [name for name in wanted if name in info.classes]
+        small = _too_small(names, m_per_px, thermal=thermal, from_above=from_above)
         if not is_part:
-            self._count(thermal=thermal, too_small=bool(small))
-        asked = [name for name in asked if name not in small]
-        if not asked:
+            self._daylight_frames += not (thermal or self.info.daylight)
+            self._thermal_frames += not self._is_own(thermal=thermal)
+            self._too_small_frames += bool(small)
+        names = [name for name in names if name not in small]
+        if not names:
             return no_detections(self.classes)
-        looks_twice = from_above and bool(session.info.turned)
+        search = _Search(session, tuple(names), tiles, m_per_px, thermal, overlapping)
 
-        def reported(looks: Seen, names: Sequence[str]) -> Detections:
-            seen = calibrated(looks, session.info)
-            least = _least_scores(
-                session.info, _thresholds(session.info, from_above), names, least_score
+        def report(seen: Seen, names: Sequence[str]) -> Detections:
+            """What is reported of these classes, in this detector's labels."""
+            seen = calibrated(seen, info)
+            thresholds = _thresholds(info, from_above)
+            least = np.array(
+                [
+                    np.inf
+                    if name not in names
+                    else thresholds[name]
+                    if least_score is None
+                    else least_score
+                    for name in info.classes
+                ]
             )
             kept = seen.scores >= least[seen.labels]
             labels = seen.labels[kept]
             if session is not self._session:
-                labels = _places_in(self.classes, session.info.classes)[labels]
+                labels = _places_in(self.classes, info.classes)[labels]
             return Detections(seen.boxes_px[kept], seen.scores[kept], labels, self.classes)
 
-        def whole(shown: ImageRGB) -> Seen:
-            groups = (
-                looks_for(session.info, m_per_px, asked, thermal)
-                if tiles == "auto"
-                else (tuple(asked),)
-            )
-            looks: dict[tuple[str, ...], Seen] = {}
-            for names in reversed(groups):  # the smaller look first: it is known soon
-                looks[names] = in_sizes(shown, names)
-                is_last = names == groups[0]
-                if early is not None and not (
-                    is_last or looks_twice or session.info.second_look.keys() & set(names)
-                ):
-                    early(names, reported(looks[names], names))
-            return _together([looks[names] for names in groups], groups, session.info.classes)
+        def report_early(names: tuple[str, ...], seen: Seen) -> None:
+            if early is not None and not info.second_look.keys() & set(names):
+                early(names, report(seen, names))
 
-        def in_sizes(shown: ImageRGB, names: Sequence[str]) -> Seen:
-            whole_px = shown.shape[0], shown.shape[1]
-            sizes = {} if overlapping else sizes_for(whole_px, session.info, names, tiles, m_per_px)
-            looks = [look(shown, names), *(look(shown, of, times) for times, of in sizes.items())]
-            if not sizes:
-                return looks[0].seen
-            seen, scales = [each.seen for each in looks], [each.scale for each in looks]
-            closer = closer_for(whole_px, session.info, names, tiles, m_per_px, seen, scales)
-            looks += [look(shown, of, times) for times, of in closer.items()]
-            return _in_sizes(looks, names, session.info)
+        # from straight above nothing is upright: the picture as it is and a quarter turned
+        if from_above and info.turned:
+            size_px = rgb.shape[0], rgb.shape[1]
+            looks = []
+            for quarters in LOOK_QUARTERS:
+                seen = search.see(turned(rgb, quarters))
+                boxes_px = turned_back(seen.boxes_px, quarters, size_px)
+                looks.append(Seen(boxes_px, seen.scores, seen.labels))
+            seen = agreed(looks)
+        else:
+            seen = search.see(rgb, report_early)
+        # a second look at the reports, by each model that has one
+        hows = {
+            info.classes.index(name): how for name, how in info.second_look.items() if name in names
+        }
+        for by in dict.fromkeys(how.by for how in hows.values()):
+            looking = self._second(session, by)
+            if looking.fixed_px is not None:  # sheets have sizes of their own
+                continue
+            places = _places_in(info.classes, looking.info.classes)
 
-        def look(shown: ImageRGB, names: Sequence[str], times: float = 1.0) -> _SizedLook:
-            size_px = shown.shape[0], shown.shape[1]
-            plan = plan_tiles(
-                size_px,
-                session.info,
-                names,
-                tiles=tiles,
-                m_per_px=m_per_px,
-                fixed_px=session.fixed_px,
-                thermal=thermal,
-                times=times,
-            )
-            tiles_seen = [
-                SeenTile(place, _look(session, shown, place, plan.scale))
-                for place in plan.places_px
-            ]
-            seen = tiles_seen[0].seen if len(tiles_seen) == 1 else merge_tiles(tiles_seen, size_px)
-            return _SizedLook(seen, plan.scale, tuple(names))
+            def see_again(
+                sheet: ImageRGB, looking: Session = looking, places: Labels = places
+            ) -> Seen:
+                self._looks[looking.info.name] += 1
+                again = looking.see(sheet)
+                return Seen(again.boxes_px, again.scores, places[again.labels])
 
-        seen = _seen_turned(rgb, whole) if looks_twice else whole(rgb)
-        return reported(self._seen_again(session, rgb, seen, asked), asked)
-
-    def _count(self, *, thermal: bool, too_small: bool) -> None:
-        """Count a frame for the notices."""
-        self._daylight_frames += not (thermal or self.info.daylight)
-        self._thermal_frames += not self._is_own(thermal=thermal)
-        self._too_small_frames += too_small
+            mine = {label: how for label, how in hows.items() if how.by == by}
+            seen = looked_again(seen, rgb, see_again, mine)
+        return report(seen, names)
 
     def _is_own(self, *, thermal: bool) -> bool:
         """Whether this model itself looks at frames of such light, and no other is sought."""
@@ -354,31 +444,6 @@ class Detector:
                 self._at_night = None if found is None else self._opened(found)
                 self._night_was_sought = True
         return self._at_night or self._session
-
-    def _seen_again(
-        self, session: Session, rgb: ImageRGB, seen: Seen, asked: Sequence[str]
-    ) -> Seen:
-        """What was seen, scored again by a second look at the reports of `asked` classes for which a model has one."""
-        info = session.info
-        hows = {
-            info.classes.index(name): how for name, how in info.second_look.items() if name in asked
-        }
-        for by in dict.fromkeys(how.by for how in hows.values()):
-            looking = self._second(session, by)
-            mine = {label: how for label, how in hows.items() if how.by == by}
-            if looking.fixed_px is None:  # sheets have sizes of their own
-                seen = looked_again(seen, rgb, self._counted(looking, info.classes), mine)
-        return seen
-
-    def _counted(self, looking: Session, classes: Sequence[str]) -> Callable[[ImageRGB], Seen]:
-        """`_in_labels_of` of a model whose looks count."""
-        sees = _in_labels_of(looking, classes)
-
-        def counts(picture: ImageRGB) -> Seen:
-            self._looks[looking.info.name] += 1
-            return sees(picture)
-
-        return counts
 
     def _second(self, session: Session, by: str) -> Session:
         """Who looks a second time; threads that ask at once wait for it."""
@@ -412,50 +477,6 @@ def _together(
     )
 
 
-def _in_sizes(looks: Sequence[_SizedLook], names: Sequence[str], info: ModelInfo) -> Seen:
-    """What looks at one picture saw together of `names`, best first; the first looked for all of them."""
-    several = [name for name in names if any(name in each.names for each in looks[1:])]
-    groups, seen = [[name for name in names if name not in several]], [looks[0].seen]
-    for name in several:
-        own = [each for each in looks if name in each.names]
-        groups.append([name])
-        seen.append(
-            agreed_in_sizes(
-                [each.seen for each in own],
-                [each.scale for each in own],
-                info.classes.index(name),
-                info.pyramid[name],
-            )
-        )
-    return _together(seen, groups, info.classes)
-
-
-def _seen_turned(rgb: ImageRGB, whole: Callable[[ImageRGB], Seen]) -> Seen:
-    """What the looks at a picture from straight above agree on."""
-    looks, settings = [], LookSettings()
-    for quarters in settings.quarters:
-        seen = whole(turned(rgb, quarters))
-        looks.append(
-            Seen(
-                turned_back(seen.boxes_px, quarters, (rgb.shape[0], rgb.shape[1])),
-                seen.scores,
-                seen.labels,
-            )
-        )
-    return agreed(looks, settings)
-
-
-def _in_labels_of(session: Session, classes: Sequence[str]) -> Callable[[ImageRGB], Seen]:
-    """How a model sees, its labels by the places of their names in `classes`; -1 for other names."""
-    own = _places_in(classes, session.info.classes)
-
-    def sees(picture: ImageRGB) -> Seen:
-        seen = session.see(picture)
-        return Seen(seen.boxes_px, seen.scores, own[seen.labels])
-
-    return sees
-
-
 def _places_in(classes: Sequence[str], names: Sequence[str]) -> Labels:
     """(names,) where each name stands in `classes`; -1 where it does not."""
     return np.array([classes.index(name) if name in classes else -1 for name in names], np.int64)
@@ -470,25 +491,3 @@ def _too_small(
 
 def _thresholds(info: ModelInfo, from_above: bool) -> Mapping[str, float]:
     return info.turned if from_above and info.turned else info.thresholds
-
-
-def _least_scores(
-    info: ModelInfo,
-    thresholds: Mapping[str, float],
-    wanted: Sequence[str],
-    least_score: float | None,
-) -> Floats:
-    """(classes,) the score from which on each of the model's classes is reported; infinite where it is not wanted."""
-    least = [thresholds[name] if least_score is None else least_score for name in info.classes]
-    return np.where([name in wanted for name in info.classes], least, np.inf)
-
-
-def _look(
-    session: Session, rgb: ImageRGB, place_px: tuple[int, int, int, int], scale: float
-) -> Seen:
-    """What the model sees in one tile, in the picture's pixels."""
-    left, top, right, bottom = place_px
-    seen = session.see(rgb[top:bottom, left:right], scale)
-    return Seen(
-        seen.boxes_px + np.array([left, top, left, top], np.float32), seen.scores, seen.labels
-    )

@@ -1,7 +1,6 @@
 """How large a flight's frames are shown to the detector where no telemetry knows their scale: chosen from the scene."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -16,18 +15,11 @@ Look = Callable[[ImageRGB], Detections]
 """Something that searches a picture (H, W, 3) as it is."""
 
 
-@dataclass(frozen=True)
-class ProbeSettings:
-    """When and how the middle of a frame is looked at enlarged."""
-
-    size_px: tuple[int, int] = (
-        480,
-        640,
-    )  # of the middle, height and width: it costs as much as nine times its pixels
-    times: tuple[float, ...] = (1.0, 2.0, 3.0)  # as large as it is
-    # frames until it is done again, then three times as many, and so on: drones climb
-    first_again: int = 30
-    growth: int = 3  # times as many frames until the next
+# When and how the middle of a frame is looked at enlarged.
+_SIZE_PX = (480, 640)  # of the middle, height and width: it costs as much as nine times its pixels
+_TIMES = (1.0, 2.0, 3.0)  # as large as it is
+_FIRST_AGAIN = 30  # frames until it is done again, ...
+_GROWTH = 3  # ... then so many times as many, and so on: drones climb
 
 
 class SceneMagnifier:
@@ -36,10 +28,8 @@ class SceneMagnifier:
     Things that are too small in a frame as it is are found in its enlarged middle; their size is the scale.
     """
 
-    def __init__(
-        self, info: ModelInfo, wanted: Sequence[str], settings: ProbeSettings = ProbeSettings()
-    ) -> None:
-        self._info, self._wanted, self._settings = info, tuple(wanted), settings
+    def __init__(self, info: ModelInfo, wanted: Sequence[str]) -> None:
+        self._info, self._wanted = info, tuple(wanted)
         self._scale = SceneScale()
         self._frames, self._next = 0, 0
 
@@ -47,7 +37,7 @@ class SceneMagnifier:
         """Of the next frame (H, W, 3); None where the scene does not show it, or shows only people large enough."""
         if self._frames == self._next:
             self._probe(picture, look)
-            self._next = max(self._settings.first_again, self._next * self._settings.growth)
+            self._next = max(_FIRST_AGAIN, self._next * _GROWTH)
         self._frames += 1
         m_per_px = self._scale.m_per_px()
         if m_per_px is None or self._scale.fit is not None:
@@ -59,12 +49,10 @@ class SceneMagnifier:
         self._scale.see(found, picture.shape[:2])
 
     def _probe(self, picture: ImageRGB, look: Look) -> None:
-        height, width = (
-            min(side, most) for side, most in zip(picture.shape[:2], self._settings.size_px)
-        )
+        height, width = (min(side, most) for side, most in zip(picture.shape[:2], _SIZE_PX))
         top, left = (picture.shape[0] - height) // 2, (picture.shape[1] - width) // 2
         middle = np.ascontiguousarray(picture[top : top + height, left : left + width])
-        for times in self._settings.times:
+        for times in _TIMES:
             size = round(width * times), round(height * times)
             shown = (
                 middle if times == 1 else cv2.resize(middle, size, interpolation=cv2.INTER_LINEAR)

@@ -1,13 +1,20 @@
-"""How large a picture is shown to the detector and in which tiles, from the ground that a pixel covers."""
+"""Which looks the detector takes at a picture: how large and in which tiles, from the ground that a pixel covers.
+
+A network knows objects of some sizes better than of others. Where the ground that a pixel covers is known, the picture
+is shown at the right size; where it is not, in several (an image pyramid, `fusing`), and only the boxes themselves show
+which of them to believe.
+"""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from sorvolo.detection.contract import MOST_LARGER, ModelInfo
+from sorvolo.detection.contract import MOST_LARGER, ModelInfo, Pyramid
+from sorvolo.detection.fusing import trust
+from sorvolo.detection.session import Seen
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.planning import BOTTOM_CRITICAL_M, Task, required_px_per_m
 from sorvolo.survey.objects import TYPICAL_SIZE_M
@@ -33,6 +40,10 @@ _THERMAL_LARGER = 1.5
 _MUCH_LONGER = 1.4  # times what the model knows: from there on a class gets a look of its own, which costs half or less
 _LEAST_OVERLAP_PX, _SPARE = 64, 1.15
 _LEAST_SIDE_PX = 64  # of a tile: less is a typing error
+MOST_MAGNIFIED_PX = 20_000_000  # of a magnified picture: what a photo of that size costs; by choice
+_LEAST_SMALL = (
+    0.3  # a score from which on something small is worth a closer look: as of the second look
+)
 
 
 @dataclass(frozen=True)
@@ -232,3 +243,67 @@ def _spans(length: int, side: float, overlap: float, step: float) -> list[tuple[
     whole = max(1, min(math.floor(side), math.floor(short), length))
     starts = np.rint(np.linspace(0, length - whole, count)).astype(int).tolist()
     return [(start, start + whole) for start in starts]
+
+
+def sizes_for(
+    size_px: tuple[int, int],
+    info: ModelInfo,
+    wanted: Sequence[str],
+    tiles: Tiles,
+    m_per_px: float,
+) -> dict[float, tuple[str, ...]]:
+    """How many times as large a picture of (height, width) `size_px` is shown besides as it is, and for which classes.
+
+    Where "auto" does not know its scale, those of the model's `pyramid` at which it has `MOST_MAGNIFIED_PX` or less.
+    """
+    asked = {name: each.times for name, each in _asked(info, wanted, tiles, m_per_px).items()}
+    return _within(size_px, asked)
+
+
+def closer_for(
+    size_px: tuple[int, int],
+    info: ModelInfo,
+    wanted: Sequence[str],
+    tiles: Tiles,
+    m_per_px: float,
+    looks: Sequence[Seen],
+    times: Sequence[float],
+) -> dict[float, tuple[str, ...]]:
+    """The same of closer looks: for the classes of which the `looks` so far, `times` as large (the first of the picture
+    as it is), show something small.
+
+    Small is what the model knows better as large as it is shown there than in any look so far.
+    """
+    asked = {}
+    for name, pyramid in _asked(info, wanted, tiles, m_per_px).items():
+        label = info.classes.index(name)
+        boxes = [
+            look.boxes_px[(look.labels == label) & (look.scores >= _LEAST_SMALL)] for look in looks
+        ]
+        shown = np.array([*times, *(times[0] * each for each in pyramid.closer)])
+        best = trust(np.concatenate(boxes), shown, pyramid).argmax(axis=1)
+        asked[name] = tuple(
+            each for k, each in enumerate(pyramid.closer, len(times)) if (best == k).any()
+        )
+    return _within(size_px, asked)
+
+
+def _asked(
+    info: ModelInfo, wanted: Sequence[str], tiles: Tiles, m_per_px: float
+) -> dict[str, Pyramid]:
+    """The classes that are looked for in several sizes."""
+    if tiles != "auto" or not math.isnan(m_per_px):
+        return {}
+    return {name: info.pyramid[name] for name in wanted if name in info.pyramid}
+
+
+def _within(
+    size_px: tuple[int, int], asked: Mapping[str, Sequence[float]]
+) -> dict[float, tuple[str, ...]]:
+    """The sizes at which a picture has not too many pixels, each with its classes."""
+    area_px = size_px[0] * size_px[1]
+    return {
+        each: tuple(name for name, times in asked.items() if each in times)
+        for each in sorted({each for times in asked.values() for each in times})
+        if area_px * each**2 <= MOST_MAGNIFIED_PX
+    }

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from sorvolo.detection.detector import Detector
+from sorvolo.detection.fusing import is_from_above
 from sorvolo.detection.models import installed_models
-from sorvolo.detection.turning import is_from_above
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.camera import Camera

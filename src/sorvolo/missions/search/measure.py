@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TypeAlias
 
-from sorvolo.detection.turning import is_from_above
+from sorvolo.detection.fusing import is_from_above
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import BoxesPx, Floats, ImageRGB, Mask, Vector3
 from sorvolo.geometry.sun import direction_from_angles

@@ -7,7 +7,7 @@ from statistics import median
 from typing import Protocol
 
 from sorvolo.capture.source import LiveSource
-from sorvolo.detection.turning import is_from_above
+from sorvolo.detection.fusing import is_from_above
 from sorvolo.geometry.arrays import Floats
 from sorvolo.geometry.pose import Pose
 from sorvolo.missions.flight.setup import FlightSetup, new_site

@@ -1,0 +1,312 @@
+"""What several looks at one picture saw, put together: of neighbouring tiles, of turned copies, of several sizes."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from sorvolo.detection.calibration import log_odds
+from sorvolo.detection.contract import Pyramid
+from sorvolo.detection.session import Seen
+from sorvolo.geometry.arrays import BoxesPx, Floats, ImageRGB, Labels, Mask, Matrix3, Numbers, Rows
+from sorvolo.geometry.box_overlap import areas, cover_matrix, iou_matrix
+
+SAME_IOU = 0.4
+"""Two tiles' boxes of a class are one object if they overlap this much in what both tiles show."""
+
+_COVERED = (
+    0.7  # so much of a cut piece within a box that another tile saw whole: the piece adds nothing
+)
+# a box that ends so near its tile's border may go on beyond; boxes are imprecise
+_TOUCH_SHARE, _TOUCH_PX = 0.2, 2.0
+_MORE = (
+    1.1  # times the piece's area: a box of its own size is no whole that it is part of; by choice
+)
+
+# The thresholds on models' cards (`turned`, `pyramid`) hold for these values.
+LOOK_QUARTERS = (0, 1)  # quarter turns, one for each look at a picture from straight above
+_LEAST_DOWN = 0.8  # of the optical axis: 37 degrees off straight down or less is from above
+_SAME_OBJECT_IOU = 0.5  # boxes of one class that overlap more are one object, as COCO counts them
+_UNSEEN = 0.02  # the score of what a turned look does not show: models report nothing below it
+_UNSEEN_ODDS = -4.5  # log-odds of what a sized look does not show: models report from -3.9 on
+_LEAST_SURE = 1e-4  # no score counts for less, nor for more than 1 less this
+_LEAST_TRUST = 1e-6  # of a look, beside the best one: it stays above zero, and its logarithm finite
+
+
+@dataclass(frozen=True, eq=False)
+class SeenTile:
+    """A tile's place in the picture, left, top, right, bottom px, and what was seen there, in the picture's pixels."""
+
+    place_px: tuple[int, int, int, int]
+    seen: Seen
+
+
+@dataclass(frozen=True, eq=False)
+class _Views:
+    """All tiles' boxes as columns: which tile saw each, which sides a border may have cut, how far borders are."""
+
+    boxes_px: BoxesPx
+    scores: Floats
+    labels: Labels
+    tiles: Rows
+    cut: Mask  # (N,)
+    room_px: Floats  # (N,) to the nearest border within the picture
+
+
+def merge_tiles(tiles: Sequence[SeenTile], size_px: tuple[int, int]) -> Seen:
+    """What overlapping tiles of a picture, (height, width) `size_px`, saw together, each object once, best first.
+
+    Boxes of one class in two tiles are the same object if, seen through the window that both tiles share, they are
+    the same box: so a cut piece finds its whole. At most one box of a tile goes into an object. Where a tile saw it
+    whole, the one that saw it most centrally gives its place; where none did (it is longer than the overlap), its
+    pieces are joined. The score is the best of all. What is left of cut pieces goes if another tile's box covers it,
+    whatever its class: a car's corner that alone looked like something else.
+    """
+    views = _views(tiles, size_px)
+    objects = _gathered(views, tiles)
+    boxes = np.zeros((len(objects), 4), np.float32)
+    scores, labels, is_piece = (
+        np.zeros(len(objects)),
+        np.zeros(len(objects), np.int64),
+        np.zeros(len(objects), bool),
+    )
+    for row, members in enumerate(objects):
+        whole = members[~views.cut[members]]
+        if len(whole):
+            boxes[row] = views.boxes_px[whole[np.argmax(views.room_px[whole])]]
+        else:
+            pieces = views.boxes_px[members]
+            boxes[row] = [*pieces[:, :2].min(axis=0), *pieces[:, 2:].max(axis=0)]
+        scores[row], labels[row], is_piece[row] = (
+            views.scores[members].max(),
+            views.labels[members[0]],
+            not len(whole),
+        )
+    kept = _not_covered(
+        boxes, is_piece, [set(views.tiles[members].tolist()) for members in objects]
+    )
+    order = kept[np.argsort(-scores[kept], kind="stable")]
+    return Seen(boxes[order], scores[order], labels[order])
+
+
+def _views(tiles: Sequence[SeenTile], size_px: tuple[int, int]) -> _Views:
+    boxes = np.concatenate([np.zeros((0, 4), np.float32), *(tile.seen.boxes_px for tile in tiles)])
+    places = np.concatenate(
+        [
+            np.zeros((0, 4)),
+            *(
+                np.tile(np.array(tile.place_px, float), (len(tile.seen.scores), 1))
+                for tile in tiles
+            ),
+        ]
+    )
+    picture = np.array([0, 0, size_px[1], size_px[0]], float)
+    room = np.abs(boxes - places)
+    room[places == picture] = np.inf  # the picture's own edge cuts nothing that could be seen
+    sides = boxes[:, 2:] - boxes[:, :2]
+    reach = np.maximum(_TOUCH_PX, _TOUCH_SHARE * np.concatenate([sides, sides], axis=1))
+    return _Views(
+        boxes,
+        np.concatenate([np.zeros(0), *(tile.seen.scores for tile in tiles)]),
+        np.concatenate([np.zeros(0, np.int64), *(tile.seen.labels for tile in tiles)]),
+        np.repeat(np.arange(len(tiles)), [len(tile.seen.scores) for tile in tiles]),
+        (room <= reach).any(axis=1),
+        room.min(axis=1, initial=np.inf),
+    )
+
+
+def _gathered(views: _Views, tiles: Sequence[SeenTile]) -> list[Rows]:
+    """Indices of the boxes that are one object, most alike first; no two from one tile."""
+    pairs = [
+        pair
+        for first, second in combinations(range(len(tiles)), 2)
+        for pair in _alike(views, tiles, first, second)
+    ]
+    groups = [[each] for each in range(len(views.scores))]
+    for _, one, other in sorted(pairs, key=lambda pair: -pair[0]):
+        a, b = groups[one], groups[other]
+        if a is not b and not {*views.tiles[a].tolist()} & {*views.tiles[b].tolist()}:
+            a += b
+            for each in b:
+                groups[each] = a
+    return [np.array(group) for index, group in enumerate(groups) if group[0] == index]
+
+
+def _alike(
+    views: _Views, tiles: Sequence[SeenTile], first: int, second: int
+) -> list[tuple[float, int, int]]:
+    """Pairs of boxes, one of each tile, that look the same in the window which both tiles share; how much first."""
+    a, b = tiles[first].place_px, tiles[second].place_px
+    window = np.array(
+        [max(a[0], b[0]), max(a[1], b[1]), min(a[2], b[2]), min(a[3], b[3])], np.float32
+    )
+    if window[0] >= window[2] or window[1] >= window[3]:
+        return []
+    ones, others = np.flatnonzero(views.tiles == first), np.flatnonzero(views.tiles == second)
+    whole = iou_matrix(views.boxes_px[ones], views.boxes_px[others])
+    through = iou_matrix(
+        _within(views.boxes_px[ones], window), _within(views.boxes_px[others], window)
+    )
+    has_cut = views.cut[ones][:, None] | views.cut[others][None]
+    alike = np.where(has_cut, through, whole)
+    alike[views.labels[ones][:, None] != views.labels[others][None]] = 0
+    rows, columns = np.nonzero(alike >= SAME_IOU)
+    return [
+        (float(alike[row, column]), int(ones[row]), int(others[column]))
+        for row, column in zip(rows, columns)
+    ]
+
+
+def _not_covered(boxes: BoxesPx, is_piece: Mask, tiles: Sequence[set[int]]) -> Rows:
+    """Indices of the objects, without the pieces that lie in a larger box of other tiles."""
+    pieces = np.flatnonzero(is_piece)
+    cover = cover_matrix(boxes[pieces], boxes)
+    area = areas(boxes)
+    gone = [
+        piece
+        for row, piece in enumerate(pieces.tolist())
+        if any(
+            area[other] > _MORE * area[piece] and not tiles[piece] & tiles[other]
+            for other in np.flatnonzero(cover[row] >= _COVERED).tolist()
+        )
+    ]
+    return np.setdiff1d(np.arange(len(boxes)), np.array(gone, np.int64))
+
+
+def _within(boxes: BoxesPx, window: Numbers) -> BoxesPx:
+    return np.concatenate(
+        [
+            np.clip(boxes[:, :2], window[:2], window[2:]),
+            np.clip(boxes[:, 2:], window[:2], window[2:]),
+        ],
+        axis=1,
+    )
+
+
+def is_from_above(site_from_camera: Matrix3) -> bool:
+    """Whether a camera of this rotation (3, 3) looks about straight down."""
+    return -float(site_from_camera[2, 2]) >= _LEAST_DOWN
+
+
+def turned(picture: ImageRGB, quarters: int) -> ImageRGB:
+    """A picture (H, W, 3) turned counter-clockwise by this many quarters."""
+    return np.ascontiguousarray(np.rot90(picture, quarters))
+
+
+def turned_back(boxes_px: BoxesPx, quarters: int, size_px: tuple[int, int]) -> BoxesPx:
+    """Boxes (N, 4) of a turned picture in the picture as it was, (height, width) `size_px`."""
+    height, width = size_px
+    left, top, right, bottom = boxes_px.T
+    columns = {
+        0: (left, top, right, bottom),
+        1: (width - bottom, left, width - top, right),
+        2: (width - right, height - bottom, width - left, height - top),
+        3: (top, height - right, bottom, height - left),
+    }[quarters % 4]
+    return np.column_stack(columns).astype(np.float32).reshape(-1, 4)
+
+
+def agreed(looks: Sequence[Seen]) -> Seen:
+    """What several looks at one picture saw, each object once, best first.
+
+    Boxes of a class that overlap are one object, at most one of each look. Its score is the mean over all looks, so
+    that what only one of them shows counts less; its box the mean of the looks' boxes by their scores.
+    """
+    boxes = np.concatenate([each.boxes_px for each in looks]).astype(np.float64)
+    scores = np.concatenate([each.scores for each in looks])
+    labels = np.concatenate([each.labels for each in looks])
+    of_look = np.repeat(np.arange(len(looks)), [len(each.scores) for each in looks])
+    kept: list[tuple[Floats, float, int]] = []
+    for label in np.unique(labels).tolist():
+        rows = np.flatnonzero(labels == label)
+        rows = rows[np.argsort(-scores[rows], kind="stable")]
+        for group in alike(boxes[rows]):
+            members = rows[group]
+            best = np.full(len(looks), _UNSEEN)
+            np.maximum.at(best, of_look[members], scores[members])
+            kept.append(
+                (
+                    np.average(boxes[members], axis=0, weights=scores[members]),
+                    float(best.mean()),
+                    label,
+                )
+            )
+    order = sorted(range(len(kept)), key=lambda k: -kept[k][1])
+    return Seen(
+        np.array([kept[k][0] for k in order], np.float32).reshape(-1, 4),
+        np.array([kept[k][1] for k in order]),
+        np.array([kept[k][2] for k in order], np.int64),
+    )
+
+
+def alike(boxes_px: Floats) -> Iterator[Rows]:
+    """Rows of boxes (N, 4) that are one object: of what is left the first, and all that overlap it more than so."""
+    overlap = iou_matrix(boxes_px, boxes_px)
+    is_free = np.ones(len(boxes_px), bool)
+    for first in range(len(boxes_px)):
+        if is_free[first]:
+            others = np.flatnonzero(is_free & (overlap[first] > _SAME_OBJECT_IOU))
+            group = np.concatenate([[first], others[others != first]])
+            is_free[group] = False
+            yield group
+
+
+def agreed_in_sizes(
+    looks: Sequence[Seen],
+    times: Sequence[float],
+    label: int,
+    pyramid: Pyramid,
+) -> Seen:
+    """What looks at one picture, each `times` as large, saw of one class: each object once, best first.
+
+    All boxes are in the picture's own pixels. Boxes that overlap are one object, at most one of each look. Its
+    log-odds are the looks' mean, weighed by how well the model knows an object of the size at which each look shows
+    it (`trust`), a logarithmic opinion pool (Genest and Zidek 1986), and `Pyramid.shift`; its box is the mean of the
+    looks' boxes by these weights times their scores.
+    """
+    own = [look.labels == label for look in looks]
+    boxes = np.concatenate([look.boxes_px[mine] for look, mine in zip(looks, own)])
+    scores = np.concatenate([look.scores[mine] for look, mine in zip(looks, own)])
+    of_look = np.repeat(np.arange(len(looks)), [np.count_nonzero(mine) for mine in own])
+    odds = log_odds(scores, _LEAST_SURE)
+    weights = trust(boxes, np.array(times), pyramid)
+    claims = odds + np.log(
+        weights[np.arange(len(boxes)), of_look]
+    )  # the look that knows the size best leads
+    order = np.argsort(-claims, kind="stable")
+    found_px, found_odds = [np.zeros((0, 4))], []
+    for group in alike(boxes[order]):
+        rows, own_weights = order[group], weights[order[group[0]]]
+        best = np.full(len(looks), _UNSEEN_ODDS)
+        np.maximum.at(best, of_look[rows], odds[rows])
+        found_odds.append(float(own_weights @ best) + pyramid.shift)
+        found_px.append(
+            np.average(boxes[rows], axis=0, weights=own_weights[of_look[rows]] * scores[rows])[None]
+        )
+    best_first = np.argsort(-np.array(found_odds), kind="stable")
+    return Seen(
+        np.concatenate(found_px)[best_first].astype(np.float32),
+        1 / (1 + np.exp(-np.array(found_odds)[best_first])),
+        np.full(len(found_odds), label, np.int64),
+    )
+
+
+def trust(
+    boxes_px: BoxesPx,
+    times: Floats,
+    pyramid: Pyramid,
+) -> Floats:
+    """(N, looks) shares of the opinion on boxes (N, 4) in looks that show the picture `times` as large.
+
+    The first look shows it as it is. A closer look is asked about what it knows best alone: larger things lose by it.
+    """
+    area_px = (boxes_px[:, 2] - boxes_px[:, 0]) * (boxes_px[:, 3] - boxes_px[:, 1])
+    off = (
+        np.log2(np.sqrt(np.maximum(area_px, 1.0))[:, None] * times / pyramid.known_px)
+        / pyramid.octaves
+    )
+    curve = np.exp(-0.5 * (off**2 - (off**2).min(axis=1, keepdims=True))) + _LEAST_TRUST
+    is_closer = np.isin(times, times[0] * np.array(pyramid.closer))
+    curve[~is_closer[curve.argmax(axis=1)][:, None] & is_closer] = _LEAST_TRUST
+    return np.asarray(curve / curve.sum(axis=1, keepdims=True))
