@@ -10,8 +10,8 @@ import pytest
 from toy_models import CLASSES, draw, rectangle_model
 
 import sorvolo
-import sorvolo.detection.detector as detector_module
 from sorvolo.detection.detector import Detector
+from sorvolo.detection.session import Seen, Session
 from sorvolo.errors import InputError, SettingsError
 
 _BOXES = [(10, 20, 50, 80), (170, 60, 200, 90), (60, 100, 90, 120)]
@@ -119,12 +119,12 @@ def test_large_cars_are_seen_in_a_smaller_look_and_people_in_the_picture(
     )
     scales = []
 
-    def noted(session: object, rgb: object, place_px: object, scale: float) -> object:
+    def noted(session: Session, rgb: np.ndarray, scale: float = 1.0) -> Seen:
         scales.append(scale)
-        return look(session, rgb, place_px, scale)
+        return see(session, rgb, scale)
 
-    look = detector_module._look
-    monkeypatch.setattr(detector_module, "_look", noted)
+    see = Session.see
+    monkeypatch.setattr(Session, "see", noted)
     longest_px = detector.info.best_px["car"][1]
     early = []
     m_per_px = 4.4 / (1.5 * longest_px)

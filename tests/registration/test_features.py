@@ -77,7 +77,7 @@ def test_nothing_is_found_in_nothing(extract):
 
 
 def test_corners_are_inside_and_spread():
-    found = corners(normalise_contrast(GRAY), FeatureSettings())
+    found = corners(normalise_contrast(GRAY))
     assert (found >= 0).all() and (found <= [WIDTH - 1, HEIGHT - 1]).all()
     assert len({(int(x // 80), int(y // 60)) for x, y in found}) == 36
 
@@ -85,7 +85,7 @@ def test_corners_are_inside_and_spread():
 def test_corners_sit_on_corners():
     board = np.full((HEIGHT, WIDTH), 60, np.uint8)
     board[100:180, 140:260] = 200
-    found = corners(board, FeatureSettings())
+    found = corners(board)
     for corner in ([139.5, 99.5], [259.5, 99.5], [259.5, 179.5], [139.5, 179.5]):
         assert np.linalg.norm(found - corner, axis=1).min() < 4.0
 

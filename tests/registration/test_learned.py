@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sorvolo.registration.learned import LEARNED, learned_features, release_network
+from sorvolo.registration.features import LEARNED, learned_features, release_network
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sorvolo.geometry.homography import apply_homography
-from sorvolo.registration.robust_fit import fit_homography, is_believable
+from sorvolo.registration.matching import fit_homography, is_believable
 
 A_FROM_B = np.array([[0.98, -0.17, 40], [0.17, 0.98, -25], [2e-5, -3e-5, 1]])
 CORNERS = np.array([[0, 0], [640, 0], [640, 480], [0, 480]], float)

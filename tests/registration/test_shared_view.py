@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sorvolo.registration.shared_view import shared_view
+from sorvolo.registration.place_search import shared_view
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from sorvolo.geometry.summary import median_or_nan
 from sorvolo.geometry.track import find_strips, length_m, speeds_m_s
 from sorvolo.geometry.units import SECOND_NS
 from sorvolo.registration.features import sharpness_and_texture
-from sorvolo.registration.shared_view import shared_view
+from sorvolo.registration.place_search import shared_view
 from sorvolo.survey.flight import Frame, Telemetry
 
 WANTED_OVERLAP = 0.7

@@ -40,8 +40,7 @@ from sorvolo.registration.features import (
     sift_features,
 )
 from sorvolo.registration.link import LinkCache, LinkSettings, refine
-from sorvolo.registration.matching import match
-from sorvolo.registration.robust_fit import fit_homography
+from sorvolo.registration.matching import fit_homography, match
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Features, Keyframe, Link
 

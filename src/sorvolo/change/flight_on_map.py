@@ -11,8 +11,7 @@ from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, Mask, Matrix3, 
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import apply_homography, fit_similarity
 from sorvolo.geometry.pose import Pose
-from sorvolo.registration.features import gray_from_rgb
-from sorvolo.registration.learned import learned_features, match_learned
+from sorvolo.registration.features import gray_from_rgb, learned_features, match_learned
 from sorvolo.survey.mosaic import Features
 
 # How photos whose places beside each other are known are looked for on the map together; pixels are

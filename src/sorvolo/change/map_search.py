@@ -20,15 +20,16 @@ from sorvolo.geometry.pose import Pose, rotation_from_vector
 from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 from sorvolo.registration.camera_fit import CameraFit, PosePrior, fit_camera, similar
 from sorvolo.registration.features import (
+    LEARNED,
     FeatureSettings,
     filled,
     gray_from_rgb,
     known_only,
+    learned_features,
+    match_learned,
     orb_features,
 )
-from sorvolo.registration.learned import LEARNED, learned_features, match_learned
-from sorvolo.registration.matching import match
-from sorvolo.registration.robust_fit import fit_homography
+from sorvolo.registration.matching import fit_homography, match
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Features
 

@@ -27,8 +27,12 @@ from sorvolo.mosaic.ground_ties import GroundTies
 from sorvolo.mosaic.overview import Overview, lay_out
 from sorvolo.mosaic.pose_graph import PoseGraph, pose_from_link
 from sorvolo.mosaic.shelf import Shelf, ShelvedRows
-from sorvolo.registration.features import gray_from_rgb, normalise_contrast, orb_features
-from sorvolo.registration.learned import release_network
+from sorvolo.registration.features import (
+    gray_from_rgb,
+    normalise_contrast,
+    orb_features,
+    release_network,
+)
 from sorvolo.registration.link import Effort, LinkCache, LinkPrediction, LinkSettings, link
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Features, Keyframe, Link, NoLink, Status

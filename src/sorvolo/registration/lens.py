@@ -1,4 +1,7 @@
-"""Taking a lens's distortion out of pictures, and the camera that a flight found out it had."""
+"""Pictures remade: without their lens's distortion, and smaller; and OpenCV's own threads."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import cv2
 import numpy as np
@@ -146,3 +149,35 @@ def _seen_from_ideal(ideal: Floats, radial: float) -> Floats:
     for _ in range(10):
         seen -= (seen + radial * seen**3 - radius) / np.maximum(1 + 3 * radial * seen**2, 0.1)
     return ideal * np.where(radius > 1e-12, seen / np.maximum(radius, 1e-12), 1.0)
+
+
+def at_size(image: ImageRGB, width_px: int, height_px: int) -> ImageRGB:
+    """The picture, (H, W, 3), at this size; the very same where it has it."""
+    if image.shape[1::-1] == (width_px, height_px):
+        return image
+    return np.asarray(
+        cv2.resize(image, (width_px, height_px), interpolation=cv2.INTER_AREA), np.uint8
+    )
+
+
+def at_most(image: ImageRGB, longest_px: int) -> ImageRGB:
+    """The picture, (H, W, 3), with a longer side of this many pixels at most."""
+    height_px, width_px = image.shape[:2]
+    longest = max(height_px, width_px)
+    if longest <= longest_px:
+        return image
+    return at_size(
+        image, *(max(1, round(side * longest_px / longest)) for side in (width_px, height_px))
+    )
+
+
+@contextmanager
+def single_threaded_opencv() -> Iterator[None]:
+    """One thread in each call of OpenCV within the block: where frames are worked on in threads of our own, OpenCV's
+    would only wait for each other."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:  # also when Ctrl-C strikes again meanwhile
+        cv2.setNumThreads(before)

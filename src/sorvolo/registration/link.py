@@ -1,9 +1,9 @@
 """Two keyframes to a Link or a NoLink: the registration room's one front door."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import Any
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -13,11 +13,21 @@ from numpy.typing import NDArray
 from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, Mask, Matrix3, PointsPx
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
-from sorvolo.registration.features import FeatureSettings, corners, known_only, sift_features
-from sorvolo.registration.learned import learned_features, match_learned
-from sorvolo.registration.matching import match
-from sorvolo.registration.robust_fit import fit_homography, is_believable
+from sorvolo.registration.features import (
+    FeatureSettings,
+    corners,
+    known_only,
+    learned_features,
+    match_learned,
+    sift_features,
+)
+from sorvolo.registration.matching import fit_homography, is_believable, match
 from sorvolo.survey.mosaic import Features, Keyframe, Link, NoLink
+
+_REFINE_WINDOW_PX = 15  # side of the patch around a corner (Lucas and Kanade)
+_REFINE_REACH_PX = 8.0  # a refined point may leave the first fit by this much
+_LEAST_LEARNED = 0.35  # share of learned pairs that agree, for them to link by themselves
+_MOST_SHARED = 0.4  # of a picture: what is known to share less is searched with SIFT there alone
 
 
 @dataclass(frozen=True)
@@ -27,13 +37,8 @@ class LinkSettings:
     features: FeatureSettings = field(default_factory=FeatureSettings)
     min_inliers: int = 18  # below this a wrong homography is not rare
     threshold_px: float = 3.0  # inlier band of the first fit; trees' parallax stays inside
-    refine_window_px: int = 15  # side of the patch around a corner (Lucas and Kanade)
-    refine_reach_px: float = 8.0  # a refined point may leave the first fit by this much
     max_pairs: int = 40  # pairs kept per link, spread over the overlap
     min_correlation: float = 0.35  # of the overlaid images: the last check against a false fit
-    least_learned: float = 0.35  # share of learned pairs that agree, for them to link by themselves
-    # of a picture: what is known to share less is searched with SIFT there alone
-    most_shared: float = 0.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +53,9 @@ class LinkPrediction:
     is_tight: bool = False
 
 
+_Kept = TypeVar("_Kept")
+
+
 class LinkCache:
     """Remembers what is costly to extract from a keyframe and is needed by several links."""
 
@@ -59,10 +67,7 @@ class LinkCache:
 
     def corners(self, keyframe: Keyframe) -> PointsPx:
         """Well-textured points of the keyframe, (N, 2)."""
-        if keyframe.id not in self._corners:
-            self._corners[keyframe.id] = corners(keyframe.gray, self._settings)
-            _trim(self._corners, self._capacity)
-        return self._corners[keyframe.id]
+        return self._of(self._corners, keyframe, corners)
 
     def has_sift(self, keyframe: Keyframe) -> bool:
         """Whether the keyframe's SIFT features are known."""
@@ -70,17 +75,20 @@ class LinkCache:
 
     def sift(self, keyframe: Keyframe) -> Features:
         """The keyframe's SIFT features."""
-        if keyframe.id not in self._sift:
-            self._sift[keyframe.id] = sift_features(keyframe.gray, self._settings)
-            _trim(self._sift, self._capacity)
-        return self._sift[keyframe.id]
+        return self._of(self._sift, keyframe, lambda gray: sift_features(gray, self._settings))
 
     def learned(self, keyframe: Keyframe) -> Features:
         """The keyframe's learned features."""
-        if keyframe.id not in self._learned:
-            self._learned[keyframe.id] = learned_features(keyframe.gray)
-            _trim(self._learned, self._capacity)
-        return self._learned[keyframe.id]
+        return self._of(self._learned, keyframe, learned_features)
+
+    def _of(
+        self, kept: dict[int, _Kept], keyframe: Keyframe, extract: Callable[[ImageGray], _Kept]
+    ) -> _Kept:
+        if keyframe.id not in kept:
+            kept[keyframe.id] = extract(keyframe.gray)
+            while len(kept) > self._capacity:
+                kept.pop(next(iter(kept)))
+        return kept[keyframe.id]
 
 
 class Effort(StrEnum):
@@ -135,38 +143,28 @@ def _candidates(
     cache: LinkCache,
     effort: Effort,
 ) -> Iterator[_Fit]:
+    """First fits from cheap to dear; the last ones are those that only a prediction allows."""
+    nothing = np.zeros((0, 2))
     if effort is not Effort.DEAR:
         if prediction is not None and prediction.is_tight:
-            yield _Fit(prediction.new_from_old, np.zeros((0, 2)), np.zeros((0, 2)))
-        fitted = _fit(new.features, old.features, prediction, settings)
-        if fitted is not None:
-            yield fitted
-    if effort is not Effort.CHEAP:
-        yield from _dear_candidates(new, old, prediction, settings, cache)
-
-
-def _dear_candidates(
-    new: Keyframe,
-    old: Keyframe,
-    prediction: LinkPrediction | None,
-    settings: LinkSettings,
-    cache: LinkCache,
-) -> Iterator[_Fit]:
-    """SIFT where a shared part is known, SIFT of all (the prediction may have been wrong), what a prediction allows."""
+            yield _Fit(prediction.new_from_old, nothing, nothing)
+        if (fit := _fit(new.features, old.features, prediction, settings)) is not None:
+            yield fit
+    if effort is Effort.CHEAP:
+        return
+    # SIFT where a shared part is known, then of all: the prediction may have been wrong
     shared = _shared_sift(new, old, prediction, settings, cache)
-    if shared is not None and (fitted := _fit(*shared, prediction, settings)) is not None:
-        yield fitted
-    fitted = _fit(cache.sift(new), cache.sift(old), prediction, settings)
-    if fitted is not None:
-        yield fitted
+    if shared is not None and (fit := _fit(*shared, prediction, settings)) is not None:
+        yield fit
+    if (fit := _fit(cache.sift(new), cache.sift(old), prediction, settings)) is not None:
+        yield fit
     if prediction is None:
         return
     shifted = _correlate(new.gray, old.gray, prediction.new_from_old, prediction.search_px)
     if shifted is not None:
-        yield _Fit(shifted, np.zeros((0, 2)), np.zeros((0, 2)))
-    fitted = _fit_learned(new, old, prediction, settings, cache)
-    if fitted is not None:
-        yield fitted
+        yield _Fit(shifted, nothing, nothing)
+    if (fit := _fit_learned(new, old, prediction, settings, cache)) is not None:
+        yield fit
 
 
 def _fit(
@@ -198,9 +196,8 @@ def _fit_learned(
         > 0
     )
     ours, theirs = cache.learned(new), known_only(learned_features(laid), np.asarray(seen))
-    found = _agreed(
-        ours, theirs, match_learned(ours, theirs, np.eye(3), prediction.search_px), settings
-    )
+    pairs = match_learned(ours, theirs, np.eye(3), prediction.search_px)
+    found = _agreed(ours, theirs, pairs, settings)
     if found is None:
         return None
     fit, share = found
@@ -208,7 +205,7 @@ def _fit_learned(
         fit.new_from_old @ prediction.new_from_old,
         fit.new_px,
         apply_homography(np.linalg.inv(prediction.new_from_old), fit.old_px),
-        is_sub_pixel=bool(share > settings.least_learned and _are_spread(fit.new_px, size)),
+        is_sub_pixel=bool(share > _LEAST_LEARNED and _are_spread(fit.new_px, size)),
     )
 
 
@@ -248,7 +245,8 @@ def _shared_sift(
     in_new = _shared_box(new.gray, old.gray, prediction.new_from_old, prediction.search_px)
     old_from_new: Matrix3 = np.linalg.inv(prediction.new_from_old).astype(np.float64)
     in_old = _shared_box(old.gray, new.gray, old_from_new, prediction.search_px)
-    if _share(in_new, new.gray) + _share(in_old, old.gray) >= 2 * settings.most_shared:
+    shares = [gray[box].size / gray.size for gray, box in ((new.gray, in_new), (old.gray, in_old))]
+    if sum(shares) >= 2 * _MOST_SHARED:
         return None
     return _sift_in(new, in_new, settings), _sift_in(old, in_old, settings)
 
@@ -268,14 +266,10 @@ def _shared_box(
     return slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))
 
 
-def _share(box: tuple[slice, slice], image: ImageGray) -> float:
-    return float(image[box].size / image.size)
-
-
 def _sift_in(keyframe: Keyframe, box: tuple[slice, slice], settings: LinkSettings) -> Features:
     """The SIFT features within rows and columns of a keyframe's picture."""
     part = keyframe.gray[box]
-    if min(part.shape) < 2 * settings.refine_window_px:
+    if min(part.shape) < 2 * _REFINE_WINDOW_PX:
         return Features("sift", np.zeros((0, 2)), np.zeros((0, 128), np.float32))
     found = sift_features(np.ascontiguousarray(part), settings.features)
     return Features(
@@ -338,7 +332,7 @@ def refine(
     """Sub-pixel pairs around a first fit that is right to `refine_reach_px`, or in words why there are none."""
     points = cache.corners(new)
     old_guess = apply_homography(np.linalg.inv(new_from_old), points)
-    margin = settings.refine_window_px / 2
+    margin = _REFINE_WINDOW_PX / 2
     high = np.array([old.gray.shape[1], old.gray.shape[0]]) - margin
     with np.errstate(invalid="ignore"):
         points = points[((old_guess > margin) & (old_guess < high)).all(axis=1)]
@@ -352,7 +346,7 @@ def refine(
             cv2.warpPerspective(old.gray, new_from_old, size, flags=cv2.INTER_LINEAR), np.uint8
         )
     start = points.astype(np.float32).reshape(-1, 1, 2)
-    window = (settings.refine_window_px, settings.refine_window_px)
+    window = (_REFINE_WINDOW_PX, _REFINE_WINDOW_PX)
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
     ahead, found, _ = cv2.calcOpticalFlowPyrLK(
         new.gray,
@@ -365,9 +359,7 @@ def refine(
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         minEigThreshold=1e-7,
     )
-    good = (found.ravel() > 0) & (
-        np.linalg.norm((ahead - start)[:, 0], axis=1) < settings.refine_reach_px
-    )
+    good = (found.ravel() > 0) & (np.linalg.norm((ahead - start)[:, 0], axis=1) < _REFINE_REACH_PX)
     if good.sum() < settings.min_inliers:
         return f"only {int(good.sum())} points could be followed from one image to the other"
     good[good] = (
@@ -384,7 +376,7 @@ def refine(
     if inliers.mean() < 0.3 or not is_believable(homography, old_px):
         return f"only {inliers.mean():.0%} of the refined points fit one plane"
     miss = np.linalg.norm(apply_homography(homography, old_px) - new_px, axis=1)
-    near = miss < settings.refine_reach_px
+    near = miss < _REFINE_REACH_PX
     chosen = _spread(new_px, miss, near, settings.max_pairs)
     # Rayleigh's median to a per-axis sigma
     sigma_px = float(SIGMA_PER_MEDIAN_DEVIATION * np.median(miss[inliers]) / 1.1774)
@@ -425,8 +417,3 @@ def _spread(points: PointsPx, miss: Floats, usable: Mask, count: int) -> NDArray
         starts, np.diff(np.append(starts, len(indices)))
     )
     return np.sort(indices[np.lexsort((cell, rank))[:count]])
-
-
-def _trim(cache: dict[int, Any], capacity: int) -> None:
-    while len(cache) > capacity:
-        cache.pop(next(iter(cache)))

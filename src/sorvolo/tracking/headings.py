@@ -10,7 +10,7 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.geometry.level_ground import ground_from_pixels
 from sorvolo.geometry.pose import Pose, rotation_from_vector, site_from_gimbal_rotation
-from sorvolo.registration.shared_view import SmallView, second_from_first, small_view
+from sorvolo.registration.place_search import SmallView, second_from_first, small_view
 from sorvolo.survey.flight import CameraPrior, Frame
 from sorvolo.survey.objects import Detections
 from sorvolo.tracking.image_motion import ImageMotion

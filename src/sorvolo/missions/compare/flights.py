@@ -37,7 +37,7 @@ from sorvolo.missions.flight.setup import (
 )
 from sorvolo.missions.heights.measure import damaged_heights, heights_stamp, own_heights_stamp
 from sorvolo.mosaic.selection import StretchSelection, every
-from sorvolo.registration.opencv_threads import single_threaded_opencv
+from sorvolo.registration.lens import single_threaded_opencv
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.area import Area
 from sorvolo.survey.findings import Change, CompareUpdate, ViewStatus

@@ -19,7 +19,7 @@ from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.memory import MemorySettings
 from sorvolo.missions.flight.priority import lower_priority, made_at_low_priority
 from sorvolo.missions.flight.result_cache import ResultCache
-from sorvolo.registration.sizes import at_most
+from sorvolo.registration.lens import at_most
 from sorvolo.store.exports.detection_files import crop_around
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.images import jpeg_from_image

@@ -8,8 +8,7 @@ from sorvolo.geometry.arrays import ImageGray, ImageRGB
 from sorvolo.heights.views import View, pixels_wide
 from sorvolo.mosaic.exposure import corrected
 from sorvolo.registration.features import gray_from_rgb
-from sorvolo.registration.lens import Undistorter, refined_camera
-from sorvolo.registration.sizes import at_size
+from sorvolo.registration.lens import Undistorter, at_size, refined_camera
 from sorvolo.store.images import ImageCache
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import StoredKeyframe

@@ -20,8 +20,7 @@ from sorvolo.mosaic.stitched_map import (
     paint_mosaic,
     site_from_mosaic,
 )
-from sorvolo.registration.lens import Undistorter
-from sorvolo.registration.sizes import at_size
+from sorvolo.registration.lens import Undistorter, at_size
 from sorvolo.store.exports.map_pictures import picture
 from sorvolo.store.pages.flight import report_page
 from sorvolo.store.site.archive import Archive
