@@ -15,8 +15,7 @@ from sorvolo.mosaic.canvas_frame import CanvasFrame
 from sorvolo.mosaic.exposure import Exposure
 from sorvolo.mosaic.placing import canvas_frame
 from sorvolo.mosaic.planar import KnownKeyframe, PlanarMapper
-from sorvolo.registration.lens import Undistorter
-from sorvolo.registration.lens import at_size
+from sorvolo.registration.lens import Undistorter, at_size
 from sorvolo.store.exports.map_pictures import LivePreview
 from sorvolo.store.images import ImageCache
 from sorvolo.store.site.archive import Archive, FlightWriter
