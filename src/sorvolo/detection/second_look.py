@@ -78,10 +78,9 @@ def opinions(
     picture: ImageRGB,
     sees: Sees,
     hows: Mapping[int, SecondLook],
-    cuts_at_once: tuple[int, int] = _CUTS,
 ) -> dict[int, Floats]:
     """The scores (looks in all positions,) of each report, by its row, for those that are looked at again."""
-    fewest, most = cuts_at_once
+    fewest, most = _CUTS
     share = SHARE * picture.shape[0] * picture.shape[1] / CELL_PX**2
     room = int(min(max(share, fewest), most))
     cuts: list[_Cut] = []
