@@ -27,6 +27,14 @@ class UnavailableError(StoreError):
     """A database or store cannot be reached, or somebody else writes: later the same may succeed."""
 
 
+class NotFoundError(StoreError):
+    """The site, or the version of its map, is not there."""
+
+
+class NoHeightsError(InputError):
+    """A flight has no heights of its present map."""
+
+
 class DiskFullError(StoreError):
     """A disk has no room for what was to be written: with room, the same will succeed."""
 

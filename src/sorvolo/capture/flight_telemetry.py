@@ -249,7 +249,8 @@ def _continued(before: Track, now: Track) -> Track:
     return replace(
         now,
         up_m=now.up_m + np.median(before.up_m - same_m),
-        height_words=before.height_words,
+        height_kind=before.height_kind,
+        ground_words=before.ground_words,
         vertical_sigma_m=before.vertical_sigma_m,
         altitude_offset_sigma_m=before.altitude_offset_sigma_m,
     )

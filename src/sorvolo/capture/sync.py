@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from functools import cached_property
 
 import numpy as np
@@ -29,10 +30,21 @@ _OTHER_FLIGHT_S = (
 )  # clocks are set to a wrong zone by up to 14 h; a day apart is another flight
 DATED_NS = 3650 * 86_400 * 10**9
 """Ten years after 1970: an earlier clock was never set."""
+
+
+class HeightKind(StrEnum):
+    """What telemetry counts its heights from."""
+
+    ABOVE_TAKEOFF = "above take-off"
+    ORTHOMETRIC = "orthometric"
+    ELLIPSOIDAL = "ellipsoidal"
+    NONE = "none"
+
+
 _HEIGHTS = (
-    ("height_above_takeoff_m", "above take-off", 1.0),
-    ("orthometric_height_m", "orthometric", 3.0),
-    ("ellipsoidal_height_m", "ellipsoidal", 3.0),
+    ("height_above_takeoff_m", HeightKind.ABOVE_TAKEOFF, 1.0),
+    ("orthometric_height_m", HeightKind.ORTHOMETRIC, 3.0),
+    ("ellipsoidal_height_m", HeightKind.ELLIPSOIDAL, 3.0),
 )
 
 
@@ -128,7 +140,8 @@ class Track:
     horizontal_sigma_m: Floats
     vertical_sigma_m: float
     altitude_offset_sigma_m: float
-    height_words: str
+    height_kind: HeightKind
+    ground_words: str  # what is taken for the ground
     angles_deg: Floats  # (N, 3) yaw, pitch, roll of the camera if known, else the body; NaN where not stated
     attitude: str  # "gimbal" | "body" | "none"
     stated_sigma_deg: tuple[float, float]  # of tilt and heading, NaN where the source states none
@@ -138,7 +151,12 @@ class Track:
     @property
     def counts_from_takeoff(self) -> bool:
         """Whether heights are those above take-off, wherever in the world that is."""
-        return self.height_words.startswith("above take-off")
+        return self.height_kind is HeightKind.ABOVE_TAKEOFF
+
+    @property
+    def height_words(self) -> str:
+        """What heights are counted from, and what is taken for the ground."""
+        return f"{self.height_kind}, {self.ground_words}"
 
     def climb_after_m(self, seconds: Sequence[float]) -> float:
         """By how much its usual height is above that at these seconds of the frames' clock; 0 where one is unknown."""
@@ -292,7 +310,9 @@ def track_from_telemetry(
     ground_elevation_m: float | None = None,
 ) -> tuple[Track, tuple[Notice, ...]]:
     """Telemetry in the site frame. `ground_elevation_m` is the ground's height in telemetry's own height reference."""
-    up_m, words, vertical_sigma_m, offset_sigma_m, notices = _heights(telemetry, ground_elevation_m)
+    up_m, kind, ground, vertical_sigma_m, offset_sigma_m, notices = _heights(
+        telemetry, ground_elevation_m
+    )
     latitude, longitude = telemetry["latitude_deg"], telemetry["longitude_deg"]
     known = np.isfinite(latitude) & np.isfinite(longitude)
     east_north = np.full((len(telemetry), 2), np.nan)
@@ -326,7 +346,8 @@ def track_from_telemetry(
         sigma,
         vertical_sigma_m,
         offset_sigma_m,
-        words,
+        kind,
+        ground,
         angles,
         attitude,
         (median_or_nan(telemetry["tilt_sigma_deg"]), median_or_nan(telemetry["heading_sigma_deg"])),
@@ -388,9 +409,11 @@ def _line(times_s: Floats, values: Floats) -> tuple[Floats, Floats, float]:
 
 def _heights(
     telemetry: Telemetry, ground_elevation_m: float | None
-) -> tuple[Floats, str, float, float, tuple[Notice, ...]]:
+) -> tuple[Floats, HeightKind, str, float, float, tuple[Notice, ...]]:
+    """Return heights above the site's ground, (N,), m; what they count from; what is taken for the ground, in words;
+    the sigmas of heights and of their zero, m; and notices."""
     notices: list[Notice] = []
-    for column, words, sigma_m in _HEIGHTS:
+    for column, kind, sigma_m in _HEIGHTS:
         values = telemetry[column]
         known = np.isfinite(values)
         if known.mean() < 0.5 if len(values) else True:
@@ -398,57 +421,29 @@ def _heights(
         stated = telemetry["vertical_sigma_m"]
         sigma_m = float(np.nanmedian(stated)) if np.isfinite(stated).any() else sigma_m
         filled = np.interp(np.arange(len(values)), np.flatnonzero(known), values[known])
+        typical = float(np.median(filled))
         if ground_elevation_m is not None:
-            return (
-                filled - ground_elevation_m,
-                f"{words}, ground given",
-                sigma_m,
-                0.5,
-                tuple(notices),
-            )
-        if column == "height_above_takeoff_m":
-            if float(np.median(filled)) < 0.5:
-                text = f"height above take-off is {np.median(filled):.1f} m for most of the flight: not used"
+            up_m = filled - ground_elevation_m
+            return up_m, kind, "ground given", sigma_m, 0.5, tuple(notices)
+        if kind is HeightKind.ABOVE_TAKEOFF:
+            if typical < 0.5:
+                text = f"height above take-off is {typical:.1f} m for most of the flight: not used"
                 notices.append(Notice("height_of_zero", int(known.sum()), text))
                 continue
-            return (
-                filled,
-                f"{words}, ground taken to be at take-off level",
-                sigma_m,
-                1.0,
-                tuple(notices),
-            )
+            words = "ground taken to be at take-off level"
+            return filled, kind, words, sigma_m, 1.0, tuple(notices)
         first = float(np.median(filled[: max(1, min(5, len(filled)))]))
-        if float(np.median(filled)) - first > 4.0 and first - float(filled.min()) < 2.0:
-            words = f"{words}, ground taken to be where the telemetry begins"
-            return filled - first, words, sigma_m, 2.0, tuple(notices)
-        notices.append(
-            Notice(
-                "ground_unknown",
-                1,
-                f"heights are {words} and the ground's is unknown: the height above ground is found from the pictures",
-            )
-        )
-        typical = float(np.median(filled))
-        return (
-            filled - typical + 40.0,
-            f"{words}, ground found from the pictures",
-            sigma_m,
-            np.inf,
-            tuple(notices),
-        )
-    notices.append(
-        Notice(
-            "height_unknown", 1, "telemetry has no height: it is found from the pictures and GPS"
-        )
-    )
-    return (
-        np.full(len(telemetry), 40.0),
-        "none, found from the pictures",
-        np.inf,
-        np.inf,
-        tuple(notices),
-    )
+        if typical - first > 4.0 and first - float(filled.min()) < 2.0:
+            words = "ground taken to be where the telemetry begins"
+            return filled - first, kind, words, sigma_m, 2.0, tuple(notices)
+        text = f"heights are {kind} and the ground's is unknown: the height above ground is found from the pictures"
+        notices.append(Notice("ground_unknown", 1, text))
+        words = "ground found from the pictures"
+        return filled - typical + 40.0, kind, words, sigma_m, np.inf, tuple(notices)
+    text = "telemetry has no height: it is found from the pictures and GPS"
+    notices.append(Notice("height_unknown", 1, text))
+    up_m = np.full(len(telemetry), 40.0)
+    return up_m, HeightKind.NONE, "found from the pictures", np.inf, np.inf, tuple(notices)
 
 
 def _angles(telemetry: Telemetry) -> tuple[str, Floats]:

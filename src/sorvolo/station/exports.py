@@ -12,7 +12,6 @@ from urllib.parse import quote
 from fastapi import APIRouter, Depends, Query, Response
 from fastapi.responses import StreamingResponse
 
-from sorvolo.errors import InputError
 from sorvolo.missions.heights.measure import measure_profile
 from sorvolo.station.collections import TITLES, SiteCollections
 from sorvolo.station.problems import Problem
@@ -180,10 +179,7 @@ def _geopackage(site: str, archive: Archive, collections: SiteCollections) -> St
 
 
 def _profile(folder: Path, line: str, step_m: float) -> dict[str, Any]:
-    try:
-        points = measure_profile(folder, _places(line), step_m=step_m)
-    except InputError as error:
-        raise Problem(404 if "heights" in str(error) else 400, str(error)) from error
+    points = measure_profile(folder, _places(line), step_m=step_m)
     points = points[:: max(1, math.ceil(len(points) / _MOST_PROFILE_POINTS))]
     known = [each.sigma_m for each in points if math.isfinite(each.sigma_m)]
     return {

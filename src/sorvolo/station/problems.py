@@ -8,7 +8,13 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
-from sorvolo.errors import InputError, SettingsError, SorvoloError, StoreError
+from sorvolo.errors import (
+    DiskFullError,
+    NoHeightsError,
+    NotFoundError,
+    SorvoloError,
+    StoreError,
+)
 
 _TITLES = {
     400: "Bad request",
@@ -83,14 +89,11 @@ def problem_answer(
 
 def status_of(error: SorvoloError) -> int:
     """The HTTP status of an error that a person must act on."""
-    text = str(error)
-    if isinstance(error, InputError | SettingsError):
-        return 400
-    if isinstance(error, StoreError):
-        if "disk full" in text:
-            return 507
-        return 404 if text.startswith("no site at") or "has no version" in text else 409
-    return 400
+    if isinstance(error, DiskFullError):
+        return 507
+    if isinstance(error, NotFoundError | NoHeightsError):
+        return 404
+    return 409 if isinstance(error, StoreError) else 400
 
 
 def answer_problems(app: FastAPI) -> None:
@@ -117,6 +120,6 @@ def answer_problems(app: FastAPI) -> None:
         return problem_answer(error.status_code, str(error.detail), error.headers)
 
     @app.exception_handler(Exception)
-    async def _of_ours_to_mend(_: Request, error: Exception) -> JSONResponse:
+    async def _of_unexpected(_: Request, error: Exception) -> JSONResponse:
         words = f"an error in the station ({type(error).__name__}); its log has the rest: please report it"
         return problem_answer(500, words)

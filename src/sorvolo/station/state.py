@@ -11,7 +11,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-from sorvolo.errors import StoreError
+from sorvolo.errors import DiskFullError, StoreError
 from sorvolo.store.atomic import writing
 from sorvolo.store.locks import take_lock
 
@@ -109,8 +109,11 @@ class StationState:
             except sqlite3.OperationalError as error:
                 if self._connection.in_transaction:
                     self._connection.execute("ROLLBACK")
-                words = "disk full: could not write" if "full" in str(error) else "cannot write"
-                raise StoreError(f"{words} {self.path} ({error}); free some space") from error
+                if error.sqlite_errorcode == sqlite3.SQLITE_FULL:
+                    raise DiskFullError(
+                        f"disk full: could not write {self.path} ({error}); free some space"
+                    ) from error
+                raise StoreError(f"cannot write {self.path} ({error}); free some space") from error
 
     def rows(self, query: str, values: Sequence[Any] = ()) -> list[sqlite3.Row]:
         """The rows of a query."""

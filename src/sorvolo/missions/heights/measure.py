@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from sorvolo.capture.areas import read_area
-from sorvolo.errors import InputError, SettingsError
+from sorvolo.errors import InputError, NoHeightsError, SettingsError
 from sorvolo.geometry.coordinates import lonlat_from_text
 from sorvolo.heights.field import HeightField, along
 from sorvolo.heights.lattice import Lattice
@@ -118,11 +118,11 @@ def write_contours(site: Path, path: Path, interval_m: float, *, flight: str = "
 
 
 def read_field(archive: Archive, flight_id: str, file: HeightFile) -> HeightField:
-    """A height model of a flight. Raises InputError where there is none, or none of the flight's present map."""
+    """A height model of a flight. Raises NoHeightsError if there is none of its present map."""
     report = _report(archive, flight_id)
     keyframes = archive.keyframes(flight_id)
     if not keyframes or report.get("run") != run_of(keyframes):
-        raise InputError(
+        raise NoHeightsError(
             f"the heights of flight {flight_id} are of an earlier map of it; make them again: "
             f"sorvolo heights {archive.folder} --flight {flight_id}"
         )
@@ -196,7 +196,7 @@ def heights_stamp(archive: Archive, but: str) -> tuple[str, int] | None:
 
 
 def _report(archive: Archive, flight_id: str) -> Mapping[str, Any]:
-    """What a flight's heights.json states. Raises InputError where there is none, or it is damaged."""
+    """What a flight's heights.json states. Raises NoHeightsError if there is none, or it is damaged."""
     report = _read_report(archive, flight_id)
     if report is None:
         is_there = archive.height_path(flight_id, HeightFile.REPORT).exists()
@@ -205,7 +205,7 @@ def _report(archive: Archive, flight_id: str) -> Mapping[str, Any]:
             if is_there
             else "has no heights; make them"
         )
-        raise InputError(
+        raise NoHeightsError(
             f"flight {flight_id} of {archive.folder} {found}: sorvolo heights {archive.folder} --flight {flight_id}"
         )
     return report

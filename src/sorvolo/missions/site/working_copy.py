@@ -5,7 +5,7 @@ import warnings
 from collections.abc import Generator
 from pathlib import Path
 
-from sorvolo.errors import SorvoloWarning, StoreError
+from sorvolo.errors import NotFoundError, SorvoloWarning, StoreError
 from sorvolo.missions.site.copy import folder_of
 from sorvolo.store.copies.bucket import OvertakenError
 from sorvolo.store.copies.transfer import CopyUpdate
@@ -32,7 +32,9 @@ def fetch_site(address: str, *, writes: bool) -> Generator[CopyUpdate, None, Pat
                 raise
             return working.folder  # a flight is being mapped into it: it is as new as that one
     if not there and not writes:
-        raise StoreError(f"no site at {address}; put one there: sorvolo site copy FOLDER {address}")
+        raise NotFoundError(
+            f"no site at {address}; put one there: sorvolo site copy FOLDER {address}"
+        )
     if writes:
         working.begin_writing()
     return working.folder

@@ -169,8 +169,8 @@ class GroundPlaces:
         nadir = "no angles: the camera is taken to look straight down, its heading estimated from the pictures' motion"
         how = words.get(track.attitude, nadir) if track else ""
         height = track.height_words if track else ""
-        if self._over_model:
-            height = f"{height.split(',')[0]}, over the height model's ground"
+        if self._over_model and track:
+            height = f"{track.height_kind}, over the height model's ground"
         text = f"places come from the telemetry's position, height ({height}) and {how}"
         return (
             *self._setup.notices,
@@ -309,5 +309,7 @@ def _why_not_on_ground(setup: FlightSetup) -> str | None:
     if not math.isfinite(track.vertical_sigma_m):
         return "the telemetry has no height"
     if not math.isfinite(track.altitude_offset_sigma_m):
-        return f"heights are {track.height_words.split(',')[0]} and the ground's is unknown (give --ground-elevation)"
+        return (
+            f"heights are {track.height_kind} and the ground's is unknown (give --ground-elevation)"
+        )
     return None

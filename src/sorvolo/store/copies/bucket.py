@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, BinaryIO, Self
 
-from sorvolo.errors import SorvoloWarning, StoreError
+from sorvolo.errors import NotFoundError, SorvoloWarning, StoreError
 from sorvolo.store.atomic import writing
 from sorvolo.store.copies.folder import refuse_loss, refuse_other
 from sorvolo.store.copies.object_store import ConflictError, Objects
@@ -166,7 +166,7 @@ class BucketEnd:
         """The manifest. Raises StoreError where there is no site."""
         found, _ = self.find_manifest()
         if found is None:
-            raise StoreError(
+            raise NotFoundError(
                 f"no site at {self.name}; put one there: sorvolo site copy FOLDER {self.name}"
             )
         return found
@@ -414,7 +414,7 @@ def prune(objects: Objects, older_than_s: float, *, only_count: bool = False) ->
     end = BucketEnd(objects)
     manifest, etag = end.find_manifest()
     if manifest is None:
-        raise StoreError(f"no site at {objects.name}; there is nothing to tidy")
+        raise NotFoundError(f"no site at {objects.name}; there is nothing to tidy")
     with tempfile.TemporaryDirectory(prefix="sorvolo-") as scratch:
         files = end.state_of(manifest, Path(scratch)).files.values()
     used = {key_of(file) for file in files if file.sha256}

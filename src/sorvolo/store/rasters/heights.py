@@ -9,7 +9,7 @@ import rasterio
 import rasterio.shutil
 from rasterio.errors import RasterioError
 
-from sorvolo.errors import InputError, StoreError
+from sorvolo.errors import NoHeightsError, StoreError
 from sorvolo.geometry.arrays import Floats32
 from sorvolo.geometry.grid import Grid
 from sorvolo.store.atomic import atomic_path, scratch_folder
@@ -87,13 +87,13 @@ def read_height_cog(path: Path, grid: Grid) -> HeightBands:
                 abs(source.transform.a - grid.m_per_px) > 1e-9 * grid.m_per_px
                 or source.dtypes[0] != "float32"
             ):
-                raise InputError(
+                raise NoHeightsError(
                     f"{path} is no height model of this site; run sorvolo heights again"
                 )
             corner = np.array([[source.transform.c, source.transform.f]])
             column, row = grid.grid_from_projected(corner)[0] + 0.5
             return HeightBands(tuple(source.read()), (round(column), round(row)))
     except RasterioError as error:
-        raise InputError(
+        raise NoHeightsError(
             f"{path} is no readable GeoTIFF ({error}); run sorvolo heights again"
         ) from error

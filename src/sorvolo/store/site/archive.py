@@ -8,7 +8,7 @@ from typing import Any, Self
 
 from sqlalchemy import Connection
 
-from sorvolo.errors import InputError, SettingsError, SorvoloWarning, StoreError
+from sorvolo.errors import InputError, NotFoundError, SettingsError, SorvoloWarning, StoreError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.site import catalogue as records
@@ -211,7 +211,7 @@ class Archive(SiteFolder):
         Raises StoreError for a version that does not exist.
         """
         if version is not None and version not in {entry.id for entry in self.versions()}:
-            raise StoreError(
+            raise NotFoundError(
                 f"{self.folder} has no version {version} of its map; `versions` lists them"
             )
         newest = self._read(records.newest_version)

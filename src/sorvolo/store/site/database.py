@@ -169,15 +169,26 @@ class SqliteDatabase(Database):
             yield
         except (sqlite3.Error, DBAPIError) as error:
             fault = str(error.orig if isinstance(error, DBAPIError) else error)
-            if "full" in fault:
+            code = getattr(getattr(error, "orig", error), "sqlite_errorcode", 0) & 0xFF
+            if code == sqlite3.SQLITE_FULL:
                 raise DiskFullError(
                     f"disk full: could not write {self._path} ({fault}); free some space and run it again"
                 ) from error
-            if any(word in fault for word in ("readonly", "locked", "unable to open", "disk I/O")):
+            if code in _UNUSABLE:
                 raise StoreError(
                     f"cannot use {self._path}: {fault}; check the disk and its permissions"
                 ) from error
             raise StoreError(DAMAGED.format(place=self.place, fault=fault)) from error
+
+
+_UNUSABLE = (
+    sqlite3.SQLITE_READONLY,
+    sqlite3.SQLITE_BUSY,
+    sqlite3.SQLITE_LOCKED,
+    sqlite3.SQLITE_CANTOPEN,
+    sqlite3.SQLITE_IOERR,
+)
+"""Codes of a disk or of permissions that refuse, not of damage."""
 
 
 def _open_engine(path: Path, *, write: bool) -> Engine:

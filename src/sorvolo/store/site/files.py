@@ -7,7 +7,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
-from sorvolo.errors import StoreError, UnavailableError
+from sorvolo.errors import NotFoundError, StoreError, UnavailableError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.store.atomic import TEMPORARY_PREFIX, writing
@@ -79,7 +79,7 @@ class SiteFolder:
         """Open a site folder. Raises StoreError as `Archive.open` does; to write, the folder is made and locked."""
         if not write:
             if not is_site(folder):
-                raise StoreError(
+                raise NotFoundError(
                     f"no site at {folder}; make one with: sorvolo map INPUT --site {folder}"
                 )
             _refuse_traps(
