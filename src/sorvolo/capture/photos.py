@@ -6,6 +6,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from enum import Enum, auto
 from itertools import pairwise
 from pathlib import Path
 from statistics import median_low
@@ -41,6 +42,14 @@ _EDGE_BYTES = (
 _EXIF_UTC = "UTC in the photos' EXIF"
 
 
+class PhotoFault(Enum):
+    """Why a photo cannot be used."""
+
+    UNREADABLE = auto()
+    DUPLICATE = auto()
+    OTHER_SIZE = auto()
+
+
 @dataclass(frozen=True)
 class Photo:
     """One photo in its flight's order. `problem` is why it cannot be used, if known without decoding."""
@@ -49,6 +58,7 @@ class Photo:
     time_ns: int
     metadata: PhotoMetadata
     problem: str = ""
+    fault: PhotoFault | None = None  # the kind of problem
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +193,7 @@ def _read(path: Path) -> Photo:
     try:
         return Photo(path, 0, read_photo_metadata(path))
     except InputError as error:
-        return Photo(path, 0, PhotoMetadata(0, 0), f"corrupt: {error}")
+        return Photo(path, 0, PhotoMetadata(0, 0), f"corrupt: {error}", PhotoFault.UNREADABLE)
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:
@@ -281,7 +291,9 @@ def _mark_duplicates(photos: Sequence[Photo]) -> list[Photo]:
             digest = hashlib.sha256(photo.path.read_bytes()).digest()
             original = first_of.setdefault(digest, photo.path.name)
             if original != photo.path.name:
-                photo = replace(photo, problem=f"duplicate of {original}")
+                photo = replace(
+                    photo, problem=f"duplicate of {original}", fault=PhotoFault.DUPLICATE
+                )
         marked.append(photo)
     return marked
 
@@ -303,7 +315,7 @@ def _check_size(photo: Photo, width_px: int, height_px: int) -> Photo:
     own_px, flight_px = photo.metadata.used_size_px, (width_px, height_px)
     if photo.problem or own_px[::-1] == flight_px or is_same_shape(own_px, flight_px):
         return photo
-    return replace(photo, problem=other_size(own_px, flight_px))
+    return replace(photo, problem=other_size(own_px, flight_px), fault=PhotoFault.OTHER_SIZE)
 
 
 def _fit(image: ImageRGB, orientation: int, width_px: int, height_px: int) -> ImageRGB:
@@ -331,7 +343,11 @@ def _turn(image: ImageRGB, orientation: int) -> ImageRGB:
 
 def _telemetry_of(photos: Sequence[Photo]) -> tuple[Telemetry, list[Notice]]:
     """One sample a photo that states its place or attitude, and is no duplicate, at exactly the photo's time."""
-    readable = [photo for photo in photos if photo.metadata.width_px and not _is_duplicate(photo)]
+    readable = [
+        photo
+        for photo in photos
+        if photo.metadata.width_px and photo.fault is not PhotoFault.DUPLICATE
+    ]
     placed = sum("latitude_deg" in photo.metadata.columns for photo in readable)
     missing = notice(
         "photo_without_gps", len(readable) - placed, "photos without a GPS position: {}"
@@ -356,7 +372,7 @@ def _picture_notices(photos: Sequence[Photo], width_px: int, height_px: int) -> 
     return [
         *notice(
             "duplicate_photo",
-            sum(map(_is_duplicate, photos)),
+            sum(photo.fault is PhotoFault.DUPLICATE for photo in photos),
             "photos that are exact copies of others, not used twice: {}",
         ),
         *notice(
@@ -383,7 +399,7 @@ def _size_notices(
     return [
         *notice(
             "other_size",
-            sum(photo.problem.startswith("size") for photo in photos),
+            sum(photo.fault is PhotoFault.OTHER_SIZE for photo in photos),
             f"photos of another shape than the flight's {shown}, not used (map another camera's photos as a flight "
             "of their own): {}",
         ),
@@ -416,7 +432,3 @@ def _camera_notices(used: Sequence[PhotoMetadata]) -> list[Notice]:
             "different focal lengths, mapped as if they were one: {}",
         ),
     ]
-
-
-def _is_duplicate(photo: Photo) -> bool:
-    return photo.problem.startswith("duplicate")
