@@ -5,6 +5,7 @@ A size is a ratchet: a change that makes it smaller lowers the number here; none
 
 import ast
 import io
+import re
 import tokenize
 from collections import Counter
 from collections.abc import Iterator
@@ -131,3 +132,17 @@ def test_files_of_tests_have_names_of_their_own() -> None:
     """Pytest imports them by their bare names: of two alike it collects one."""
     names = [path.name for path in (ROOT / "tests").rglob("*.py") if path.name != "conftest.py"]
     assert sorted(names) == sorted(set(names))
+
+
+def test_what_answers_the_questions_of_architecture_is_there() -> None:
+    """Each file that ARCHITECTURE.md names exists and defines the name in brackets behind it."""
+    text = (ROOT / "ARCHITECTURE.md").read_text()
+    named = re.findall(r"`(\w[\w/]*/\w+\.py)`(?: \(`(\w+)`)?", text[text.index("## 3. ") :])
+    missing = [f"{path}: {name}" for path, name in named if not _defines(PACKAGE / path, name)]
+    assert len(named) > 15 and not missing, missing
+
+
+def _defines(path: Path, name: str) -> bool:
+    if not path.is_file():
+        return (ROOT / path.relative_to(PACKAGE)).is_file()
+    return bool(re.search(rf"(def|class) {name}\b", path.read_text())) if name else True
