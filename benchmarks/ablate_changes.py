@@ -22,8 +22,8 @@ import numpy as np
 
 from sorvolo.lab.evaluation import changes as evaluation
 from sorvolo.lab.evaluation.change_metrics import FoundEvent, match_events, score_events
-from sorvolo.lab.simulate.site import simulate_site
 from sorvolo.lab.simulation.presets import preset
+from sorvolo.lab.simulation.site import simulate_site
 from sorvolo.missions.compare import run
 from sorvolo.missions.compare.flights import compare_flights
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings

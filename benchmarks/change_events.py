@@ -31,9 +31,9 @@ from rich.table import Table
 from child import peak_mb, run_child
 from provenance import commit, machine, note_scoring, seeds_or_drawn
 from sorvolo.lab.evaluation.changes import as_json, evaluate_changes
-from sorvolo.lab.simulate.site import simulate_site
 from sorvolo.lab.simulation.presets import preset
 from sorvolo.lab.simulation.settings import ImagingSettings
+from sorvolo.lab.simulation.site import simulate_site
 from sorvolo.missions.compare.flights import compare_flights
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.map.flights import map_flights

@@ -27,8 +27,8 @@ from sorvolo.lab.evaluation.detector import (
     write_evaluation,
 )
 from sorvolo.lab.evaluation.detector_files import FoundSet
-from sorvolo.lab.simulate.pictures import simulate_pictures
 from sorvolo.lab.simulation.flight import simulate_flight
+from sorvolo.lab.simulation.picture_sets import simulate_pictures
 from sorvolo.lab.simulation.pictures import LEAST_VISIBLE, SMALLEST_PX, PictureSettings
 from sorvolo.lab.simulation.presets import preset
 from sorvolo.lab.simulation.truth import coco_boxes

@@ -30,7 +30,6 @@ import rasterio
 
 from provenance import commit, machine, note_scoring, seeds_or_drawn
 from sorvolo.heights.field import HeightField
-from sorvolo.lab.simulate.site import simulate_site
 from sorvolo.lab.simulation.flight import SimulatedFlight, simulate_flights
 from sorvolo.lab.simulation.relief import Relief
 from sorvolo.lab.simulation.settings import (
@@ -41,6 +40,7 @@ from sorvolo.lab.simulation.settings import (
     SensorSettings,
     SimulationSettings,
 )
+from sorvolo.lab.simulation.site import simulate_site
 from sorvolo.lab.simulation.truth import ground_heights, surface_heights
 from sorvolo.lab.simulation.world import orthophoto
 from sorvolo.missions.flight.settings import MapSettings

@@ -26,12 +26,12 @@ from child import peak_mb, run_child
 from provenance import commit, machine, seeds_or_drawn
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.geometry.homography import apply_homography, fit_similarity
+from sorvolo.lab.evaluation.map_quality import corner_errors
 from sorvolo.lab.evaluation.mosaic import evaluate_mosaic
-from sorvolo.lab.simulate.site import simulate_site
 from sorvolo.lab.simulation.presets import preset
+from sorvolo.lab.simulation.site import simulate_site
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
-from sorvolo.mosaic.map_quality import corner_errors
 
 METHODS = ("planar", "thesis", "opencv-scans")
 COLUMNS = {

@@ -55,13 +55,13 @@ from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.geometry.homography import apply_homography, fit_similarity
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.lab.evaluation.frame_rows import map_frames
-from sorvolo.lab.simulate.flight_files import (
+from sorvolo.lab.simulation.flight import SimulatedFlight, simulate_flight
+from sorvolo.lab.simulation.flight_files import (
     video_writer,
     write_camera,
     write_photo,
     write_telemetry,
 )
-from sorvolo.lab.simulation.flight import SimulatedFlight, simulate_flight
 from sorvolo.lab.simulation.ground import orthophoto_ground
 from sorvolo.lab.simulation.settings import (
     ImagingSettings,

@@ -28,10 +28,10 @@ from sorvolo.lab.thesis.settings import (
     ReproductionSettings,
     SimulatedSize,
 )
+from sorvolo.lab.thesis.sheets import reproduction_sheets
 from sorvolo.lab.thesis.simulated import simulated_dataset
-from sorvolo.lab.thesis.thesis_tables import tables_of
+from sorvolo.lab.thesis.tables import tables_of
 from sorvolo.store.exports.plain import plain_json
-from sorvolo.store.exports.reproduction_sheets import reproduction_sheets
 
 RESULTS = Path(__file__).parent / "results" / "thesis_tables.json"
 

@@ -32,7 +32,6 @@ from rich.console import Console
 from rich.table import Table
 
 from provenance import commit, machine
-from sorvolo.lab.simulate.site import simulate_site
 from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     LaterSettings,
@@ -41,6 +40,7 @@ from sorvolo.lab.simulation.settings import (
     SceneSettings,
     SimulationSettings,
 )
+from sorvolo.lab.simulation.site import simulate_site
 
 RESULTS = Path(__file__).parent / "results" / "unit_costs.json"
 FPS, VIDEO_S, SPEED_M_S = 10.0, (2.0, 8.0), 6.0

@@ -24,7 +24,6 @@ from scipy.optimize import linear_sum_assignment
 
 from provenance import commit, machine, note_scoring, seeds_or_drawn
 from sorvolo.geometry.geodesy import LocalFrame
-from sorvolo.lab.simulate.site import simulate_site
 from sorvolo.lab.simulation.settings import (
     DEFAULT_ORIGIN,
     ImagingSettings,
@@ -35,6 +34,7 @@ from sorvolo.lab.simulation.settings import (
     SensorSettings,
     SimulationSettings,
 )
+from sorvolo.lab.simulation.site import simulate_site
 from sorvolo.missions.watch.flights import watch
 from sorvolo.missions.watch.settings import WatchOutputs
 

@@ -40,7 +40,6 @@ from scipy.optimize import linear_sum_assignment
 from detection_data import hituav
 from provenance import commit, machine, note_scoring, seeds_or_drawn
 from sorvolo.detection.detector import Detector
-from sorvolo.lab.simulate.site import simulate_site
 from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     LaterSettings,
@@ -50,6 +49,7 @@ from sorvolo.lab.simulation.settings import (
     SensorSettings,
     SimulationSettings,
 )
+from sorvolo.lab.simulation.site import simulate_site
 from sorvolo.missions.watch.flights import watch
 from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
 from sorvolo.survey.labels import LabelledPicture

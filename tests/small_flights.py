@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-from sorvolo.lab.simulate.site import simulate_site
 from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     OutputSettings,
@@ -11,6 +10,7 @@ from sorvolo.lab.simulation.settings import (
     SensorSettings,
     SimulationSettings,
 )
+from sorvolo.lab.simulation.site import simulate_site
 
 
 def small_flight(

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sorvolo.capture.areas import read_area
-    from sorvolo.change.pair.compare import Comparison, compare_images
-    from sorvolo.change.pair.thesis import ThesisSettings, prepare_reference, thesis_steps
+    from sorvolo.change.compare import Comparison, compare_images
     from sorvolo.change.robust import RobustSettings
     from sorvolo.detection.detector import Detector
     from sorvolo.errors import GeometryError, InputError, SettingsError, SorvoloError, StoreError
@@ -24,14 +23,20 @@ if TYPE_CHECKING:
     )
     from sorvolo.lab.evaluation.mosaic import evaluate_mosaic
     from sorvolo.lab.evaluation.objects import evaluate_objects
-    from sorvolo.lab.simulate.pictures import simulate_pictures
-    from sorvolo.lab.simulate.site import simulate_site
+    from sorvolo.lab.simulation.picture_sets import simulate_pictures
     from sorvolo.lab.simulation.pictures import PictureSettings
     from sorvolo.lab.simulation.presets import preset, preset_names
     from sorvolo.lab.simulation.settings import SimulationSettings
-    from sorvolo.lab.train.detector import train_detector
-    from sorvolo.lab.train.sets import DataOptions
-    from sorvolo.lab.train.settings import TrainSettings
+    from sorvolo.lab.simulation.site import simulate_site
+    from sorvolo.lab.thesis.changes import (
+        ThesisSettings,
+        compare_thesis,
+        prepare_reference,
+        thesis_steps,
+    )
+    from sorvolo.lab.training.detector import train_detector
+    from sorvolo.lab.training.sets import DataOptions
+    from sorvolo.lab.training.settings import TrainSettings
     from sorvolo.missions.calibrate_camera import (
         calibrate_camera,
         find_views,
@@ -96,6 +101,7 @@ __all__ = [
     "camera_to_plan_with",
     "compare_flights",
     "compare_images",
+    "compare_thesis",
     "correct_telemetry",
     "evaluate_changes",
     "evaluate_detector",
@@ -126,8 +132,7 @@ __all__ = [
 
 _HOMES = {
     "capture.areas": ("read_area",),
-    "change.pair.compare": ("Comparison", "compare_images"),
-    "change.pair.thesis": ("ThesisSettings", "prepare_reference", "thesis_steps"),
+    "change.compare": ("Comparison", "compare_images"),
     "change.robust": ("RobustSettings",),
     "detection.detector": ("Detector",),
     "errors": ("GeometryError", "InputError", "SettingsError", "SorvoloError", "StoreError"),
@@ -141,14 +146,20 @@ _HOMES = {
     ),
     "lab.evaluation.mosaic": ("evaluate_mosaic",),
     "lab.evaluation.objects": ("evaluate_objects",),
-    "lab.simulate.pictures": ("simulate_pictures",),
-    "lab.simulate.site": ("simulate_site",),
+    "lab.simulation.picture_sets": ("simulate_pictures",),
+    "lab.simulation.site": ("simulate_site",),
     "lab.simulation.pictures": ("PictureSettings",),
     "lab.simulation.presets": ("preset", "preset_names"),
     "lab.simulation.settings": ("SimulationSettings",),
-    "lab.train.detector": ("train_detector",),
-    "lab.train.sets": ("DataOptions",),
-    "lab.train.settings": ("TrainSettings",),
+    "lab.thesis.changes": (
+        "ThesisSettings",
+        "compare_thesis",
+        "prepare_reference",
+        "thesis_steps",
+    ),
+    "lab.training.detector": ("train_detector",),
+    "lab.training.sets": ("DataOptions",),
+    "lab.training.settings": ("TrainSettings",),
     "missions.calibrate_camera": (
         "calibrate_camera",
         "find_views",

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import sorvolo
-from sorvolo.change.robust import RobustSettings
 from sorvolo.errors import InputError, SettingsError
 
 
@@ -18,20 +17,23 @@ def scene() -> tuple[Any, Any]:
     return before, after
 
 
-@pytest.mark.parametrize("method", ["thesis", "robust"])
-def test_mask_and_boxes(method: str) -> None:
-    mask, boxes = sorvolo.compare_images(*scene(), method=method)
+COMPARE = [sorvolo.compare_images, sorvolo.compare_thesis]
+
+
+@pytest.mark.parametrize("compare", COMPARE)
+def test_mask_and_boxes(compare: Any) -> None:
+    mask, boxes = compare(*scene())
     assert mask.shape == (96, 128) and mask.dtype == np.uint8 and set(np.unique(mask)) <= {0, 255}
     assert boxes.ndim == 2 and boxes.shape[1] == 4 and boxes.dtype == np.int64
 
 
-def test_the_default_is_the_thesis_with_any_number_of_threads_and_any_layout() -> None:
+def test_the_thesis_compares_with_any_number_of_threads_and_any_layout() -> None:
     before, after = scene()
-    found = sorvolo.compare_images(before, after)
+    found = sorvolo.compare_thesis(before, after)
     assert found.mask[40:50, 50:70].all() and len(found.boxes) == 1
     wide = np.zeros((96, 256, 3), np.uint8)
     wide[:, ::2] = after
-    again = sorvolo.compare_images(sorvolo.prepare_reference(before), wide[:, ::2], threads=3)
+    again = sorvolo.compare_thesis(sorvolo.prepare_reference(before), wide[:, ::2], threads=3)
     np.testing.assert_array_equal(found.mask, again.mask)
     np.testing.assert_array_equal(found.boxes, again.boxes)
 
@@ -39,7 +41,7 @@ def test_the_default_is_the_thesis_with_any_number_of_threads_and_any_layout() -
 PICTURE = np.zeros((40, 50, 3), np.uint8)
 
 
-@pytest.mark.parametrize("method", ["thesis", "robust"])
+@pytest.mark.parametrize("compare", COMPARE)
 @pytest.mark.parametrize(
     ("reference", "query", "valid", "message"),
     [
@@ -56,24 +58,20 @@ PICTURE = np.zeros((40, 50, 3), np.uint8)
     ],
 )
 def test_input_that_cannot_be_used_is_named(
-    method: str, reference: Any, query: Any, valid: Any, message: str
+    compare: Any, reference: Any, query: Any, valid: Any, message: str
 ) -> None:
     with pytest.raises(InputError, match=message):
-        sorvolo.compare_images(reference, query, valid, method=method)
+        compare(reference, query, valid)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"method": "best"}, "method is 'best'; give one of thesis, robust"),
         (
-            {"settings": RobustSettings()},
-            "settings are RobustSettings; method 'thesis' needs ThesisSettings",
+            {"settings": sorvolo.ThesisSettings()},
+            "settings are ThesisSettings; give RobustSettings",
         ),
-        ({"settings": sorvolo.ThesisSettings(), "method": "robust"}, "needs RobustSettings"),
         ({"settings": {"T_B": 0.3}}, "settings are dict"),
-        ({"threads": 0}, "threads is 0"),
-        ({"threads": 1.5}, "threads is 1.5"),
     ],
 )
 def test_settings_that_contradict_are_named(options: Any, message: str) -> None:

@@ -15,7 +15,7 @@ from toy_models import rectangle_model
 from sorvolo.cli import main as cli
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
-from sorvolo.lab.simulate.flight_files import video_writer, write_camera, write_telemetry
+from sorvolo.lab.simulation.flight_files import video_writer, write_camera, write_telemetry
 from sorvolo.survey.flight import Telemetry
 
 _WIDTH, _HEIGHT, _FPS, _STEP_PX = 320, 240, 10.0, 4

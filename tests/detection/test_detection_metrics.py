@@ -28,7 +28,7 @@ from sorvolo.lab.evaluation.detection_scores import (
     group_tables,
     intervals,
 )
-from sorvolo.lab.train.held_out import Checked, best_sizes_px
+from sorvolo.lab.training.held_out import Checked, best_sizes_px
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import Detections
 

@@ -17,7 +17,6 @@ import pytest
 from small_flights import simulate_into, small_flight
 from sorvolo.capture.calibration import camera_from_option, guess_camera
 from sorvolo.capture.source import opened_sources
-from sorvolo.change.pair.thesis_options import thesis_options
 from sorvolo.change.reference import ReferenceMap
 from sorvolo.change.views import FlightCamera, ViewMaker, ViewOutcome
 from sorvolo.cli.main import main
@@ -26,6 +25,7 @@ from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.lab.evaluation.changes import evaluate_changes
 from sorvolo.lab.simulation.settings import LaterSettings, OutputSettings, SimulationSettings
+from sorvolo.lab.thesis.changes import ThesisComparison, ThesisSettings
 from sorvolo.missions.compare.flights import _begun, compare_flights
 from sorvolo.missions.flight.known_camera import known_camera
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
@@ -435,7 +435,7 @@ def test_a_guessed_camera_names_one_that_was_given_for_pictures_of_its_size(site
 
 def test_the_thesis_method_compares_too_and_shows_its_steps(flown, site, tmp_path):
     settings = CompareSettings(
-        model="none", method="thesis", thesis=thesis_options(["T_gray=light", "threads=2"])
+        ThesisComparison(ThesisSettings(gray_threshold=None), threads=2), model="none"
     )
     updates = list(
         compare_flights(
@@ -447,14 +447,14 @@ def test_the_thesis_method_compares_too_and_shows_its_steps(flown, site, tmp_pat
         )
     )
     assert report(site)["comparison"]["method"] == "thesis"
-    assert report(site)["settings"]["thesis"]["threads"] == 2
-    assert report(site)["settings"]["thesis"]["settings"]["gray_threshold"] is None
+    assert report(site)["settings"]["method"]["threads"] == 2
+    assert report(site)["settings"]["method"]["settings"]["gray_threshold"] is None
     pictures = list((tmp_path / "steps").rglob("*.png"))
     assert len(pictures) >= 7 * len(updates)
 
 
 def test_steps_of_another_method_are_refused(flown, site):
-    with pytest.raises(SettingsError, match="--method thesis"):
+    with pytest.raises(SettingsError, match="choose another --method"):
         list(
             compare_flights(
                 [flown / "flight2"],
@@ -467,7 +467,7 @@ def test_steps_of_another_method_are_refused(flown, site):
 
 
 def test_steps_within_the_site_folder_are_refused(tmp_path):
-    thesis = CompareSettings(model="none", method="thesis")
+    thesis = CompareSettings(ThesisComparison(), model="none")
     for steps in (tmp_path / "site" / "flights" / "steps", tmp_path / "other" / ".." / "site"):
         with pytest.raises(SettingsError, match="lies in the site folder"):
             list(compare_flights([tmp_path / "later"], tmp_path / "site", thesis, steps=steps))
@@ -478,7 +478,6 @@ def test_steps_within_the_site_folder_are_refused(tmp_path):
     [
         lambda: CompareSettings(votes=4, voters=3),
         lambda: CompareSettings(views_per_second=0.0),
-        lambda: CompareSettings(method="best"),
     ],
 )
 def test_settings_are_checked(make: Callable[[], object]):
@@ -731,7 +730,7 @@ def test_a_flight_in_the_dark_is_reported_to_show_less_and_paints_no_black_groun
         compare(
             tmp_path / "dark",
             tmp_path / "thesis",
-            replace(_COMPARE, method="thesis", views_per_second=1.0),
+            replace(_COMPARE, method=ThesisComparison(), views_per_second=1.0),
         )
         assert not has_grown(tmp_path / "thesis")
 

@@ -16,8 +16,8 @@ from sorvolo.cli.main import main
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.homography import apply_homography, site_from_image_homography
 from sorvolo.geometry.level_ground import footprint
-from sorvolo.lab.simulate.flight_files import write_camera, write_photo
 from sorvolo.lab.simulation.flight import SimulatedFlight, simulate_flights
+from sorvolo.lab.simulation.flight_files import write_camera, write_photo
 from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     LaterSettings,

@@ -14,7 +14,7 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import site_from_image_homography
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
-from sorvolo.lab.simulate.flight_files import video_writer
+from sorvolo.lab.simulation.flight_files import video_writer
 from sorvolo.missions.flight.headline import MapQuality, map_headline
 from sorvolo.missions.flight.warnings import _angle_warnings, unlevelled
 from sorvolo.mosaic.consistency import Consistency

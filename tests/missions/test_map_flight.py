@@ -15,12 +15,13 @@ from sorvolo.capture.source import open_sources
 from sorvolo.cli import main as cli
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.geometry.homography import apply_homography, fit_similarity
+from sorvolo.lab.thesis.mapping import ThesisMapping
+from sorvolo.lab.thesis.stitching import RoiStitchingSettings
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import prepare
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.map.planar_run import PlanarRun
 from sorvolo.missions.site.history import site_history
-from sorvolo.mosaic.roi_stitching import RoiStitchingSettings
 from sorvolo.store.exports.plain import features_path
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.flight import Frame, PosedFrame
@@ -419,10 +420,13 @@ def test_the_thesis_method(
     photos = _some_photos(photographed, tmp_path / "few", 0, 7)
     site = tmp_path / "site"
     stitching = RoiStitchingSettings(transform=transform, max_features=3000)
-    settings = MapSettings(method="thesis", thesis=stitching, model="none")
+    settings = MapSettings(ThesisMapping(stitching), model="none")
     list(map_flights([photos], site, settings, camera=photographed / "camera.xml"))
     report = report_of(site, "few")
-    assert report["method"] == "thesis" and report["settings"]["thesis"]["transform"] == transform
+    assert (
+        report["method"] == "thesis"
+        and report["settings"]["method"]["stitching"]["transform"] == transform
+    )
     assert report["frames"]["vision"] == 7
     assert corner_errors_m(site, "few", photographed / "truth")[1] < 1.0  # metres: its own ceiling
 

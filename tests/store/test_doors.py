@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 
 from mutations import mutated
 from sorvolo.errors import InputError, SettingsError, StoreError
-from sorvolo.lab.simulate.flight_files import read_orthophoto
+from sorvolo.lab.simulation.flight_files import read_orthophoto
 from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.store.images import image_from_jpeg, jpeg_from_image, rgba_from_png
 from sorvolo.store.nofollow import read_below

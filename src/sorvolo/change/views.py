@@ -10,6 +10,7 @@ from cv2.typing import MatLike
 
 from sorvolo.change.alignment import Aligned, Aligner, AlignStep, Caution, FlightPlace
 from sorvolo.change.areas import leaning, level_of
+from sorvolo.change.compare import PairMethod
 from sorvolo.change.corroboration import (
     LEAST_SCORE,
     SURE,
@@ -20,8 +21,6 @@ from sorvolo.change.corroboration import (
 )
 from sorvolo.change.earlier_pictures import EarlierPictures
 from sorvolo.change.map_search import MapSearch
-from sorvolo.change.pair.thesis import compare_thesis
-from sorvolo.change.pair.thesis_options import ThesisOptions
 from sorvolo.change.planting import Planted, Planting
 from sorvolo.change.reference import ReferenceMap
 from sorvolo.change.robust import RobustSettings, compare_robust
@@ -212,8 +211,8 @@ _TURNED_SIGMA_DEG = 3.0  # of a camera's angles as it fits the map: tilt and pla
 
 @dataclass(frozen=True, eq=False)
 class ViewTraces:
-    """What a frame's comparison left in its `ViewMaker`: `measured` is None where nothing was compared, or by method
-    thesis."""
+    """What a frame's comparison left in its `ViewMaker`: `measured` is None where nothing was compared, or by another
+    method."""
 
     step: AlignStep
     aligned: Aligned | None
@@ -303,8 +302,8 @@ class ViewMaker:
 
     `compare_with_map` finds what differs from the map, `corroborate` keeps what earlier pictures confirm. Either is
     called for the frames in their order; one may run while the other does, in another thread. The frames that an
-    earlier process compared come first, each to `recall`. With `thesis`, its method compares, which asks no earlier
-    pictures; else the robust one.
+    earlier process compared come first, each to `recall`. A `method` given compares in place of the robust one; it asks
+    no earlier pictures.
     """
 
     def __init__(
@@ -312,7 +311,7 @@ class ViewMaker:
         flight: FlightCamera,
         reference: ReferenceMap,
         site_grid: SiteGrid,
-        thesis: ThesisOptions | None,
+        method: PairMethod | None,
         pictures: EarlierPictures | None,
     ) -> None:
         self._flight, self._reference, self._site_grid = flight, reference, site_grid
@@ -326,8 +325,8 @@ class ViewMaker:
         self._lens_sees: Mask = np.ones(size[::-1], bool) if seen is None else seen
         self._pictures = pictures
         self._aligner = Aligner(reference, site_grid)
-        self._thesis = thesis or ThesisOptions()
-        self._tuning = FlightTuning() if thesis is None else None
+        self._method = method
+        self._tuning = FlightTuning() if method is None else None
         self._planting = Planting()
 
     def compare_with_map(
@@ -461,7 +460,7 @@ class ViewMaker:
         )
 
     def chosen(self) -> dict[str, Any]:
-        """What the robust method's parameters set themselves to on this flight; nothing for method thesis."""
+        """What the robust method's parameters set themselves to on this flight; nothing for another method."""
         return {} if self._tuning is None else self._tuning.chosen()
 
     def change_m_per_px(self, first: ComparedView) -> float:
@@ -474,8 +473,8 @@ class ViewMaker:
         return views_m_per_px if views_m_per_px > _COARSER * map_m_per_px else map_m_per_px
 
     def brightness_beside_map(self, posed: PosedFrame, outcome: ViewOutcome) -> float:
-        """How many times as bright as the map a frame is. Where no ground was compared in its light yet (and method
-        thesis never does), its middle grey gives it."""
+        """How many times as bright as the map a frame is. Where no ground was compared in its light yet (and another
+        method never does), its middle grey gives it."""
         if np.isnan(outcome.brightness):
             return self._reference.brightness_of(posed.frame.image)
         return outcome.brightness
@@ -575,7 +574,7 @@ class ViewMaker:
         return believed((compared.found, compared.valid), earlier), leans
 
     def _plant(self, view: ComparedView, compared: OneSided) -> tuple[Planted, ...]:
-        """What is found of things drawn into a view, if it is its turn; nothing by method thesis."""
+        """What is found of things drawn into a view, if it is its turn; nothing by another method."""
         if compared.settings is None:
             return ()
         sure, reference = SURE, as_bgr(compared.reference)
@@ -593,17 +592,16 @@ class ViewMaker:
         """What differs from the map; the flight's tuning learns of it, by what was measured."""
         settings = self._settings_now()
         if self._tuning is None or settings is None:
-            thesis = compare_thesis(
-                reference, query, valid, self._thesis.settings, self._thesis.threads
-            )
-            return Difference(thesis.mask, thesis.boxes, np.full(len(thesis.boxes), 0.5)), None
+            assert self._method is not None
+            other = self._method.compare(reference, query, valid)
+            return Difference(other.mask, other.boxes, np.full(len(other.boxes), 0.5)), None
         found = compare_robust(reference, query, valid, settings)
         measured = PairMeasures.of(found)
         self._tuning.observe(measured)
         return Difference(found.mask, found.boxes, found.scores), measured
 
     def _settings_now(self) -> RobustSettings | None:
-        """Those of the robust method as the flight has set them so far; None for method thesis."""
+        """Those of the robust method as the flight has set them so far; None for another method."""
         least_score = LEAST_SCORE
         return (
             None

@@ -45,6 +45,7 @@ from sorvolo.survey.wording import area_text, counted, plural
 if TYPE_CHECKING:
     from collections.abc import Generator
 
+    from sorvolo.change.compare import PairMethod
     from sorvolo.missions.flight.request import AlreadyDone
     from sorvolo.survey.findings import CompareUpdate
 
@@ -124,7 +125,7 @@ def compare(
     from sorvolo.missions.flight.settings import CompareSettings
 
     settings = CompareSettings(
-        method.value,
+        None if method == ChangeMethod.ROBUST else _thesis(),
         votes=votes,
         voters=votes + 2,
         offset_s=offset,
@@ -156,6 +157,12 @@ def compare(
             show_results(results, place.folder, Console(), coordinates)
     if any(result["comparison"]["headline"]["quality"] != "compared" for result in results):
         raise typer.Exit(TO_CHECK)
+
+
+def _thesis() -> "PairMethod":
+    from sorvolo.lab.thesis.changes import ThesisComparison
+
+    return ThesisComparison()
 
 
 def read_results(

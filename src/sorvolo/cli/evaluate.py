@@ -37,10 +37,10 @@ if TYPE_CHECKING:
         SetComparison,
         SetScores,
     )
+    from sorvolo.lab.evaluation.map_quality import Spread
     from sorvolo.lab.evaluation.mask_folders import MaskScores
     from sorvolo.lab.evaluation.mosaic import MosaicEvaluation
     from sorvolo.lab.evaluation.track_metrics import FlightObjects
-    from sorvolo.mosaic.map_quality import Spread
 
 evaluate_app = typer.Typer(no_args_is_help=True)
 

@@ -37,6 +37,7 @@ from sorvolo.cli.sites import ended_by_signal, opened_site, run_on_site
 from sorvolo.survey.wording import counted, counted_list
 
 if TYPE_CHECKING:
+    from sorvolo.missions.flight.settings import MapMethod
     from sorvolo.store.site.catalogue_place import Catalogues
 
 _MAX_REASONS = 6  # of frames that are not on the map, the commonest first
@@ -126,7 +127,7 @@ def map_command(
     from sorvolo.store.site.catalogue_place import chosen_catalogues
 
     settings = MapSettings(
-        method.value,
+        None if method == Method.PLANAR else _thesis(),
         gsd,
         offset_s=offset,
         ground_elevation_m=ground_elevation,
@@ -196,6 +197,12 @@ def _print(
         return
     for report in heights:
         show_heights(site, report, Console())
+
+
+def _thesis() -> "MapMethod":
+    from sorvolo.lab.thesis.mapping import ThesisMapping
+
+    return ThesisMapping()
 
 
 def show_reports(reports: Sequence[Mapping[str, Any]], site: Path, console: Console) -> None:

@@ -143,7 +143,7 @@ def _written(
 
 def _show(document: dict[str, Any], page: Path) -> None:
     """The tables as the thesis prints them."""
-    from sorvolo.store.exports.reproduction_sheets import reproduction_sheets
+    from sorvolo.lab.thesis.sheets import reproduction_sheets
 
     console = Console()
     if missing := document["missing"]:

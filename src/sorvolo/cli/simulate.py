@@ -20,8 +20,8 @@ from sorvolo.errors import SettingsError
 from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
-    from sorvolo.lab.simulate.site import SimulationProgress
     from sorvolo.lab.simulation.settings import SimulationSettings
+    from sorvolo.lab.simulation.site import SimulationProgress
 
 PresetName = Annotated[
     str,
@@ -130,7 +130,7 @@ def simulate(
         raise SettingsError(
             f"--pictures makes single pictures, not flights: leave out {', '.join(given)}"
         )
-    from sorvolo.lab.simulate.pictures import simulate_pictures
+    from sorvolo.lab.simulation.picture_sets import simulate_pictures
     from sorvolo.lab.simulation.pictures import PictureSettings
 
     asked = PictureSettings(pictures, 1 if seed is None else seed, kind, thermal)
@@ -167,7 +167,7 @@ def _simulate_flights(
     *,
     as_json: bool,
 ) -> None:
-    from sorvolo.lab.simulate.site import simulate_site
+    from sorvolo.lab.simulation.site import simulate_site
 
     steps = simulate_site(folder, settings, ground_file, ground_gsd)
     if as_json:
@@ -212,8 +212,8 @@ def demo(
     """
     from sorvolo.lab.evaluation.changes import evaluate_changes
     from sorvolo.lab.evaluation.mosaic import evaluate_mosaic
-    from sorvolo.lab.simulate.site import simulate_site
     from sorvolo.lab.simulation.presets import preset
+    from sorvolo.lab.simulation.site import simulate_site
     from sorvolo.missions.compare.flights import compare_flights
     from sorvolo.missions.map.flights import map_flights
 
@@ -272,7 +272,7 @@ def _next_steps(folder: Path, site: Path) -> list[str]:
 
 def _is_simulated(folder: Path, settings: "SimulationSettings") -> bool:
     """Whether an earlier run of this version left the very flights that are wanted."""
-    from sorvolo.lab.simulate.simulation_folder import MARK
+    from sorvolo.lab.simulation.folder import MARK
     from sorvolo.store.exports.plain import plain_json
 
     try:

@@ -27,7 +27,7 @@ from sorvolo.cli.sites import Stop
 from sorvolo.errors import SettingsError
 
 if TYPE_CHECKING:  # torch is an extra, and slow to import: only this command needs it
-    from sorvolo.lab.train.detector import TrainingUpdate
+    from sorvolo.lab.training.detector import TrainingUpdate
 
 
 class Preset(StrEnum):
@@ -90,7 +90,7 @@ def train(
 
     Example: sorvolo train my-labels --out my-model --resume
     """
-    from sorvolo.lab.train.settings import TrainSettings
+    from sorvolo.lab.training.settings import TrainSettings
 
     settings = TrainSettings(
         preset.value,
@@ -103,8 +103,8 @@ def train(
         synthetic=synthetic,
     )
     try:
-        from sorvolo.lab.train.detector import CHECKPOINT, train_detector
-        from sorvolo.lab.train.sets import DataOptions
+        from sorvolo.lab.training.detector import CHECKPOINT, train_detector
+        from sorvolo.lab.training.sets import DataOptions
     except ModuleNotFoundError as error:
         raise SettingsError(
             f"training needs packages that are not installed ({error.name}): pip install 'sorvolo[training]'"

@@ -111,7 +111,7 @@ def video_plan(
     by_pictures: bool,
 ) -> FramePlan:
     """The plan of a recorded video. `by_pictures`: three times as many frames are asked as eq. 3.17 needs, and the
-    pictures decide; else (the thesis) it alone does."""
+    pictures decide; else it alone does."""
     keyframe_s = interval_s(camera, height_m, speed_m_s, overlap)
     share = 3 if by_pictures else 1
     step_s = float(np.clip(keyframe_s / share, 1 / max(frame_rate_hz, 1.0), 2.0 / share))

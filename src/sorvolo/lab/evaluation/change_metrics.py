@@ -1,4 +1,4 @@
-"""How good change detection is: the thesis's counts (Tables 4.3 to 4.5) of pixels and frames, events, ground."""
+"""How good change detection is: counts of pixels and frames, events, ground."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -85,7 +85,7 @@ def frame_counts(
     """One frame as a whole: positive when at least `least_px` of its known pixels are changed.
 
     A frame whose true change has some pixels, but fewer than `least_px`, and a frame of which nothing is known, are
-    `unknown`. The thesis counts any pixel: `least_px` 1. Raises InputError when the masks differ in size, SettingsError
+    `unknown`. Raises InputError when the masks differ in size, SettingsError
     for `least_px` under 1.
     """
     if least_px < 1:

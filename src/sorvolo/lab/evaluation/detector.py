@@ -29,10 +29,10 @@ from sorvolo.lab.evaluation.detector_files import (
     read_found,
     write_found,
 )
-from sorvolo.lab.train.holding_out import hold_out
+from sorvolo.lab.evaluation.detector_page import detector_page
+from sorvolo.lab.training.holding_out import hold_out
 from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.exports.plain import json_bytes
-from sorvolo.store.pages.detector import detector_page
 from sorvolo.survey.flight import Notice
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import Detections, no_detections

@@ -12,19 +12,19 @@ from numpy.typing import NDArray
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGBA, Mask, PointsPx
 from sorvolo.geometry.geodesy import Projection
+from sorvolo.lab.evaluation.frame_deviation import (
+    DeviationSummary,
+    MapDeviation,
+    frames_to_compare,
+    summed_up,
+)
 from sorvolo.lab.evaluation.frame_rows import (
     map_frames,
     refuse_simulation,
     true_frames,
     truth_file,
 )
-from sorvolo.mosaic.frame_deviation import (
-    DeviationSummary,
-    MapDeviation,
-    frames_to_compare,
-    summed_up,
-)
-from sorvolo.mosaic.map_quality import (
+from sorvolo.lab.evaluation.map_quality import (
     CornerErrors,
     Shift,
     Spread,

@@ -10,25 +10,24 @@ from statistics import median
 from typing import Any
 
 from sorvolo.capture.source import open_sources
-from sorvolo.change.pair.thesis import compare_thesis
-from sorvolo.change.pair.thesis_options import thesis_options
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.lab.datasets.mask_pictures import read_mask
-from sorvolo.lab.datasets.umcd import read_umcd_metadata
-from sorvolo.lab.datasets.umcd_folder import UmcdVideo
 from sorvolo.lab.evaluation.change_metrics import Counts
+from sorvolo.lab.evaluation.frame_deviation import MapDeviation
 from sorvolo.lab.evaluation.frame_rows import map_frames
 from sorvolo.lab.evaluation.mask_folders import (
     ComparedMask,
     compared_masks,
     frames_against_times,
 )
+from sorvolo.lab.thesis.changes import compare_thesis
 from sorvolo.lab.thesis.settings import COMPARISONS, FIGURE_PX
+from sorvolo.lab.thesis.umcd import read_umcd_metadata
+from sorvolo.lab.thesis.umcd_folder import UmcdVideo
 from sorvolo.lab.thesis.video_input import VideoInput
 from sorvolo.missions.compare.flights import compare_flights
 from sorvolo.missions.flight.settings import CompareSettings
-from sorvolo.mosaic.frame_deviation import MapDeviation
 from sorvolo.store.atomic import writing
 from sorvolo.store.exports.annotated import with_outlines
 from sorvolo.store.images import jpeg_from_image
@@ -53,16 +52,14 @@ def compare_video(
     InputError where nothing states which frames show a change.
     """
     _demand_truth(truth)
-    method, written = COMPARISONS[title]
     with writing(scratch):
         shutil.rmtree(scratch, ignore_errors=True)
         shutil.copytree(site, scratch)
     settings = CompareSettings(
-        method=method,
+        COMPARISONS[title],
         model="none",
         writes_masks=True,
         updates_map=False,
-        thesis=thesis_options(written),
         views_per_second=views_per_second,
     )
     started_cpu_s = time.process_time()

@@ -11,11 +11,11 @@ from sorvolo.capture.source import open_sources
 from sorvolo.capture.video import read_video_info
 from sorvolo.detection.detector import Detector
 from sorvolo.errors import InputError
-from sorvolo.lab.datasets.umcd import UmcdMetadata, read_umcd_metadata
-from sorvolo.lab.datasets.umcd_folder import UmcdVideo
 from sorvolo.lab.evaluation.detector import EvaluationSettings, evaluate_detector, read_sets
 from sorvolo.lab.thesis.settings import FIGURE_PX, DetectorSettings
-from sorvolo.lab.train.settings import TrainSettings
+from sorvolo.lab.thesis.umcd import UmcdMetadata, read_umcd_metadata
+from sorvolo.lab.thesis.umcd_folder import UmcdVideo
+from sorvolo.lab.training.settings import TrainSettings
 from sorvolo.mosaic.selection import every
 from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.exports.annotated import annotated
@@ -66,8 +66,8 @@ def train_network(
     Raises InputError as `train_detector`, and where torch is not installed; SettingsError for a device.
     """
     try:
-        from sorvolo.lab.train.detector import MODEL, train_detector
-        from sorvolo.lab.train.sets import DataOptions
+        from sorvolo.lab.training.detector import MODEL, train_detector
+        from sorvolo.lab.training.sets import DataOptions
     except ModuleNotFoundError as error:
         raise InputError(
             f"training needs packages that are not installed ({error.name}): pip install 'sorvolo[training]'"

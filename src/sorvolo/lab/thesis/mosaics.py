@@ -11,14 +11,15 @@ import numpy as np
 
 from sorvolo.geometry.arrays import Floats
 from sorvolo.geometry.polygons import signed_area
+from sorvolo.lab.evaluation.frame_deviation import MapDeviation
 from sorvolo.lab.evaluation.frame_rows import map_frames
 from sorvolo.lab.evaluation.mosaic import evaluate_mosaic
+from sorvolo.lab.thesis.mapping import ThesisMapping
 from sorvolo.lab.thesis.settings import FIGURE_PX
+from sorvolo.lab.thesis.stitching import RoiStitchingSettings
 from sorvolo.lab.thesis.video_input import VideoInput
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
-from sorvolo.mosaic.frame_deviation import MapDeviation
-from sorvolo.mosaic.roi_stitching import RoiStitchingSettings
 from sorvolo.store.atomic import writing
 from sorvolo.store.exports.map_pictures import picture
 from sorvolo.store.images import jpeg_from_image, jpeg_from_rgba
@@ -79,11 +80,8 @@ def map_video(
     with writing(site):
         shutil.rmtree(site, ignore_errors=True)
         site.parent.mkdir(parents=True, exist_ok=True)
-    settings = MapSettings(
-        method="thesis" if method == "thesis" else "planar",
-        model="none",
-        thesis=RoiStitchingSettings(transform=transform),
-    )
+    thesis = ThesisMapping(RoiStitchingSettings(transform=transform))
+    settings = MapSettings(thesis if method == "thesis" else None, model="none")
     started_s, started_cpu_s = time.monotonic(), time.process_time()
     updates = list(map_flights([flight.video], site, settings, **flight.options))
     minutes, cpu_minutes = (

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from sorvolo.lab.datasets.umcd_folder import CHANGES, MOSAICKING, WITH, WITHOUT
+from sorvolo.lab.thesis.umcd_folder import CHANGES, MOSAICKING, WITH, WITHOUT
 
 VIDEOS: dict[str, dict[str, tuple[str, ...]]] = {
     f"{WITHOUT}/{MOSAICKING}": {

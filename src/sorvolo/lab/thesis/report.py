@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from sorvolo import __version__
+from sorvolo.lab.thesis.page import reproduction_page
 from sorvolo.lab.thesis.published import FIGURES
 from sorvolo.lab.thesis.rows import Row, RowStore
 from sorvolo.lab.thesis.settings import ReproductionSettings, SimulatedSize
-from sorvolo.lab.thesis.thesis_tables import tables_of
+from sorvolo.lab.thesis.sheets import reproduction_sheets
+from sorvolo.lab.thesis.tables import tables_of
 from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.exports.plain import json_bytes, plain_json
-from sorvolo.store.exports.reproduction_sheets import reproduction_sheets
-from sorvolo.store.pages.reproduction import reproduction_page
 from sorvolo.survey.wording import counted
 
 NUMBERS, PAGE, MARKDOWN = "reproduction.json", "reproduction.html", "reproduction.md"

@@ -10,9 +10,8 @@ from typing import Any
 
 from sorvolo import __version__
 from sorvolo.errors import GeometryError, InputError, StoreError
-from sorvolo.lab.datasets.npu_folder import ENVIRONMENT, read_npu_folder
-from sorvolo.lab.datasets.umcd_folder import UmcdFolder, UmcdVideo, read_umcd_folder
 from sorvolo.lab.thesis import comparisons, detectors, mosaics
+from sorvolo.lab.thesis.npu_folder import ENVIRONMENT, read_npu_folder
 from sorvolo.lab.thesis.published import VIDEOS
 from sorvolo.lab.thesis.rows import Row, RowStore
 from sorvolo.lab.thesis.settings import (
@@ -21,6 +20,7 @@ from sorvolo.lab.thesis.settings import (
     PUBLISHED,
     ReproductionSettings,
 )
+from sorvolo.lab.thesis.umcd_folder import UmcdFolder, UmcdVideo, read_umcd_folder
 from sorvolo.lab.thesis.video_input import VideoInput, video_input
 from sorvolo.store.site.journal import content_sha256
 

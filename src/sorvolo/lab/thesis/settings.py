@@ -4,6 +4,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from sorvolo.errors import SettingsError
+from sorvolo.lab.thesis.changes import ThesisComparison, ThesisSettings
 
 ENVIRONMENTS = ("Urban", "Dirt", "Countryside")
 FIGURE_PX = 960
@@ -12,13 +13,15 @@ FIGURE_PX = 960
 MAP_METHODS = ("thesis", "planar")
 PUBLISHED = "published"
 """The kind of rows that compare a map with a published mosaic of the NPU Drone-Map dataset."""
-COMPARISONS: dict[str, tuple[Literal["thesis", "robust"], tuple[str, ...]]] = {
-    "thesis": ("thesis", ()),
-    "thesis, eq. 3.21 as printed": ("thesis", ("eq3.21=printed",)),
-    "thesis, thresholds from the light": ("thesis", ("T_gray=light", "T_H=light")),
-    "robust": ("robust", ()),
+COMPARISONS: dict[str, ThesisComparison | None] = {
+    "thesis": ThesisComparison(),
+    "thesis, eq. 3.21 as printed": ThesisComparison(ThesisSettings(isolation_as_printed=True)),
+    "thesis, thresholds from the light": ThesisComparison(
+        ThesisSettings(gray_threshold=None, hamming_share=None)
+    ),
+    "robust": None,
 }
-"""The ways in which pictures are compared, by their titles: the method and its values."""
+"""The ways in which pictures are compared, by their titles; None is the robust method."""
 
 
 @dataclass(frozen=True)

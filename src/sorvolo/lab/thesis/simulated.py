@@ -8,7 +8,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from sorvolo.errors import SettingsError
-from sorvolo.lab.datasets.umcd_folder import (
+from sorvolo.lab.simulation.presets import preset, preset_names
+from sorvolo.lab.simulation.settings import SimulationSettings
+from sorvolo.lab.simulation.site import SimulationProgress, simulate_site
+from sorvolo.lab.thesis.settings import ReproductionSettings, SimulatedSize
+from sorvolo.lab.thesis.umcd_folder import (
     CALIBRATION,
     CHANGES,
     MASKS_ENDING,
@@ -16,11 +20,7 @@ from sorvolo.lab.datasets.umcd_folder import (
     WITH,
     WITHOUT,
 )
-from sorvolo.lab.datasets.umcd_writing import umcd_metadata
-from sorvolo.lab.simulate.site import SimulationProgress, simulate_site
-from sorvolo.lab.simulation.presets import preset, preset_names
-from sorvolo.lab.simulation.settings import SimulationSettings
-from sorvolo.lab.thesis.settings import ReproductionSettings, SimulatedSize
+from sorvolo.lab.thesis.umcd_writing import umcd_metadata
 from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.exports.plain import json_bytes
 

@@ -8,7 +8,7 @@ from sorvolo.capture.calibration import camera_from_option
 from sorvolo.capture.telemetry import is_telemetry
 from sorvolo.capture.video import read_video_info
 from sorvolo.errors import InputError
-from sorvolo.lab.datasets.umcd_folder import UmcdVideo
+from sorvolo.lab.thesis.umcd_folder import UmcdVideo
 
 
 @dataclass(frozen=True)

@@ -76,34 +76,6 @@ def _sampled(features: Tensor, boxes: Tensor, batch: Tensor, scale: float, side:
     return out
 
 
-def roi_means(features: Tensor, boxes: Tensor, stride: int, side: int) -> Tensor:
-    """(R, C, side, side) as `roi_align` of one picture's features (1, C, H, W), in training and exported graph alike.
-
-    Boxes (R, 4) may reach beyond the picture, where its edge goes on; ONNX's own RoiAlign has nothing there.
-    """
-    # one box more, dropped in the end: in an exported graph a Reshape of no boxes at all fails
-    boxes = torch.cat([boxes, boxes.new_zeros(1, 4)])
-    height, width = features.shape[-2], features.shape[-1]
-    steps = (torch.arange(side * _SAMPLES, dtype=features.dtype, device=features.device) + 0.5) / (
-        side * _SAMPLES
-    )
-    x = (boxes[:, 0:1] + steps * (boxes[:, 2:3] - boxes[:, 0:1])) / stride
-    y = (boxes[:, 1:2] + steps * (boxes[:, 3:4] - boxes[:, 1:2])) / stride
-    x, y = x * 2 / width - 1, y * 2 / height - 1
-    columns = x[:, None, :] + 0 * y[:, :, None]
-    lines = y[:, :, None] + 0 * x[:, None, :]
-    grid = torch.stack([columns, lines], -1).reshape(
-        1, boxes.shape[0] * side * _SAMPLES, side * _SAMPLES, 2
-    )
-    seen = functional.grid_sample(features, grid, padding_mode="border", align_corners=False)
-    seen = (
-        seen[0]
-        .reshape(features.shape[1], boxes.shape[0], side * _SAMPLES, side * _SAMPLES)
-        .transpose(0, 1)
-    )
-    return functional.avg_pool2d(seen, _SAMPLES)[:-1]
-
-
 def pooled_levels(
     levels: Sequence[Tensor], strides: Sequence[int], boxes: Tensor, batch: Tensor, side: int
 ) -> Tensor:

@@ -64,6 +64,8 @@ class JointTraining:
         )
         self._started_s = time.monotonic()
 
+    phase, is_whole = "learning", True
+
     def learn(self, batch: Sequence[Sample]) -> Progress:
         """One step on a batch of samples of one size."""
         self.model.train()

@@ -116,28 +116,6 @@ def joint_proposal_loss(proposed: Proposed, answers: Sequence[Answer]) -> tuple[
     return score_loss / len(picture), box_loss / len(picture)
 
 
-def thesis_proposal_loss(
-    proposed: Proposed, answers: Sequence[Answer], generator: torch.Generator, *, sampled: int = 256
-) -> tuple[Tensor, Tensor]:
-    """Eq. 4.2 for the proposals: log loss over sampled anchors and smooth L1 over the positives among them.
-
-    Positives overlap a true box by more than 0.7, background by less than 0.3; half of a sample at most is positive. Of
-    the two ways that the thesis's 4.3 names it chooses this: a box that no anchor overlaps so far has no positive.
-    """
-    score_losses, box_losses = [], []
-    for index, answer in enumerate(answers):
-        match = match_boxes(proposed.anchors, answer, over=0.7, under=0.3, best_too=False)
-        chosen = sample(match, sampled, 0.5, generator)
-        wanted = match.positive[chosen].to(proposed.scores.dtype)
-        score_losses.append(
-            functional.binary_cross_entropy_with_logits(proposed.scores[index][chosen], wanted)
-        )
-        rows = chosen[match.positive[chosen]]
-        offsets = proposed.offsets[index][rows]
-        box_losses.append(_smooth_l1(offsets, proposed.anchors[rows], match, rows, answer, sampled))
-    return torch.stack(score_losses).mean(), torch.stack(box_losses).mean()
-
-
 def region_loss(
     scores: Tensor, offsets: Tensor, regions: Tensor, match: Match, answer: Answer, *, overlap: bool
 ) -> tuple[Tensor, Tensor]:
@@ -172,12 +150,3 @@ def sample(match: Match, count: int, most_positive: float, generator: torch.Gene
     ]
     negative = negative[torch.randperm(len(negative), generator=generator)[: count - len(positive)]]
     return torch.cat([positive, negative])
-
-
-def _smooth_l1(
-    offsets: Tensor, anchors: Tensor, match: Match, rows: Tensor, answer: Answer, sampled: int
-) -> Tensor:
-    if not len(rows):
-        return offsets.sum() * 0
-    goal = offsets_from_boxes(answer.boxes[match.target[rows]], anchors)
-    return functional.smooth_l1_loss(offsets, goal, reduction="sum", beta=1 / 9) / sampled

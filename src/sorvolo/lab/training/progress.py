@@ -22,6 +22,14 @@ class Learner(Protocol):
     def average(self) -> FasterRCNN:
         """The model that would be kept if training ended now."""
 
+    @property
+    def phase(self) -> str:
+        """What it learns now, in words."""
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the model's parts fit together already, so that it can be checked."""
+
     def learn(self, batch: Sequence[Sample]) -> Progress:
         """One step."""
 

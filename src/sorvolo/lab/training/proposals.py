@@ -2,12 +2,19 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from sorvolo.lab.training.boxes import at_most, boxes_from_offsets, clipped, suppress
-from sorvolo.lab.training.inception import Stem, proposal_stem
+from sorvolo.lab.training.depthwise import Depthwise
+from sorvolo.lab.training.feature_pyramid import convolution, separable
+
+Stem = Literal["standard", "extended", "extended-residual"]
+
+RATIOS = (0.5, 1.0, 2.0)  # of height to width: Faster R-CNN's (Ren et al. 2015)
 
 
 @dataclass(frozen=True)
@@ -43,7 +50,7 @@ class Proposed:
 
 
 class ProposalNetwork(nn.Module):
-    """For each level a stem of its own (`inception.proposal_stem`), then the scores and offsets of its anchors."""
+    """For each level a stem of its own (`proposal_stem`), then the scores and offsets of its anchors."""
 
     def __init__(
         self,
@@ -101,6 +108,91 @@ def propose(
     boxes = clipped(boxes, *size_px)
     kept = suppress(boxes.detach(), best.detach()[None], after, iou, 0.0)[:, 1]
     return boxes[kept], best[kept]
+
+
+class StandardStack(nn.Module):
+    """The standard proposal network's one 3x3 convolution."""
+
+    def __init__(self, channels: int, out: int) -> None:
+        super().__init__()
+        self.convolution = convolution(channels, out, 3)
+        self.channels = out
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(N, channels, H, W) -> (N, self.channels, H, W)."""
+        return self.convolution(features)
+
+
+class ResidualStack(nn.Module):
+    """Ours: the standard convolution, to which a stack of Inception modules learns to add; at first it adds nothing.
+
+    `light` is for pictures on a laptop: each module filters by 3x3, 5x5 and 7x7, channel by channel, side by side, and
+    mixes the three with its input. Else the modules are the table's, `scale` times as wide.
+    """
+
+    def __init__(
+        self, channels: int, out: int, *, light: bool, modules: int = 1, scale: float = 0.25
+    ) -> None:
+        super().__init__()
+        self.channels = out
+        self.standard: nn.Module = (
+            separable(channels, 3) if light else convolution(channels, out, 3)
+        )
+        if light:
+            if channels != out:
+                raise ValueError(f"a light stack keeps its width, {channels}; got {out}")
+            self.added = nn.Sequential(*(_LightInception(channels) for _ in range(modules)))
+        else:
+            from sorvolo.lab.thesis.network import ExtendedStack
+
+            stack = ExtendedStack(channels, scale)
+            self.added = nn.Sequential(
+                stack, nn.Conv2d(stack.channels, out, 1, bias=False), nn.BatchNorm2d(out)
+            )
+            nn.init.zeros_(self.added[2].weight)  # type: ignore[arg-type]
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(N, channels, H, W) -> (N, self.channels, H, W)."""
+        standard = self.standard(features)
+        if isinstance(self.added[0], _LightInception):
+            return self.added(standard)
+        return standard + self.added(features)
+
+
+class _LightInception(nn.Module):
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.branches = nn.ModuleList(
+            nn.Sequential(
+                Depthwise(channels, kernel),
+                nn.BatchNorm2d(channels),
+                nn.ReLU(inplace=True),
+            )
+            for kernel in (3, 5, 7)
+        )
+        self.mix = nn.Sequential(
+            nn.Conv2d(3 * channels, channels, 1, bias=False), nn.BatchNorm2d(channels)
+        )
+        nn.init.zeros_(self.mix[1].weight)  # type: ignore[arg-type]
+
+    def forward(self, features: Tensor) -> Tensor:
+        mixed = self.mix(torch.cat([branch(features) for branch in self.branches], 1))
+        return functional.relu(features + mixed)
+
+
+def proposal_stem(kind: Stem, channels: int, out: int, *, light: bool) -> nn.Module:
+    """What replaces the proposal network's convolution; it has `.channels`, the width that comes out."""
+    if kind == "standard":
+        if not light:
+            return StandardStack(channels, out)
+        stem = separable(channels, 3)
+        stem.channels = channels  # type: ignore[assignment]
+        return stem
+    if kind == "extended":
+        from sorvolo.lab.thesis.network import ExtendedStack
+
+        return ExtendedStack(channels, 0.125 if light else 1.0)
+    return ResidualStack(channels, out, light=light)
 
 
 def _predictor(channels: int, out: int, spread: float, bias: float) -> nn.Conv2d:

@@ -10,11 +10,10 @@ import torch
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.lab.training.exported import ExportedModel, load_exported
 from sorvolo.lab.training.faster_rcnn import FasterRCNN
-from sorvolo.lab.training.four_steps import FourStepSettings, FourStepTraining
-from sorvolo.lab.training.inception import Stem
 from sorvolo.lab.training.joint import JointSettings, JointTraining, collate
 from sorvolo.lab.training.presets import Preset, build, fast
 from sorvolo.lab.training.progress import Learner
+from sorvolo.lab.training.proposals import Stem
 from sorvolo.lab.training.samples import Sample
 from sorvolo.lab.training.weights import ImageNetWeights
 
@@ -82,6 +81,8 @@ def start_learner(
         model = build(preset, classes, rpn, start)
     model = model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     if schedule == "four-steps":
+        from sorvolo.lab.thesis.four_steps import FourStepSettings, FourStepTraining
+
         return FourStepTraining(model, FourStepSettings(steps=steps), seed, device)
     settings = JointSettings(
         steps=steps,

@@ -43,7 +43,7 @@ class ComparePlan:
         """Plan a comparison; a stream leaves no time for learned differences."""
         is_photos = source.kind == "photos"
         fine = 1.0
-        if settings.method != "thesis":
+        if settings.method is None:
             fine = min(max(map_m_per_px / _FINE_M_PER_PX, 1.0), _FINER)
         return cls(
             settings.side_px or (_VIDEO_PX if source.kind == "video" else _PHOTO_PX),
@@ -86,7 +86,7 @@ class FlightChanges:
                 self._flight,
             )
         announced = self._evidence.add(view)
-        if self._settings.method != "thesis":
+        if self._settings.method is None:
             self._areas.add(view, leans)
         if self._gathered is not None and self._selection.take(view.outline_m):
             self._gathered.add(view, leans)

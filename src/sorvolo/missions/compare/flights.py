@@ -66,7 +66,7 @@ def compare_flights(
 
     `inputs`, `telemetry`, `camera`, `area`, `detector`, `live` and `until` are those of `map_flights`. An update
     carries the changes that its frame announced; after one that `comes_again` its frame may have another. `steps` is a
-    folder for the intermediate pictures of method thesis (its Figure 3.14). The flights' findings and the new version
+    folder for the intermediate pictures of another method than the robust one. The flights' findings and the new version
     of the map are part of the site when a flight's last update was yielded.
     A run that was killed continues when the same is asked for again.
     A flight that was compared already, as it is asked for, is left out and returned, unless `again` is given.
@@ -130,10 +130,8 @@ def _reviews(archive: Archive) -> list[tuple[str, str]]:
 
 def _check_steps(steps: Path, site: Path, settings: CompareSettings) -> None:
     """Raise SettingsError where the intermediate pictures cannot be made, or not there."""
-    if settings.method != "thesis":
-        raise SettingsError(
-            "the steps are those of the thesis's method: give --method thesis as well"
-        )
+    if settings.method is None:
+        raise SettingsError("the robust method shows no steps: choose another --method as well")
     if steps.resolve().is_relative_to(site.resolve()):
         raise SettingsError(
             f"{steps} lies in the site folder {site}, which is sorvolo's own; name another folder"

@@ -123,7 +123,7 @@ def comparison_summary(
     coverage["other_ground_m2"] = min(areas_m2, coverage["compared_m2"])
     return {
         "against_version": base_version,
-        "method": settings.method,
+        "method": settings.method_name,
         **counts.summary(),
         "changes": {kind.value: kinds[kind] for kind in ChangeKind},
         "single_view": sum(each.is_single_view for each in changes),

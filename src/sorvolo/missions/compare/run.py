@@ -13,7 +13,6 @@ from sorvolo.change.earlier_pictures import EarlierPicture, EarlierPictures, wit
 from sorvolo.change.flight_on_map import FlightFit, FlightOnMap
 from sorvolo.change.map_update import paint_changes
 from sorvolo.change.outlines import KnownPlace
-from sorvolo.change.pair.thesis import thesis_steps
 from sorvolo.change.reconcile import reported
 from sorvolo.change.reference import ReferenceMap
 from sorvolo.change.relief import Relief
@@ -116,7 +115,7 @@ class CompareRun:
         self._writer: FlightWriter = archive.begin_flight(
             source.name,
             source.fingerprint,
-            {**vars(settings), "method": f"compare-{settings.method}", REQUEST: request},
+            {**vars(settings), "method": f"compare-{settings.method_name}", REQUEST: request},
             journal=self._memo.journal,
         )
         self._views = view_maker(setup, archive, settings, base_version)
@@ -350,16 +349,10 @@ class CompareRun:
         if self._settings.writes_masks:
             changed, valid = self._views.pixels.masks(view)
             self._writer.save_masks(view.name, changed, valid, self._views.pixels.boxes(view))
-        if self._steps is not None:
-            thesis = self._settings.thesis
-            steps = thesis_steps(
-                as_bgr(view.reference),
-                as_bgr(view.image),
-                view.valid,
-                thesis.settings,
-                thesis.threads,
-            )
-            write_pictures(self._steps / view.name, steps.pictures())
+        method = self._settings.method
+        if self._steps is not None and method is not None:
+            steps = method.steps(as_bgr(view.reference), as_bgr(view.image), view.valid)
+            write_pictures(self._steps / view.name, steps)
 
     def _report(
         self,
@@ -410,7 +403,7 @@ class CompareRun:
             "area_m2": self._extension.grown_m2(self._base_version),
         }
         return report | {
-            "method": f"compare-{self._settings.method}",
+            "method": f"compare-{self._settings.method_name}",
             "settings": asdict(self._settings),
             "comparison": comparison,
             "warnings": [*report["warnings"], *warnings],
@@ -427,8 +420,8 @@ def view_maker(
         source.camera.camera, setup.usual_height_m, plan.side_px, setup.utc_ns, plan.finer
     )
     reference = ReferenceMap(archive.tiles(base_version), site_grid.grid)
-    if settings.method == "thesis":
-        return ViewMaker(flight, reference, site_grid, settings.thesis, None)
+    if settings.method is not None:
+        return ViewMaker(flight, reference, site_grid, settings.method, None)
     return ViewMaker(flight, reference, site_grid, None, _earlier_pictures(archive, source.name))
 
 

@@ -72,7 +72,7 @@ def build_report(
         "sorvolo": sorvolo.__version__,
         "flight": source.name,
         "site": site.name,
-        "method": settings.method,
+        "method": settings.method_name,
         "inputs": list(source.inputs),
         "georeferenced": not site.is_local,
         "flown": utc_text(setup.flown_ns) if setup.flown_ns else None,

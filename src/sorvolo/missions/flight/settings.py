@@ -1,13 +1,18 @@
 """What a person may choose for a mission; each value has its unit and a default that suits most flights."""
 
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, Protocol
 
-from sorvolo.change.pair.thesis_options import ThesisOptions
+from sorvolo.change.compare import PairMethod
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.geodesy import check_map_crs
 from sorvolo.missions.flight.memory import memory_budget_bytes
-from sorvolo.mosaic.roi_stitching import RoiStitchingSettings
+
+if TYPE_CHECKING:
+    from sorvolo.missions.flight.map_objects import ObjectFinder
+    from sorvolo.missions.flight.setup import FlightSetup
+    from sorvolo.missions.map.run import FlightRun
+    from sorvolo.store.site.archive import Archive
 
 _MOST_OFFSET_S = 86_400 * 365  # a year: a clock that was never set
 
@@ -20,11 +25,29 @@ def check_offset(offset_s: float | None) -> None:
         )
 
 
+class MapMethod(Protocol):
+    """Another way to map a flight than fitting all of its frames together. A frozen record of its own choices."""
+
+    @property
+    def name(self) -> str:
+        """As reports name it."""
+
+    def begin(
+        self,
+        setup: "FlightSetup",
+        archive: "Archive",
+        settings: "MapSettings",
+        finder: "ObjectFinder | None",
+        request: str,
+    ) -> "FlightRun":
+        """The run of one flight."""
+
+
 @dataclass(frozen=True)
 class MapSettings:
     """How a flight becomes a map (`sorvolo map`)."""
 
-    method: Literal["planar", "thesis"] = "planar"
+    method: MapMethod | None = None  # None: planar, all frames fitted together
     m_per_px: float | None = None  # of the map; None: the pictures' own, when the site is new
     overlap: float = 0.7  # s of eq. 3.17
     offset_s: float | None = None  # telemetry time = video time + this; None: estimated from motion
@@ -37,7 +60,6 @@ class MapSettings:
     )
     live_s: float = 3.0  # how often the growing map is made visible
     model: str = "default"  # that looks for objects: an installed one's name, a file, or "none"
-    thesis: RoiStitchingSettings = field(default_factory=RoiStitchingSettings)  # of method thesis
     control_sigma_m: float = 0.05  # of the control points' places, horizontal
     checks: tuple[
         str, ...
@@ -51,7 +73,6 @@ class MapSettings:
             raise SettingsError(
                 f"the control points' accuracy (--gcp-accuracy) must lie in 0.0001 to 100 m, got {self.control_sigma_m}"
             )
-        self._check_method()
         if self.compress not in (None, "deflate", "jpeg"):
             raise SettingsError(
                 f"the compression (--compress) must be deflate or jpeg, got {self.compress!r}"
@@ -66,20 +87,17 @@ class MapSettings:
             check_map_crs(self.crs)
         check_offset(self.offset_s)
 
-    def _check_method(self) -> None:
-        if self.method not in ("planar", "thesis"):
-            raise SettingsError(f"method must be planar or thesis, got {self.method!r}")
-        if self.method != "thesis" and self.thesis != RoiStitchingSettings():
-            raise SettingsError(
-                "the settings `thesis` belong to the thesis's method: choose the method thesis as well"
-            )
+    @property
+    def method_name(self) -> str:
+        """As reports name it."""
+        return "planar" if self.method is None else self.method.name
 
 
 @dataclass(frozen=True)
 class CompareSettings:
     """How a later flight is compared with the map (`sorvolo compare`)."""
 
-    method: Literal["robust", "thesis"] = "robust"
+    method: PairMethod | None = None  # None: robust
     views_per_second: float = 5.0  # of flight: neighbouring frames of a video show the same again
     votes: int = 3  # k: views of a piece of ground that must show a change ...
     voters: int = 5  # n: ... among the last this many that saw it
@@ -94,18 +112,9 @@ class CompareSettings:
     writes_masks: bool = False
     trusts_map: bool = False  # also a map that contradicts itself
     model: str = "default"  # that looks for objects: an installed one's name, a file, or "none"
-    thesis: ThesisOptions = field(
-        default_factory=ThesisOptions
-    )  # of method thesis: Table 4.2, threads
     classes: tuple[str, ...] = ()  # that are looked for; none: those that the model usually reports
 
     def __post_init__(self) -> None:
-        if self.method != "thesis" and self.thesis != ThesisOptions():
-            raise SettingsError(
-                "Table 4.2 belongs to the thesis's method: give --method thesis as well"
-            )
-        if self.method not in ("robust", "thesis"):
-            raise SettingsError(f"method must be robust or thesis, got {self.method!r}")
         if not 0.05 <= self.views_per_second <= 240:
             raise SettingsError(
                 f"views per second must lie in 0.05 to 240, got {self.views_per_second}"
@@ -118,6 +127,11 @@ class CompareSettings:
         if self.side_px is not None and not 256 <= self.side_px <= 8192:
             raise SettingsError(f"frames are compared at 256 to 8192 px, got {self.side_px}")
         check_offset(self.offset_s)
+
+    @property
+    def method_name(self) -> str:
+        """As reports name it."""
+        return "robust" if self.method is None else self.method.name
 
     @property
     def mapping(self) -> MapSettings:

@@ -297,7 +297,7 @@ def _with_gps(
 def _planned(source: Source, settings: MapSettings, telemetry: FlightTelemetry) -> FramePlan:
     if source.kind == "photos":
         return untimed_plan(is_video=False, expected=source.frame_count)
-    camera, by_pictures = source.camera.camera, settings.method == "planar"
+    camera, by_pictures = source.camera.camera, settings.method is None
     height_m, speed_m_s = telemetry.height_m, telemetry.speed_m_s
     if isinstance(source, LiveSource):
         return live_plan(camera, height_m, speed_m_s, settings.overlap, by_pictures=by_pictures)

@@ -39,7 +39,6 @@ from sorvolo.missions.flight.setup import (
 from sorvolo.missions.map.coverage import FlightCoverage
 from sorvolo.missions.map.planar_run import PlanarRun
 from sorvolo.missions.map.run import FlightRun
-from sorvolo.missions.map.thesis_run import ThesisRun
 from sorvolo.mosaic.control import ControlSettings
 from sorvolo.mosaic.selection import (
     Selected,
@@ -151,7 +150,7 @@ def _known_ground(
         )
     if control is None and base is None:
         return None
-    if settings.method != "planar":
+    if settings.method is not None:
         raise SettingsError("--gcp and --base tie maps of method planar only; leave --method out")
     if len(sources) != 1:
         raise SettingsError(
@@ -180,8 +179,8 @@ def _map_one(
     check_room(flight.setup, archive, m_per_px)
     room = LiveRoom(flight.setup, archive.folder, m_per_px)
     flight = flight.noting(*repeated(archive, source, "mapped"))
-    setup, is_planar = flight.setup, settings.method == "planar"
-    memo = flight.cache(archive) if is_planar else ResultCache()
+    setup, method = flight.setup, settings.method
+    memo = flight.cache(archive) if method is None else ResultCache()
     finder = None
     if detector is not None:
         live_folder = archive.folder if isinstance(source, LiveSource) else None
@@ -190,8 +189,8 @@ def _map_one(
         )
     begun: FlightRun = (
         PlanarRun(setup, archive, settings, None, finder, memo, flight.request, coverage)
-        if is_planar
-        else ThesisRun(setup, archive, settings, finder, flight.request)
+        if method is None
+        else method.begin(setup, archive, settings, finder, flight.request)
     )
     with begun as run, nullcontext() if search is None else search:
         for selected in itertools.chain(_kept(memo), _selected(setup, settings, area)):
@@ -239,7 +238,7 @@ def _selected(
     selection = SelectionSettings(
         overlap=settings.overlap, least_overlap=min(0.5, settings.overlap)
     )
-    is_planar = settings.method == "planar"
+    is_planar = settings.method is None
     wanted = every(setup.plan.step_s)
     if isinstance(source, VideoSource) and is_planar:
         sparse = SparseReading(

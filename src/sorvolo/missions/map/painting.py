@@ -73,7 +73,7 @@ class KnownKeyframes:
 
     def _for_graph(self, number: int) -> KnownKeyframe:
         stored = self.stored[number]
-        # the thesis's method knows a similarity only: that of a camera looking straight down
+        # another method than planar may know a similarity only: of a camera looking straight down
         pose = stored.site_from_camera or pose_from_homography(
             stored.site_from_image, stored.camera
         )

@@ -153,7 +153,11 @@ class FlightRun(ABC):
             self._writer = self._archive.begin_flight(
                 source.name,
                 source.fingerprint,
-                {**vars(self._settings), REQUEST: self._request},
+                {
+                    **vars(self._settings),
+                    "method": self._settings.method_name,
+                    REQUEST: self._request,
+                },
                 tiles_mb=min(memory.tiles_mb, memory_mb // 8),
                 images_mb=min(images_mb, memory_mb // 2),
                 journal=self._memo.journal,

@@ -4,24 +4,26 @@ import math
 from functools import cache
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+_HOME = "sorvolo.store.pages"
 
-def render(template: str, **values: Any) -> Markup:
-    """The template `templates/<template>` filled with these values, as text that needs no more escaping."""
-    return Markup(_environment().get_template(template).render(**values))
+
+def render(template: str, *, package: str = _HOME, **values: Any) -> Markup:
+    """The template `templates/<template>` of a package filled with these values, as text that needs no more escaping."""
+    return Markup(_environment(package).get_template(template).render(**values))
 
 
 def cell(macro: str, *values: Any) -> Markup:
     """A cell of a table, by a macro of `templates/cells.html`."""
-    return Markup(getattr(_environment().get_template("cells.html").module, macro)(*values))
+    return Markup(getattr(_environment(_HOME).get_template("cells.html").module, macro)(*values))
 
 
 @cache
-def _environment() -> Environment:
+def _environment(package: str) -> Environment:
     environment = Environment(
-        loader=PackageLoader("sorvolo.store.pages"),
+        loader=ChoiceLoader([PackageLoader(package), PackageLoader(_HOME)]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

@@ -1,1 +1,0 @@
-"""Two aligned pictures of one ground: which pixels and regions changed."""

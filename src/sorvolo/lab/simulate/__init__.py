@@ -1,1 +1,0 @@
-"""`sorvolo simulate`: flights and pictures with known truth."""

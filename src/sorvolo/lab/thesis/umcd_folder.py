@@ -1,0 +1,166 @@
+"""The UMCD dataset's folder (the thesis's chapter 2): which videos it has, and which files belong to each."""
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from sorvolo.errors import InputError
+from sorvolo.lab.datasets.mask_pictures import MASK_ENDINGS
+from sorvolo.lab.thesis.umcd import looks_like_umcd
+
+WITH, WITHOUT = "Videos With Telemetry", "Videos Without Telemetry"
+MOSAICKING, CHANGES = "Mosaicking", "Change Detection"
+CALIBRATION = "Camera Calibration"
+"""The names of the folders, as the thesis writes them; read in any case, with any separators."""
+
+MASKS_ENDING = "_masks"
+"""Of the folder beside a video that holds its change masks, one a frame. The dataset has none: they are added."""
+
+_VIDEO_ENDINGS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".m4v"})
+_TEXT_ENDINGS = frozenset({".txt", ".csv", ".log", ".nmea", ".srt", ".gpx", ".tsv", ".gps", ".dat"})
+_SECOND_SET = re.compile(r"(.+?)_\d+")
+_REST = re.compile(r"(?:[-_. ](?!\d).*)?")  # path4_1 is another video than path4
+
+
+@dataclass(frozen=True)
+class UmcdVideo:
+    """One video. `texts` lie beside it under its name and are no metadata; `masks` is a folder of change masks.
+
+    `has_telemetry`: the dataset has its telemetry, so that one of the texts has to be that.
+    """
+
+    environment: str  # its folder's name, as written there
+    name: str
+    video: Path
+    texts: tuple[Path, ...] = ()
+    metadata: Path | None = None
+    masks: Path | None = None
+    has_telemetry: bool = True
+
+    @property
+    def key(self) -> str:
+        """The environment and the name, in small letters: unique within a list of videos."""
+        return f"{self.environment}/{self.name}".lower()
+
+
+@dataclass(frozen=True)
+class UmcdFolder:
+    """A dataset's videos by the part they lie in, and its camera file."""
+
+    place: Path
+    without_telemetry: tuple[UmcdVideo, ...]
+    mosaicking: tuple[UmcdVideo, ...]
+    change_detection: tuple[UmcdVideo, ...]
+    camera: Path | None
+
+    def mosaic_of(self, later: UmcdVideo) -> UmcdVideo | None:
+        """The mosaicking video of the path that a change detection video flew: path4 of path4_1 (thesis 2.2)."""
+        by_key = {each.key: each for each in self.mosaicking}
+        second = _SECOND_SET.fullmatch(later.name)
+        shorter = f"{later.environment}/{second[1]}".lower() if second else ""
+        return by_key.get(later.key) or by_key.get(shorter)
+
+
+def read_umcd_folder(place: Path) -> UmcdFolder:
+    """Find the videos of a dataset in the thesis's layout; raises InputError for a folder that has none of its parts.
+
+    A part that is not there leaves its list empty.
+    """
+    if not place.is_dir():
+        raise InputError(f"{place}: no such folder; give the folder of the UMCD dataset")
+    parts = {name: _folder(place, name) for name in (WITHOUT, WITH, CALIBRATION)}
+    mosaicking, changes = (_folder(parts[WITH], name) for name in (MOSAICKING, CHANGES))
+    bare = _folder(parts[WITHOUT], MOSAICKING) or parts[WITHOUT]
+    maps, later = videos_in(mosaicking), videos_in(changes)
+    videos = tuple(replace(each, has_telemetry=False) for each in videos_in(bare))
+    if not (videos or maps or later):
+        raise InputError(
+            f"{place}: not the UMCD dataset: no videos in '{WITHOUT}', nor in '{MOSAICKING}' or '{CHANGES}' of "
+            f"'{WITH}' (thesis, chapter 2); give the folder that holds these"
+        )
+    return UmcdFolder(place, videos, maps, later, _camera(parts[CALIBRATION]))
+
+
+def videos_in(part: Path | None) -> tuple[UmcdVideo, ...]:
+    """All videos in a folder and below it, with the files that belong to each; none of None."""
+    if part is None:
+        return ()
+    found = sorted(
+        path for path in part.rglob("*") if path.suffix.lower() in _VIDEO_ENDINGS and path.is_file()
+    )
+    return tuple(_video(path, part) for path in found)
+
+
+def _folder(place: Path | None, name: str) -> Path | None:
+    """The folder of this name, whatever its case and separators."""
+    if place is None:
+        return None
+    wanted = _letters(name)
+    return next(
+        (
+            each
+            for each in sorted(place.iterdir())
+            if each.is_dir() and _letters(each.name) == wanted
+        ),
+        None,
+    )
+
+
+def _letters(name: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", name.lower())
+
+
+def _video(path: Path, part: Path) -> UmcdVideo:
+    beside = [each for each in sorted(path.parent.iterdir()) if _belongs(each, path)]
+    texts = list(filter(_is_text, beside))
+    metadata = next((each for each in texts if _is_metadata(each)), None)
+    others = tuple(each for each in texts if each != metadata)
+    return UmcdVideo(
+        path.parent.name if path.parent != part else "",
+        path.stem,
+        path,
+        others,
+        metadata,
+        _masks(beside),
+    )
+
+
+def _is_text(path: Path) -> bool:
+    return path.suffix.lower() in _TEXT_ENDINGS and path.is_file()
+
+
+def _is_metadata(path: Path) -> bool:
+    return path.suffix.lower() == ".txt" and looks_like_umcd(path)
+
+
+def _belongs(other: Path, video: Path) -> bool:
+    """Whether a file or folder has the video's name, alone or with more behind it: path1.csv, path1_masks."""
+    stem, name = video.stem.lower(), other.stem.lower() if other.is_file() else other.name.lower()
+    return (
+        other != video and name.startswith(stem) and _REST.fullmatch(name[len(stem) :]) is not None
+    )
+
+
+def _masks(beside: Sequence[Path]) -> Path | None:
+    folders = (
+        each for each in beside if each.is_dir() and each.name.lower().endswith(MASKS_ENDING)
+    )
+    return next((each for each in folders if _holds(each, MASK_ENDINGS)), None)
+
+
+def _holds(folder: Path, endings: Iterable[str]) -> bool:
+    return any(each.suffix.lower() in endings for each in folder.iterdir())
+
+
+def _camera(folder: Path | None) -> Path | None:
+    if folder is None:
+        return None
+    return next(
+        (
+            each
+            for each in sorted(folder.iterdir())
+            if each.suffix.lower() in (".xml", ".yml", ".yaml")
+        ),
+        None,
+    )

@@ -1,1 +1,0 @@
-"""`sorvolo train`: a detector from labelled pictures."""

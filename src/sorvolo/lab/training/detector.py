@@ -1,0 +1,488 @@
+"""Train the detector: labelled pictures and weights in, checkpoints on the way, a model file and a report out."""
+
+import math
+import os
+import time
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
+from dataclasses import asdict, dataclass, field, replace
+from datetime import UTC, datetime
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from sorvolo import __version__
+from sorvolo.capture.photos import read_picture
+from sorvolo.detection.calibration import scaled_thresholds
+from sorvolo.detection.contract import FORMAT, Calibration
+from sorvolo.errors import InputError, SettingsError
+from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.lab.training.checkpoint import (
+    checkpoint_bytes,
+    load_weights_bytes,
+    read_checkpoint,
+    restore,
+    weights_bytes,
+)
+from sorvolo.lab.training.checks import check_model, check_of
+from sorvolo.lab.training.drawing import batches_from
+from sorvolo.lab.training.exported import ExportedModel
+from sorvolo.lab.training.faster_rcnn import FasterRCNN
+from sorvolo.lab.training.held_out import Checked, best_sizes_px, found_sizes_px
+from sorvolo.lab.training.joint import Progress
+from sorvolo.lab.training.onnx_export import ExportCheck, check_export, export_onnx
+from sorvolo.lab.training.page import training_page
+from sorvolo.lab.training.progress import Check, History, Learner, seconds_left
+from sorvolo.lab.training.samples import Augmentation, Sample
+from sorvolo.lab.training.seeing import padded_to
+from sorvolo.lab.training.sets import (
+    DataOptions,
+    TrainingSets,
+    read_labels,
+    simulate_samples,
+    training_sets,
+)
+from sorvolo.lab.training.settings import TrainSettings
+from sorvolo.lab.training.start import (
+    class_notices,
+    kept_on_request,
+    kept_thermal_by,
+    load_start,
+    part_notices,
+    request_notices,
+    size_notices,
+    threshold_notices,
+)
+from sorvolo.lab.training.starting import device_of, start_learner, without_denormals
+from sorvolo.lab.training.weights import ImageNetWeights
+from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, writing
+from sorvolo.store.exports.plain import json_bytes, plain_json
+from sorvolo.survey.wording import counted
+
+MODEL, REPORT, PAGE = "model.onnx", "training.json", "training.html"
+CHECKPOINT, BEST, SIMULATED = "checkpoint.pt", "best.safetensors", "simulated"
+"""What a run leaves in its folder; the last only where simulated pictures were asked for."""
+
+_CHECKS, _CHECK_STEPS = (
+    20,
+    50,
+)  # a run is checked so often, evenly over its steps, but not after fewer of them
+_MOST_CHECKED, _MOST_CHECKED_LAST = 150, 1000  # held-out pictures
+_ROWS = 200  # of losses in the report
+_SAVE_S = 60.0  # a kill costs no more than this and the time between two checks
+_KEPT_PICTURES_BYTES = (
+    2 << 30
+)  # decoded pictures in memory: two gigabytes of a small computer's eight; by choice
+_FINDS_NOTHING_AP50 = 0.05  # below which a model is of no use yet
+_EXPORT_PICTURES, _EXPORT_PX = 4, 1280  # by which the model file is compared with torch
+
+
+@dataclass(frozen=True)
+class TrainingUpdate:
+    """Where a run stands. Before its first step `step` is 0 and `words` names what is being done."""
+
+    step: int
+    steps: int
+    words: str
+    losses: Progress | None = None  # of the last step
+    steps_per_s: float = float("nan")
+    left_s: float = float("nan")
+    check: Check | None = None  # the one made just now
+    notices: tuple[str, ...] = ()  # what is to be known, each reported once
+
+
+@dataclass(eq=False)
+class _Run:
+    """A run on its way: `learner` and `history` change with every step."""
+
+    out: Path
+    settings: TrainSettings
+    sets: TrainingSets
+    learner: Learner
+    reader: "_Reader"
+    device: str
+    start: ImageNetWeights | ExportedModel | None
+    notices: tuple[str, ...]  # reported before the first step
+    history: History = field(default_factory=History)
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What a run must share with the one that it goes on from."""
+        settings = {key: value for key, value in asdict(self.settings).items() if key != "patience"}
+        if isinstance(self.start, ExportedModel):
+            begun = f"model with SHA-256 {self.start.sha256[:16]}"
+        else:
+            begun = (
+                "none"
+                if self.start is None
+                else f"ImageNet{', original strides' if self.start.original else ''}"
+            )
+        return {
+            **settings,
+            "weights": begun,
+            "classes": list(self.sets.classes),
+            "data": self.sets.fingerprint,
+        }
+
+
+def train_detector(
+    places: Sequence[Path],
+    out: Path,
+    settings: TrainSettings,
+    options: DataOptions,
+    *,
+    device: str = "auto",
+    resume: bool = False,
+) -> Iterator[TrainingUpdate]:
+    """Train on the sets at `places` and leave model.onnx, training.html, training.json and checkpoints in `out`.
+
+    Closing the iterator early leaves a checkpoint, from which `resume` goes on. Raises InputError for data or weights
+    that cannot be used, SettingsError for a device that is not there, for an `out` that holds another run, and for
+    resuming with other settings or data; StoreError on a full disk.
+    """
+    device = device_of(device)
+    with _claimed(out, resume):
+        yield from _train(places, out, settings, options, device, resume)
+
+
+def _train(
+    places: Sequence[Path],
+    out: Path,
+    settings: TrainSettings,
+    options: DataOptions,
+    device: str,
+    resume: bool,
+) -> Iterator[TrainingUpdate]:
+    start = load_start(settings.weights, settings.preset)
+    steps = settings.steps
+    yield TrainingUpdate(0, steps, "reading the labels")
+    labels = read_labels(places, options, synthetic=settings.synthetic, seed=settings.seed)
+    if settings.synthetic > 0:
+        samples = round(steps * settings.batch * settings.synthetic)
+        for words in simulate_samples(out / SIMULATED, samples, settings.seed):
+            yield TrainingUpdate(0, steps, words)
+    sets = training_sets(labels, synthetic=settings.synthetic, simulated=out / SIMULATED)
+    notices = sets.notices
+    if isinstance(start, ExportedModel):
+        notices += (*part_notices(start), *class_notices(start, sets.classes))
+    yield TrainingUpdate(0, steps, f"preparing the network ({settings.preset})", notices=notices)
+    reader = _Reader(sets)
+    with without_denormals():
+        with closing(_batches(sets, reader, settings)) as first:
+            learner = start_learner(
+                settings.preset,
+                sets.classes,
+                settings.rpn,
+                settings.schedule,
+                start,
+                first,
+                steps=steps,
+                batch=settings.batch,
+                seed=settings.seed,
+                device=device,
+            )
+        run = _Run(out, settings, sets, learner, reader, device, start, notices)
+        if resume:
+            checkpoint = read_checkpoint((out / CHECKPOINT).read_bytes(), str(out / CHECKPOINT))
+            restore(run.learner, checkpoint, run.identity)
+            run.history = checkpoint.history
+        yield from _learn(run)
+        yield TrainingUpdate(run.learner.step, steps, "measuring and writing the model")
+        check, closing_notices = _finish(run)
+    yield TrainingUpdate(
+        run.learner.step, steps, f"{out / MODEL} is ready", check=check, notices=closing_notices
+    )
+
+
+@contextmanager
+def _claimed(out: Path, resume: bool) -> Iterator[None]:
+    """Make the folder; raise SettingsError unless it is free, or holds what is to be gone on from.
+
+    What was made is gone again when nothing came into it, as after an error before the first step.
+    """
+    held = (out / CHECKPOINT).is_file()
+    if resume and not held:
+        raise SettingsError(
+            f"{out} holds no {CHECKPOINT} to go on from; leave --resume out to start there"
+        )
+    if held and not resume:
+        raise SettingsError(
+            f"{out} already holds a run; --resume continues it, another --out starts a new one"
+        )
+    made = [each for each in (out, *out.parents) if not each.exists()]
+    with writing(out):
+        out.mkdir(parents=True, exist_ok=True)
+        remove_leftovers([out])
+    try:
+        yield
+    finally:
+        with suppress(OSError):  # a folder that holds something stays
+            for each in made:
+                each.rmdir()
+
+
+class _Reader:
+    """Reads pictures, keeping as many as a bounded part of the memory holds; `damaged` are those that cannot be."""
+
+    def __init__(self, sets: TrainingSets) -> None:
+        pictures = [picture for share in sets.shares for picture in share.labelled.pictures]
+        size = sum(3 * each.width_px * each.height_px for each in pictures) / len(pictures)
+        self.damaged: dict[str, str] = {}
+        self._kept = lru_cache(maxsize=int(_KEPT_PICTURES_BYTES / size))(self._read)
+
+    def __call__(self, path: str) -> ImageRGB:
+        """The picture's pixels. Raises InputError when it is damaged or gone."""
+        return self._kept(path)
+
+    def _read(self, path: str) -> ImageRGB:
+        try:
+            return read_picture(Path(path))
+        except (InputError, OSError) as error:
+            self.damaged[path] = str(error)
+            raise InputError(f"{path}: {error}") from error
+
+
+def _batches(
+    sets: TrainingSets, reader: _Reader, settings: TrainSettings, start: int = 0
+) -> Generator[list[Sample], None, None]:
+    """What is learnt from, batch by batch, from number `start` on."""
+    return batches_from(
+        sets.shares,
+        sets.classes,
+        reader,
+        Augmentation(side_px=settings.side_px),
+        seed=settings.seed,
+        batch=settings.batch,
+        start=start,
+        threads=max(1, min(8, (os.cpu_count() or 1) - 1)),
+    )
+
+
+def _learn(run: _Run) -> Iterator[TrainingUpdate]:
+    """All steps that are left, with checks and checkpoints; ends early where checks no longer get better."""
+    settings, learner = run.settings, run.learner
+    batches = _batches(run.sets, run.reader, settings, learner.step)
+    first, before_s, started_s = learner.step, run.history.seconds, time.monotonic()
+    saved_s = started_s
+    try:
+        while learner.step < settings.steps and run.history.is_worth_going_on(settings.patience):
+            progress = learner.learn(next(batches))
+            if not math.isfinite(progress.loss):
+                raise SettingsError(
+                    f"the loss of step {progress.step} is no number: learning has come apart. Take larger batches, "
+                    f"--weights auto or another --seed; {run.out / CHECKPOINT} is from before"
+                )
+            here_s = time.monotonic() - started_s
+            run.history = run.history.after(
+                progress, before_s + here_s, every=max(1, settings.steps // _ROWS)
+            )
+            check = _check(run) if _is_check_due(run) else None
+            if check is not None or time.monotonic() - saved_s > _SAVE_S:
+                _save(run)
+                saved_s = time.monotonic()
+            yield TrainingUpdate(
+                learner.step,
+                settings.steps,
+                learner.phase,
+                progress,
+                (learner.step - first) / here_s,
+                seconds_left(learner.step, settings.steps, learner.step - first, here_s),
+                check,
+            )
+    except GeneratorExit:
+        _save(run)
+        raise
+    finally:
+        batches.close()
+    _save(run)
+
+
+def _is_check_due(run: _Run) -> bool:
+    """At even distances and in the end; of the four steps only in the last: before, the parts do not fit together."""
+    step, steps = run.learner.step, run.settings.steps
+    if not run.sets.held_out or not run.learner.is_whole:
+        return False
+    return step % max(_CHECK_STEPS, steps // _CHECKS) == 0 or step == steps
+
+
+def _check(run: _Run) -> Check:
+    """Look at held-out pictures; the best weights so far are kept."""
+    check = check_of(_look(run, run.learner.average, _MOST_CHECKED), run.learner.step)
+    run.history = run.history.checked(check)
+    if run.history.best is check:
+        atomic_write_bytes(run.out / BEST, weights_bytes(run.learner.average))
+    return check
+
+
+def _save(run: _Run) -> None:
+    atomic_write_bytes(
+        run.out / CHECKPOINT, checkpoint_bytes(run.learner, run.identity, run.history)
+    )
+
+
+def _look(run: _Run, model: FasterRCNN, most: int) -> Checked:
+    return check_model(
+        model, run.sets.classes, run.sets.held_out, run.reader, device=run.device, most=most
+    )
+
+
+def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
+    """The best weights as a model file, checked against torch, with the report; its last check, and notices that
+    are new."""
+    model, classes, best = run.learner.average, run.sets.classes, run.history.best
+    if best is not None:
+        load_weights_bytes(model, (run.out / BEST).read_bytes(), str(run.out / BEST))
+    checked = _look(run, model, _MOST_CHECKED_LAST) if run.sets.held_out else Checked({}, {})
+    before = run.start.thresholds if isinstance(run.start, ExportedModel) else {}
+    thresholds = checked.thresholds(classes, before)
+    scores = {name: each.score for name, each in thresholds.items()}
+    known = run.start.calibration if isinstance(run.start, ExportedModel) else {}
+    calibration = checked.calibration(
+        classes, {name: Calibration(**each) for name, each in known.items()}
+    )
+    scaled = scaled_thresholds(scores, calibration)
+    info = _info(run, checked, scores) | {
+        "format": FORMAT if calibration else 1,
+        "thresholds": scaled,
+        "calibration": {name: asdict(each) for name, each in calibration.items()},
+    }
+    exported = export_onnx(model, info)
+    agreement = check_export(model.cpu(), exported, _some_pictures(run))
+    atomic_write_bytes(run.out / MODEL, exported)
+    check = (
+        check_of(checked, run.learner.step if best is None else best.step)
+        if run.sets.held_out
+        else None
+    )
+    notices = _closing_notices(run, agreement, check)
+    if isinstance(run.start, ExportedModel):
+        notices += tuple(threshold_notices(run.start, checked.too_few(classes)))
+        notices += tuple(size_notices(run.start, checked.too_few(classes)))
+        notices += tuple(request_notices(run.start, info["on_request"]))
+    report = _report(run, info, agreement, len(exported), check, notices) | {
+        "reported": {
+            name: asdict(replace(each, score=scaled[name])) for name, each in thresholds.items()
+        },
+        "found_px": found_sizes_px(checked, scores, classes),
+    }
+    atomic_write_bytes(run.out / REPORT, json_bytes(report))
+    atomic_write_bytes(run.out / PAGE, training_page(plain_json(report)).encode())
+    return check, notices
+
+
+def _info(run: _Run, checked: Checked, thresholds: dict[str, float]) -> dict[str, Any]:
+    """What the model file states of itself."""
+    learnt = [share.labelled for share in run.sets.shares]
+    classes, (thermal, by_day) = run.sets.classes, run.sets.lights
+    before = run.start.best_px if isinstance(run.start, ExportedModel) else {}
+    return {
+        "name": run.out.resolve().name or "model",
+        "preset": run.settings.preset,
+        "version": __version__,
+        "classes": list(classes),
+        "thresholds": thresholds,
+        "best_px": best_sizes_px(checked, thresholds, learnt, classes, before),
+        **_descent(run, ", ".join(each.name for each in learnt)),
+        "thermal": thermal,
+        "daylight": by_day,
+        **_kept(run, checked, thermal=thermal),
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+def _kept(run: _Run, checked: Checked, *, thermal: bool) -> dict[str, Any]:
+    """What a tuned model keeps of how the one before is used; nothing of one that begins otherwise."""
+    if not isinstance(run.start, ExportedModel):
+        return {}
+    classes = run.sets.classes
+    return {
+        "on_request": list(kept_on_request(run.start, classes, checked.too_few(classes))),
+        "thermal_by": kept_thermal_by(run.start, classes, thermal=thermal),
+    }
+
+
+def _descent(run: _Run, learnt: str) -> dict[str, str]:
+    """The model file's licence and what it was trained on: of a tuned one also those of the model before."""
+    licence = "as the data that it was trained on"
+    if not isinstance(run.start, ExportedModel):
+        return {"licence": licence, "trained_on": learnt}
+    before = run.start.trained_on or "not stated"
+    return {
+        "licence": f"{licence}; {run.start.origin} before: {run.start.licence or 'not stated'}",
+        "trained_on": f"{learnt}; {run.start.origin} before: {before}",
+    }
+
+
+def _some_pictures(run: _Run) -> list[ImageRGB]:
+    """A few that can be read, held-out ones first, padded where a side is shorter than the network's stride."""
+    sets = (*run.sets.held_out, *(share.labelled for share in run.sets.shares))
+    found: list[ImageRGB] = []
+    for picture in (each for labelled in sets for each in labelled.pictures):
+        if len(found) == _EXPORT_PICTURES:
+            break
+        try:
+            found.append(
+                padded_to(
+                    run.reader(picture.path)[:_EXPORT_PX, :_EXPORT_PX], run.learner.model.stride
+                )
+            )
+        except InputError:
+            continue
+    return found
+
+
+def _closing_notices(run: _Run, agreement: ExportCheck, check: Check | None) -> tuple[str, ...]:
+    """What is only known in the end."""
+    notices = []
+    if check is not None and check.ap50 < _FINDS_NOTHING_AP50:
+        notices.append(
+            f"the model finds next to nothing: its AP50 on the held-out pictures is {check.ap50:.3f}; train longer "
+            "(--steps), begin with --weights auto or a model, or check whether the labels fit the pictures"
+        )
+    if run.reader.damaged:
+        count, (path, reason) = len(run.reader.damaged), next(iter(run.reader.damaged.items()))
+        notices.append(
+            f"{counted(count, 'picture')} left out that cannot be read (first: {path}: {reason})"
+        )
+    if not run.sets.held_out:
+        notices.append(
+            "nothing was held out: how good the model is, and from which score to report, is not known"
+        )
+    if not agreement.is_good:
+        notices.append(
+            f"the exported model differs from torch by {agreement.box_px:.2f} px, {agreement.score:.4f} in score, "
+            f"{agreement.unmatched} of {agreement.detections} detections unmatched"
+        )
+    return tuple(notices)
+
+
+def _report(
+    run: _Run,
+    info: Mapping[str, Any],
+    agreement: ExportCheck,
+    size_bytes: int,
+    check: Check | None,
+    closing_notices: Sequence[str],
+) -> dict[str, Any]:
+    """The content of training.json."""
+    step, steps, history = run.learner.step, run.settings.steps, run.history
+    return {
+        "made_by": "sorvolo train",
+        "format": 1,
+        "model": dict(info),
+        "settings": asdict(run.settings),
+        "device": run.device,
+        "weights": "none" if run.start is None else run.start.origin,
+        "not_carried_on": list(run.start.left) if isinstance(run.start, ExportedModel) else [],
+        "sets": run.sets.described(),
+        "notices": [*run.notices, *closing_notices],
+        "step": step,
+        "steps": steps,
+        "stopped_early": step < steps,
+        "seconds": history.seconds,
+        "losses": [asdict(row) for row in history.rows],
+        "checks": [asdict(each) for each in history.checks],
+        "best_step": None if history.best is None else history.best.step,
+        "held_out": None if check is None else asdict(check),
+        "export": {**asdict(agreement), "good": agreement.is_good, "bytes": size_bytes},
+    }

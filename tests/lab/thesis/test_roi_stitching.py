@@ -1,0 +1,209 @@
+"""The thesis's method: it places what it should, reports why it did not, and repeats itself exactly."""
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sorvolo.errors import GeometryError, SettingsError
+from sorvolo.geometry.homography import apply_homography
+from sorvolo.lab.thesis.stitching import (
+    NotStitched,
+    RoiStitcher,
+    RoiStitchingSettings,
+    Stitched,
+    georeference,
+)
+
+WIDTH, HEIGHT = 320, 240
+
+
+def ground(seed: int = 0, contrast: float = 25.0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    total = np.zeros((700, 1000, 3), np.float32)
+    for octave in (6, 24, 96):
+        small = rng.normal(0, 1, (700 // octave + 2, 1000 // octave + 2, 3)).astype(np.float32)
+        total += cv2.resize(small, (1000, 700), interpolation=cv2.INTER_CUBIC)
+    return np.clip(128 + contrast * total, 0, 255).astype(np.uint8)
+
+
+GROUND = ground()
+
+
+def pose(x: float, y: float, turn_deg: float = 0.0, scale: float = 1.0) -> np.ndarray:
+    a = np.radians(turn_deg)
+    return np.array(
+        [
+            [scale * np.cos(a), -scale * np.sin(a), x],
+            [scale * np.sin(a), scale * np.cos(a), y],
+            [0, 0, 1],
+        ]
+    )
+
+
+def photographed(ground_from_image: np.ndarray, gain: float = 1.0) -> np.ndarray:
+    image = cv2.warpPerspective(GROUND, np.linalg.inv(ground_from_image), (WIDTH, HEIGHT))
+    return np.clip(image * gain, 0, 255).astype(np.uint8)
+
+
+PATH = [
+    pose(40, 40),
+    pose(130, 60, 4),
+    pose(220, 70, -3, 1.03),
+    pose(330, 120, 6, 0.98),
+    pose(380, 240, 10),
+]
+
+
+def corner_error_px(placed: Stitched, true: np.ndarray, first: np.ndarray = PATH[0]) -> float:
+    corners = np.array([[0, 0], [WIDTH, 0], [WIDTH, HEIGHT], [0, HEIGHT]], dtype=float)
+    expected = apply_homography(np.linalg.inv(first) @ true, corners)
+    return float(np.abs(apply_homography(placed.mosaic_from_image, corners) - expected).max())
+
+
+@pytest.mark.parametrize("options", [{}, {"matching": "ratio"}, {"transform": "homography"}])
+def test_frames_are_placed_where_they_were_taken(options):
+    stitcher = RoiStitcher(RoiStitchingSettings(**options))
+    for number, true in enumerate(PATH):
+        placed = stitcher.add(number, photographed(true))
+        assert isinstance(placed, Stitched)
+        assert corner_error_px(placed, true) < 3.0
+        assert number == 0 or placed.inliers >= 12
+        assert placed.residual_px < 2.0
+    centre = np.array([[(WIDTH - 1) / 2, (HEIGHT - 1) / 2]])
+    assert placed.barycentre_px == pytest.approx(
+        apply_homography(placed.mosaic_from_image, centre)[0]
+    )
+
+
+def test_the_picture_grows_and_shows_the_ground():
+    stitcher = RoiStitcher()
+    for number, true in enumerate(PATH):
+        stitcher.add(number, photographed(true))
+    picture, (x, y) = stitcher.mosaic()
+    assert (x, y) == pytest.approx((0, 0), abs=30)
+    left, top = x + 40, y + 40  # in GROUND
+    assert left >= 0
+    own = GROUND[top : top + picture.shape[0], left : left + picture.shape[1]]
+    seen = picture[: own.shape[0], : own.shape[1], 3] == 255
+    assert seen.sum() > 150_000
+    assert np.abs(picture[: own.shape[0], : own.shape[1], :3].astype(int) - own)[seen].mean() < 8
+
+
+def test_it_grows_in_every_direction():
+    stitcher = RoiStitcher()
+    for number, true in enumerate([pose(400, 300), pose(330, 240), pose(250, 180)]):
+        assert isinstance(stitcher.add(number, photographed(true)), Stitched)
+    picture, offset = stitcher.mosaic()
+    assert offset == pytest.approx((-150, -120), abs=4)
+    assert picture.shape[:2] == pytest.approx((HEIGHT + 120, WIDTH + 150), abs=8)
+
+
+def test_gain_is_matched_to_the_mosaic():
+    stitcher = RoiStitcher()
+    stitcher.add(0, photographed(PATH[0]))
+    stitcher.add(1, photographed(PATH[1], 0.7))
+    picture, _ = stitcher.mosaic()
+    right = picture[60:200, 340:400, :3][picture[60:200, 340:400, 3] > 0]
+    assert right.mean() == pytest.approx(GROUND[100:240, 380:440].mean(), rel=0.05)
+
+
+def test_the_same_frames_give_the_same_map_to_the_bit():
+    pictures = []
+    for _ in range(2):
+        stitcher = RoiStitcher()
+        for number, true in enumerate(PATH[:3]):
+            placed = stitcher.add(number, photographed(true))
+        pictures.append((stitcher.mosaic()[0], placed.mosaic_from_image))
+    assert np.array_equal(pictures[0][0], pictures[1][0])
+    assert np.array_equal(pictures[0][1], pictures[1][1])
+
+
+def test_a_lost_frame_is_named_and_the_region_stays():
+    stitcher = RoiStitcher()
+    stitcher.add(0, photographed(PATH[0]))
+    before, _ = stitcher.mosaic()
+    blank = stitcher.add(1, np.full((HEIGHT, WIDTH, 3), 100, np.uint8))
+    assert isinstance(blank, NotStitched)
+    assert "features" in blank.reason
+    elsewhere = stitcher.add(2, cv2.resize(ground(9)[:HEIGHT, :WIDTH], (WIDTH, HEIGHT)))
+    assert isinstance(elsewhere, NotStitched)
+    assert "match" in elsewhere.reason
+    assert np.array_equal(stitcher.mosaic()[0], before)
+    assert isinstance(stitcher.add(3, photographed(PATH[1])), Stitched)
+
+
+def test_the_region_is_around_the_last_frame_only():
+    """Ground that the mosaic shows, but farther than the region reaches, is not found again."""
+    settings = RoiStitchingSettings(roi_frames=1.0)
+    stitcher = RoiStitcher(settings)
+    for number, x in enumerate((0, 150, 300, 450, 600)):
+        assert isinstance(stitcher.add(number, photographed(pose(x, 200))), Stitched)
+    assert isinstance(stitcher.add(9, photographed(pose(0, 200))), NotStitched)
+
+
+def test_low_contrast_needs_the_low_threshold():
+    faint = ground(3, contrast=6)
+    a, b = faint[100:340, 100:420], faint[120:360, 160:480]
+    for threshold, wanted in ((8e-5, Stitched), (1e-3, NotStitched)):
+        stitcher = RoiStitcher(RoiStitchingSettings(akaze_threshold=threshold))
+        stitcher.add(0, a)
+        assert isinstance(stitcher.add(1, b), wanted)
+
+
+def test_an_empty_mosaic_is_empty():
+    picture, offset = RoiStitcher().mosaic()
+    assert picture.shape == (0, 0, 4)
+    assert offset == (0, 0)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"akaze_threshold": 0.0},
+        {"ratio": 1.5},
+        {"roi_frames": 0.5},
+        {"min_inliers": 2},
+        {"bands": 0},
+        {"max_features": 0},
+        {"matching": "flann"},
+        {"transform": "affine"},
+    ],
+)
+def test_impossible_settings_are_refused(options):
+    with pytest.raises(SettingsError):
+        RoiStitchingSettings(**options)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    st.floats(0.01, 1.0),
+    st.floats(-180, 180),
+    st.floats(-1000, 1000),
+    st.floats(-1000, 1000),
+    st.integers(0, 999),
+)
+def test_georeference_finds_the_similarity_and_turns_y_up(scale, turn_deg, east, north, seed):
+    barycentres = np.random.default_rng(seed).uniform(-2000, 2000, (6, 2))
+    true = pose(east, north, turn_deg, scale) @ np.diag([1.0, -1.0, 1.0])
+    fixes = apply_homography(true, barycentres)
+    found = georeference(barycentres, fixes)
+    assert np.allclose(found, true, atol=1e-6)
+    assert np.linalg.det(found[:2, :2]) < 0
+
+
+def test_georeference_takes_every_fix_unless_set_otherwise():
+    barycentres = np.random.default_rng(2).uniform(0, 2000, (20, 2))
+    true = pose(10, 20, 30, 0.05) @ np.diag([1.0, -1.0, 1.0])
+    fixes = apply_homography(true, barycentres)
+    fixes[3] += [40, -60]
+    assert not np.allclose(georeference(barycentres, fixes), true, atol=1e-3)
+    assert np.allclose(georeference(barycentres, fixes, robust=True), true, atol=1e-6)
+
+
+def test_georeference_needs_two_places():
+    with pytest.raises(GeometryError):
+        georeference(np.zeros((1, 2)), np.zeros((1, 2)))
+    with pytest.raises(GeometryError):
+        georeference(np.zeros((3, 2)), np.zeros((2, 2)))
