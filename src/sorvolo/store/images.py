@@ -6,7 +6,6 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 from cv2.typing import MatLike
-from numpy.typing import NDArray
 
 from sorvolo.errors import StoreError
 from sorvolo.geometry.arrays import Floats32, ImageRGB, ImageRGBA, Mask, frozen
@@ -80,11 +79,6 @@ def image_from_jpeg(
             f"{name} is damaged: no JPEG in its {len(data)} bytes; map its flight again"
         )
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-
-
-def array_from_bytes(data: bytes) -> NDArray[np.uint8]:
-    """Bytes as an array, (N,), where arrays are wanted."""
-    return np.frombuffer(data, np.uint8)
 
 
 def png_from_rgba(rgba: ImageRGBA) -> bytes:

@@ -382,7 +382,8 @@ class BucketEnd:
             self._objects.copy(key_of(file), name)
 
     def _refuse_foreign(self) -> None:
-        foreign = sorted(each for each in self._objects.first() if not _is_ours(each))
+        own = ("tiles", "files", "catalogues", MANIFEST, *SHOWN)
+        foreign = sorted(key for key in self._objects.first() if key.split("/")[0] not in own)
         if foreign:
             raise StoreError(
                 f"{self.name} is not empty and holds no site (there is {foreign[0][:80]!r}); choose another place"
@@ -476,10 +477,6 @@ def key_of(file: SiteFile) -> str:
 def catalogue_key(sha256: str) -> str:
     """The key of a catalogue."""
     return f"catalogues/{sha256}.db"
-
-
-def _is_ours(key: str) -> bool:
-    return key.split("/")[0] in ("tiles", "files", "catalogues", MANIFEST, *SHOWN)
 
 
 def _size(value: Any) -> int:

@@ -343,15 +343,12 @@ def _listed(
         if path in lasting or (is_site_path(path) and not is_left_out(path, keyframes, owed)):
             if (file := _file(folder, path, lasting.get(path, ""))) is not None:
                 found[path] = file
-        elif _is_foreign(path):
+        elif not (
+            path in _OF_THE_FOLDER or is_site_path(path) or tile_of(path) or _is_passing(path)
+        ):
             foreign.append(path)
     missing = {path: SiteFile(path, 0, lasting[path]) for path in lasting.keys() - found.keys()}
     return found | missing, tuple(sorted(foreign))
-
-
-def _is_foreign(path: str) -> bool:
-    """Whether the file does not belong to a site."""
-    return not (path in _OF_THE_FOLDER or is_site_path(path) or tile_of(path) or _is_passing(path))
 
 
 def _file(folder: Path, path: str, sha256: str) -> SiteFile | None:

@@ -110,7 +110,9 @@ def changes_page(
         files=_files(site),
         view_rows=_view_rows(report),
         not_announced=_not_announced(report),
-        reasons=_reasons(report),
+        reasons=[
+            (count, why) for why, count in (at(report, "comparison", "reasons") or {}).items()
+        ],
         how=_how(report),
     )
     return str(page)
@@ -133,10 +135,6 @@ def _compared_ground(
         "size_rows": () if site.is_local else size_rows(coverage),
         "unknown_share": None if unknown is None else f"{unknown:.1%}",
     }
-
-
-def _reasons(report: Mapping[str, Any]) -> list[tuple[Any, Any]]:
-    return [(count, why) for why, count in (at(report, "comparison", "reasons") or {}).items()]
 
 
 @dataclass(frozen=True)

@@ -79,7 +79,7 @@ class Archive(SiteFolder):
     @property
     def created_utc(self) -> str:
         """When the site was created, to the millisecond: no other site of its name has the same; "" before."""
-        return self._read(records.created_utc)
+        return self.catalogue_rows(records.created_utc)
 
     def create_site(self, site: Site) -> None:
         """Fix the site for ever; raises StoreError when the folder has one."""
@@ -93,7 +93,7 @@ class Archive(SiteFolder):
 
     def flights(self) -> list[FlightEntry]:
         """Every flight by rank. A complete run stays listed until the run that replaces it commits."""
-        return self._read(records.list_flights)
+        return self.catalogue_rows(records.list_flights)
 
     def change_mark(self) -> tuple[int, int]:
         """Another one after each change that others made to the catalogue; what is read after it is no older."""
@@ -102,7 +102,7 @@ class Archive(SiteFolder):
     @property
     def exported_version(self) -> int:
         """The version that mosaic.tif and the other files of the map show; 0 for none."""
-        return self._read(records.derived_version)
+        return self.catalogue_rows(records.derived_version)
 
     def version_at(self, moment: datetime) -> VersionEntry:
         """The newest version of flights flown by a moment, taken as UTC when it names no time zone.
@@ -132,15 +132,15 @@ class Archive(SiteFolder):
 
     def comparisons(self) -> dict[int, Mapping[str, int]]:
         """The versions that comparisons made: how many changes of each kind each found."""
-        return self._read(change_records.compared_versions)
+        return self.catalogue_rows(change_records.compared_versions)
 
     def changes(self, flight_id: str | None = None) -> list[StoredChange]:
         """The changes that complete runs found, by flight rank and number, with their verdicts; of one flight."""
-        return self._read(change_records.load_changes, flight_id)
+        return self.catalogue_rows(change_records.load_changes, flight_id)
 
     def reviews(self) -> list[StoredReview]:
         """All reviews of changes, oldest first, also of changes that were replaced since."""
-        return self._read(change_records.load_reviews)
+        return self.catalogue_rows(change_records.load_reviews)
 
     @property
     def is_searched(self) -> bool:
@@ -149,11 +149,11 @@ class Archive(SiteFolder):
 
     def objects(self, flight_id: str | None = None) -> list[StoredObject]:
         """The objects that complete runs found, by flight rank and number; of one flight."""
-        return self._read(object_records.load_objects, flight_id)
+        return self.catalogue_rows(object_records.load_objects, flight_id)
 
     def searches(self) -> list[StoredSearch]:
         """Which ground each complete run searched for objects, by flight rank."""
-        return self._read(object_records.load_searches)
+        return self.catalogue_rows(object_records.load_searches)
 
     def newest_objects(self, flights: Collection[str] | None = None) -> list[StoredObject]:
         """What stands on the site by the newest look at each piece of ground; as far as these flights know."""
@@ -199,7 +199,7 @@ class Archive(SiteFolder):
 
     def keyframes(self, flight_id: str | None = None) -> list[StoredKeyframe]:
         """Keyframes of complete runs, by flight rank and index; of one flight when its id is given."""
-        return self._read(records.load_keyframes, flight_id)
+        return self.catalogue_rows(records.load_keyframes, flight_id)
 
     def image(self, keyframe: StoredKeyframe) -> ImageRGB:
         """A keyframe's undistorted image; raises StoreError when its flight was mapped again meanwhile."""
@@ -214,7 +214,7 @@ class Archive(SiteFolder):
             raise NotFoundError(
                 f"{self.folder} has no version {version} of its map; `versions` lists them"
             )
-        newest = self._read(records.newest_version)
+        newest = self.catalogue_rows(records.newest_version)
         return self.version_tiles(newest if version is None else version)
 
     def live_tiles(self) -> TileView:
@@ -235,7 +235,7 @@ class Archive(SiteFolder):
         """
         self._require_writable()
         path = self.journal_path(flight_id)
-        newest = self._read(records.newest_version)
+        newest = self.catalogue_rows(records.newest_version)
         journal = RunJournal(path, key, newest, program)
         if not anew and (why_not := journal.why_not):
             _warn(
@@ -247,7 +247,7 @@ class Archive(SiteFolder):
 
     def stopped_run(self, key: str, program: str) -> RunJournal | None:
         """What a killed run of this `key` left, of whatever flight; None where there is none. See `journal`."""
-        newest = self._read(records.newest_version)
+        newest = self.catalogue_rows(records.newest_version)
         for flight_id in stopped_flights(self):
             journal = RunJournal(self.journal_path(flight_id), key, newest, program)
             if journal.is_begun:

@@ -213,14 +213,14 @@ class SiteFolder:
             return {}
         return content if isinstance(content, dict) else {}
 
-    def _read(self, query: Callable[..., T], *arguments: object) -> T:
+    def catalogue_rows(self, query: Callable[..., T], *arguments: object) -> T:
         """What a query finds in one transaction."""
         with self.catalogue.reading() as connection:
             return query(connection, *arguments)
 
     def find_site(self) -> Site | None:
         """The site; None while there is none."""
-        return self._read(records.load_site)
+        return self.catalogue_rows(records.load_site)
 
     def site(self) -> Site:
         """The site; raises StoreError while there is none."""
@@ -236,13 +236,13 @@ class SiteFolder:
 
     def versions(self) -> list[VersionEntry]:
         """Every state of the map, oldest first."""
-        return self._read(records.list_versions)
+        return self.catalogue_rows(records.list_versions)
 
     def version_tiles(self, version_id: int) -> TileView:
         """The tiles of a version, read when asked for; none for a version that does not exist."""
 
         def hashes() -> Mapping[Any, str]:
-            return self._read(records.tile_hashes, version_id)
+            return self.catalogue_rows(records.tile_hashes, version_id)
 
         return TileView(self.blobs, hashes(), hashes)
 

@@ -30,6 +30,7 @@ from sorvolo.store.site import change_records, object_records
 from sorvolo.store.site.catalogue import OwedFiles, VersionEntry
 from sorvolo.store.site.files import JOURNAL, STAGED, SiteFolder
 from sorvolo.store.site.journal import is_journal_after
+from sorvolo.store.site.object_records import StoredObject, StoredSearch
 
 STAGED_FOLDERS = ("changes", "masks", CROPS)
 # of the map in changes.html; daily flights without change should cost little
@@ -44,15 +45,16 @@ def repair(files: SiteFolder) -> None:
     with files.catalogue.reading() as connection:
         owed = records.owed_files(connection)
         shown = records.derived_version(connection)
-    newest = _newest(files)
+    newest = next((each for each in reversed(files.versions()) if each.complete), None)
     with ThreadPoolExecutor(1, thread_name_prefix="map files") as other:
         waiting: list[Future[None]] = []
         if newest is not None and not _is_shown(files, newest, shown):
             waiting.append(other.submit(write_map_files, files, newest))
         for each in owed:
             _write_flight_files(files, each)
-        if owed or not site_objects_are_there(files):
-            write_site_objects(files)
+        searches = files.catalogue_rows(object_records.load_searches)
+        if owed or bool(searches) != features_path(files.folder, OBJECTS).is_file():
+            _write_site_objects(files, searches)
         for written in waiting:
             written.result()
     if newest is None:
@@ -62,12 +64,16 @@ def repair(files: SiteFolder) -> None:
 
 
 def _is_shown(files: SiteFolder, newest: VersionEntry, shown: int) -> bool:
-    """Whether the map's files are those of the newest version, or would be the same."""
-    return _looks_like(files, newest, shown) and (not newest.tiles or map_is_there(files))
-
-
-def _newest(files: SiteFolder) -> VersionEntry | None:
-    return next((each for each in reversed(files.versions()) if each.complete), None)
+    """Whether the map's files are there and are those of the newest version, or would be the same."""
+    if newest.id != shown:
+        written_as = {each.id: (each.export_crs, each.compress) for each in files.versions()}
+        with files.catalogue.reading() as connection:
+            now, then = (records.tile_hashes(connection, each) for each in (newest.id, shown))
+        if now != then or written_as.get(shown) != (newest.export_crs, newest.compress):
+            return False
+    paths = [files.preview_path, files.mosaic_path]
+    paths += [] if files.site().is_local else [files.kmz_path]
+    return not newest.tiles or all(path.is_file() for path in paths)
 
 
 def forget_unfinished(files: SiteFolder) -> None:
@@ -126,16 +132,6 @@ def _remove_unused_pictures(flight: Path, known_runs: set[str]) -> None:
             emptied.rmdir()
 
 
-def _looks_like(files: SiteFolder, version: VersionEntry, shown: int) -> bool:
-    """Whether the map's files, which show another version, would be the same for this one."""
-    if version.id == shown:
-        return True
-    written_as = {each.id: (each.export_crs, each.compress) for each in files.versions()}.get(shown)
-    with files.catalogue.reading() as connection:
-        same = records.tile_hashes(connection, version.id) == records.tile_hashes(connection, shown)
-    return same and written_as == (version.export_crs, version.compress)
-
-
 def _write_flight_files(files: SiteFolder, owed: OwedFiles) -> None:
     folder = files.flight_folder(owed.flight_id)
     with writing(folder):
@@ -153,7 +149,10 @@ def _write_flight_files(files: SiteFolder, owed: OwedFiles) -> None:
         (each for each in files.versions() if each.run_id == owed.run_id and is_compared), None
     )
     write_change_files(files, owed.flight_id, version)
-    write_object_files(files, owed.flight_id, is_searched=is_searched)
+    found = (
+        files.catalogue_rows(object_records.load_objects, owed.flight_id) if is_searched else None
+    )
+    _write_objects(files, folder, found)
 
 
 def write_map_files(files: SiteFolder, version: VersionEntry) -> None:
@@ -195,14 +194,6 @@ def write_map_files(files: SiteFolder, version: VersionEntry) -> None:
         each.result()
 
 
-def map_is_there(files: SiteFolder) -> bool:
-    """Whether no file of the map is missing."""
-    paths = [files.preview_path, files.mosaic_path]
-    return all(
-        path.is_file() for path in paths + ([] if files.site().is_local else [files.kmz_path])
-    )
-
-
 def take_staged(flight_folder: Path, run_id: int) -> None:
     """Put the pictures that a committed run collected in the place of those of the run before it.
 
@@ -235,14 +226,17 @@ def write_change_files(files: SiteFolder, flight_id: str, version: VersionEntry 
         _remove_list(folder, "changes")
         (folder / "changes.html").unlink(missing_ok=True)
         return
-    with files.catalogue.reading() as connection:
-        changes = change_records.load_changes(connection, flight_id)
+    changes = files.catalogue_rows(change_records.load_changes, flight_id)
     site = files.site()
     placemarks = [] if site.is_local else change_placemarks(changes, site)
     _write_list(
         folder, "changes", changes_geojson(changes, site), placemarks, is_local=site.is_local
     )
-    crops = {each.id: _crops(files, flight_id, each.id) for each in changes}
+    crops = {}
+    for change in changes:
+        names = (f"flights/{flight_id}/changes/{name}" for name in crop_names(change.id))
+        earlier, later = (_crop(files, name) for name in names)
+        crops[change.id] = earlier, later
     before, after = _before_and_after(files, version, _PICTURE_PX if changes else _UNCHANGED_PX)
     made = {each.id: each for each in files.versions()}
     page = changes_page(
@@ -259,38 +253,22 @@ def write_change_files(files: SiteFolder, flight_id: str, version: VersionEntry 
     atomic_write_bytes(folder / "changes.html", page.encode())
 
 
-def write_object_files(files: SiteFolder, flight_id: str, *, is_searched: bool) -> None:
-    """Write objects.geojson of a flight; remove it when the flight's frames were not searched for objects."""
-    folder, site = files.flight_folder(flight_id), files.site()
-    if not is_searched:
-        _remove_list(folder, OBJECTS)
-        return
-    with files.catalogue.reading() as connection:
-        found = object_records.load_objects(connection, flight_id)
-    placemarks = [] if site.is_local else object_placemarks(found, site)
-    collection = objects_geojson(found, site, crops_from_site=False)
-    _write_list(folder, OBJECTS, collection, placemarks, is_local=site.is_local)
-
-
-def write_site_objects(files: SiteFolder) -> None:
+def _write_site_objects(files: SiteFolder, searches: Sequence[StoredSearch]) -> None:
     """Write objects.geojson of the site, the newest of each place; remove it when no flight was ever searched."""
-    with files.catalogue.reading() as connection:
-        searches = object_records.load_searches(connection)
-        found = object_records.newest_objects(object_records.load_objects(connection), searches)
-    if not searches:
-        _remove_list(files.folder, OBJECTS)
+    found = files.catalogue_rows(object_records.load_objects)
+    newest = object_records.newest_objects(found, searches) if searches else None
+    _write_objects(files, files.folder, newest)
+
+
+def _write_objects(files: SiteFolder, folder: Path, found: Sequence[StoredObject] | None) -> None:
+    """Write objects.geojson of a flight's folder or the site's; remove it where nothing was searched for."""
+    if found is None:
+        _remove_list(folder, OBJECTS)
         return
     site = files.site()
     placemarks = [] if site.is_local else object_placemarks(found, site)
-    collection = objects_geojson(found, site, crops_from_site=True)
-    _write_list(files.folder, OBJECTS, collection, placemarks, is_local=site.is_local)
-
-
-def site_objects_are_there(files: SiteFolder) -> bool:
-    """Whether the site's objects.geojson is there if, and only if, any flight was searched."""
-    with files.catalogue.reading() as connection:
-        is_searched = bool(object_records.load_searches(connection))
-    return is_searched == features_path(files.folder, OBJECTS).is_file()
+    collection = objects_geojson(found, site, crops_from_site=folder == files.folder)
+    _write_list(folder, OBJECTS, collection, placemarks, is_local=site.is_local)
 
 
 def _write_list(
@@ -344,17 +322,8 @@ def _words_of(version: VersionEntry | None) -> tuple[str, str]:
     return f"version {version.id}: flight {version.flight_id},", date
 
 
-def _crops(
-    files: SiteFolder, flight_id: str, change_id: str
-) -> tuple[ImageRGBA | None, ImageRGBA | None]:
-    """A change's pictures before and after; None for one that is gone."""
-    before, after = (
-        _crop(files, f"flights/{flight_id}/changes/{name}") for name in crop_names(change_id)
-    )
-    return before, after
-
-
 def _crop(files: SiteFolder, name: str) -> ImageRGBA | None:
+    """One picture of a change; None for one that is gone."""
     try:
         return rgba_from_png(read_below(files.folder, name), str(files.folder / name))
     except FileNotFoundError:
