@@ -198,7 +198,7 @@ def test_what_was_not_compared_and_how_small_a_thing_is_found_are_shown(tmp_path
             0.0,
             2_100.0,
             True,
-            "not to be relied on, most of the ground is another one now (snow, water, ploughing?), and what stands on it may "
+            "not to be relied on, most of the ground surface changed (snow, water, ploughing?), and objects on it may "
             "be missed: 8 changes in 0.3 ha; 0 m2 could not be compared",
         ),
         (

@@ -18,8 +18,8 @@ from sorvolo.detection.second_look import (
     SUREST,
     UNSEEN,
     cut_out,
-    looked_again,
     opinions,
+    rescore,
 )
 from sorvolo.detection.session import Seen, Session, read_info
 from sorvolo.errors import InputError
@@ -76,7 +76,7 @@ def test_weak_reports_stay_behind_those_that_were_looked_at() -> None:
     seen = Seen(boxes, np.linspace(0.9, 0.1, count), np.zeros(count, np.int64))
     none = Seen(np.zeros((0, 4), np.float32), np.zeros(0), np.zeros(0, np.int64))
     how = SecondLook((34.0,), own=1.2, again=0.7, shift=-0.1, least=0.5, enlarged=9.0)
-    after = looked_again(seen, np.zeros((800, 800, 3), np.uint8), lambda sheet: none, {0: how})
+    after = rescore(seen, np.zeros((800, 800, 3), np.uint8), lambda sheet: none, {0: how})
     np.testing.assert_array_equal(after.boxes_px, boxes)
     assert (np.diff(after.scores) < 0).all() and after.scores[0] < seen.scores[0]
 
@@ -86,7 +86,7 @@ def test_no_report_is_so_sure_that_the_second_look_cannot_overrule_it() -> None:
     seen = Seen(boxes, np.array([0.9999, 0.99, 0.9]), np.zeros(3, np.int64))
     how = SecondLook((34.0,), own=1.0, again=1.0, shift=0.0, least=0.5, enlarged=9.0)
     none = Seen(np.zeros((0, 4), np.float32), np.zeros(0), np.zeros(0, np.int64))
-    after = looked_again(seen, np.zeros((300, 300, 3), np.uint8), lambda sheet: none, {0: how})
+    after = rescore(seen, np.zeros((300, 300, 3), np.uint8), lambda sheet: none, {0: how})
     unseen = math.log(UNSEEN / (1 - UNSEEN))
     most = 1 / (1 + math.exp(-math.log(SUREST / (1 - SUREST)) - unseen))
     np.testing.assert_allclose(after.scores[:2], most)
@@ -146,7 +146,7 @@ def test_a_crowd_costs_no_more_than_its_share() -> None:
         assert sorted(again) == list(range(cuts // 2)), "the best reports"
         height, width, _ = shown.pop()
         assert height * width <= max(SHARE * size[0] * size[1], 8 * 128**2) + 8 * 128**2
-    lone = looked_again(crowd, np.zeros((640, 640, 3), np.uint8), sees, how)
+    lone = rescore(crowd, np.zeros((640, 640, 3), np.uint8), sees, how)
     assert len(lone.scores) == 60 and (np.diff(lone.scores) <= 0).all()
     none = Seen(boxes[:0], np.zeros(0), np.zeros(0, np.int64))
     shown.clear()
@@ -181,7 +181,7 @@ def test_each_position_shows_the_report_where_it_is_said_to_be_and_all_count_ali
     np.testing.assert_array_equal(mirrored_quarter, np.rot90(upright, 3)[:, ::-1])
     sheets.clear()
     odds = np.log(np.array([0.1, 0.2, 0.3, 0.4]) / np.array([0.9, 0.8, 0.7, 0.6]))
-    after = looked_again(bar, picture, sees, {0: how})
+    after = rescore(bar, picture, sees, {0: how})
     assert after.scores[0] == pytest.approx(1 / (1 + math.exp(-odds.mean()))), (
         "the mean of the positions' log-odds"
     )

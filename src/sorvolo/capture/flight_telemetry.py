@@ -1,4 +1,4 @@
-"""One flight's telemetry in the site frame, as it is known by now, and what it foretells of the flight."""
+"""One flight's telemetry in the site frame, received so far, and predictions from it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -96,7 +96,7 @@ class Aligned:
 
 
 class Caution(Enum):
-    """When a frame is placed only by what is cheap and beyond doubt: what is not found so comes again later."""
+    """When to use fast, unambiguous alignment alone; frames that it does not place are retried later."""
 
     NEVER = "never"
     AT_FIRST = "at first"  # until a frame of the flight was found beyond doubt
@@ -224,7 +224,7 @@ class Aligner:
         if place is not None:
             placed = _as_known(place, camera, small_camera)
         elif is_cautious:
-            # cheap, and beyond doubt; misses of frames that come again do not count
+            # fast and unambiguous; failures do not count, for the frame is retried
             misses = self._misses
             placed = self._by_homographies(frame, is_cheap=True)
             self._misses = misses

@@ -43,14 +43,14 @@ Verdict = Announce | Wait | Drop
 
 
 # When a candidate is announced.
-LEAST_SCORE = 0.38  # half of what the trees asked for that had seen no flights
+LEAST_SCORE = 0.38  # half the threshold of trees that were not trained on flights
 _LARGE_M2 = 2.0  # from this size on ...
 _LARGE_SCORE = 0.52  # ... and shorter than the flying height, a less sure one is a wall that leans
-# share of views that flag the ground around for nothing: half the score is left
+# false-alarm rate nearby that halves the score
 _RESTLESS_HALF = 0.05
 _DOUBT = 2.0  # restless ground counts in full where half of the score is missing
 _CUT_OFF = 0.5  # of the score is left where no view shows all of it
-_ONE_PLACE = 0.05  # flying heights: views no wider apart see the same ghost, and count half
+_ONE_PLACE = 0.05  # flying heights: views closer together share a parallax error; they count half
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Tally:
     whole: int = 0  # views that show all of it; in the others it ends at a rim
     camera_low_m: tuple[float, float, float] = (np.inf, np.inf, np.inf)
     camera_high_m: tuple[float, float, float] = (-np.inf, -np.inf, -np.inf)
-    restless: float = 0.0  # share of views that flag the ground around for nothing
+    restless: float = 0.0  # false-alarm rate nearby
     moved: int = 0  # views that were taken out, since what moves shows in them
     look: Look | None = None
 

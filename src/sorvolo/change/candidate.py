@@ -184,7 +184,7 @@ class Pictures:
 
 
 # When ground is parted anew, and what is the same thing as before.
-_MORE_VIEWS = 1.2  # so many times as many views may show another thing beside the first
+_MORE_VIEWS = 1.2  # re-split a change once its view count grew by this factor
 _SAME = 0.4  # of the union of two outlines of one thing lies in both
 
 

@@ -65,7 +65,7 @@ _STANDS_S = 2.0
 
 
 _LEAST_VIEWS = 2  # where fewer than n ever see it
-_LEAST_VIEWS_APART_S = 0.1  # frames nearer in time see the same thing and are no news
+_LEAST_VIEWS_APART_S = 0.1  # frames closer in time add nothing
 _LEAST_AREA_M2 = 0.02  # 14 cm a side: smaller things are not looked for
 _JOIN_M = 0.3  # a smaller gap does not make two things of one
 # what one view shows, and no other could, must be so sure, and confirmed

@@ -177,8 +177,7 @@ class GatheredThings:
     ) -> list[Change]:
         """After the last view: the things that all views together show, and those of `others` that they do not hold.
 
-        A thing that holds others goes on as the one it holds most of, with its id and times; others get
-        the next of `numbers`. Left out is also, of `others`, what lies on ground that is the same by its features.
+        A change inherits id and times of the one it overlaps most; others get the next of `numbers`. Left out is also, of `others`, what lies on ground that is the same by its features.
         What moves and areas are left as they are.
         """
         if self._ground.is_empty:

@@ -198,7 +198,7 @@ def _quantile(values: Image, where: Mask, share: float) -> int:
 
 
 # How regions become masks. Lengths in px of the half size pictures.
-_LEAST_GROWN = 0.5  # score: what is doubted is shown as it differs, and takes no ground from around
+_LEAST_GROWN = 0.5  # score: regions below it keep their raw mask
 # part of its hull: what fills more fills all of it, for it may have the ground's colours
 _MASK_CONVEXITY = 0.5
 # side of the window within which an outline is drawn, where half of the difference is left ...

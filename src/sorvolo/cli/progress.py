@@ -57,7 +57,7 @@ class ProgressReport:
         self._bar.stop()
 
     def show(self, task: str, done: int = 0, total: int | None = None, words: str = "") -> None:
-        """`done` of `total` of a task (None: nobody knows of how many), and more in `words`; a new task, a new bar."""
+        """`done` of `total` of a task (None: total unknown), and more in `words`; a new task, a new bar."""
         if self._is_live:
             if task != self._task:
                 for earlier in self._bar.task_ids:

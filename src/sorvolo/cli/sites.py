@@ -125,7 +125,7 @@ def run_on_site(
     for flight in repeated:
         moment = flight.done_utc[:16].replace("T", " ")
         typer.echo(
-            f"{flight.flight} is {done} already ({moment} UTC); --again does it anew", err=True
+            f"{flight.flight} is {done} already ({moment} UTC); --again repeats it", err=True
         )
     with Archive.open(place.folder, write=False, catalogues=catalogues) as archive:
         made = [

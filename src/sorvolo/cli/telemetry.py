@@ -47,7 +47,7 @@ def telemetry_command(
     """Correct a flight's telemetry by its map, and report what was wrong: compass, clock, heights.
 
     Writes geo.txt (OpenDroneMap), track.gpx, track.csv, cot.xml (Cursor on Target with the camera's field of view), and
-    for a video the same pictures as a transport stream with corrected KLV (MISB ST 0601). Nothing is encoded anew.
+    for a video the same pictures as a transport stream with corrected KLV (MISB ST 0601). Nothing is re-encoded.
 
     Example: sorvolo telemetry DJI_0042.MP4 --site field
 

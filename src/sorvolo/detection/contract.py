@@ -21,13 +21,13 @@ _NEEDED = ("name", "classes", "thresholds", "best_px")
 _TEXTS = ("thermal_by", "preset", "version", "precision", "licence", "trained_on", "created")
 
 MOST_LARGER = 3.0
-"""So many times as large as it is a picture is shown at most: magnified further, it is only blurred more."""
+"""Largest upscaling factor of a picture; beyond it only blur is added."""
 
 MOST_CLOSER = 4.0
-"""The same of a picture in which small things were seen already: their boxes gain."""
+"""Largest upscaling factor once small objects were found: it refines their boxes."""
 
 POSITIONS = ((0, False), (1, False), (2, True), (3, True))
-"""In which a second look may show a report: turned by so many quarters counter-clockwise, and then mirrored or not."""
+"""Quarter turns counter-clockwise, and whether mirrored then, of each pass of a second look."""
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from sorvolo.detection.fusing import (
 )
 from sorvolo.detection.light import Picture, is_thermal, rgb_from_picture
 from sorvolo.detection.models import demand_searching, find_model, thermal_model
-from sorvolo.detection.second_look import looked_again
+from sorvolo.detection.second_look import rescore
 from sorvolo.detection.session import Seen, Session
 from sorvolo.detection.tiling import (
     COARSEST_M,
@@ -409,10 +409,10 @@ class Detector:
         else:
             seen = search.see(rgb, report_early)
         # a second look at the reports, by each model that has one
-        hows = {
+        second_look_by_label = {
             info.classes.index(name): how for name, how in info.second_look.items() if name in names
         }
-        for by in dict.fromkeys(how.by for how in hows.values()):
+        for by in dict.fromkeys(how.by for how in second_look_by_label.values()):
             looking = self._second(session, by)
             if looking.fixed_px is not None:  # sheets have sizes of their own
                 continue
@@ -425,8 +425,8 @@ class Detector:
                 again = looking.see(sheet)
                 return Seen(again.boxes_px, again.scores, places[again.labels])
 
-            mine = {label: how for label, how in hows.items() if how.by == by}
-            seen = looked_again(seen, rgb, see_again, mine)
+            mine = {label: how for label, how in second_look_by_label.items() if how.by == by}
+            seen = rescore(seen, rgb, see_again, mine)
         return report(seen, names)
 
     def _is_own(self, *, thermal: bool) -> bool:
@@ -446,7 +446,7 @@ class Detector:
         return self._at_night or self._session
 
     def _second(self, session: Session, by: str) -> Session:
-        """Who looks a second time; threads that ask at once wait for it."""
+        """Return the session of the second look, loaded once; threads wait for it."""
         if not by:
             return session
         with self._seeking:

@@ -126,7 +126,7 @@ def _engine(provider: str, session: Any, where: str) -> Engine:
 def _shrink(session: Any, side_px: tuple[int, int]) -> None:
     """Have ONNX Runtime free the memory that it holds for pictures as large as those so far; 300 MB for 1080p.
 
-    It does so only at the end of a run: of a picture as small as the model takes, in 0.06 s of processor time.
+    Memory is freed only after a run, so run the smallest input; it takes 0.06 s of processor time.
     """
     import onnxruntime
 

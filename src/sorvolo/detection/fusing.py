@@ -299,7 +299,7 @@ def trust(
 ) -> Floats:
     """(N, looks) shares of the opinion on boxes (N, 4) in looks that show the picture `times` as large.
 
-    The first look shows it as it is. A closer look is asked about what it knows best alone: larger things lose by it.
+    The first look shows it as it is. Closer looks count for small objects alone; they hurt large ones.
     """
     area_px = (boxes_px[:, 2] - boxes_px[:, 0]) * (boxes_px[:, 3] - boxes_px[:, 1])
     off = (

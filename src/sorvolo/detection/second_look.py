@@ -47,23 +47,23 @@ class _Cut:
     box_px: Floats
 
 
-def looked_again(
+def rescore(
     seen: Seen,
     picture: ImageRGB,
     sees: Sees,
-    hows: Mapping[int, SecondLook],
+    second_look_by_label: Mapping[int, SecondLook],
 ) -> Seen:
     """What was `seen` in a picture (H, W, 3), with the scores that a second look leaves, best first.
 
-    `hows` names for labels how their reports are looked at again; others keep their score. Reports below `least` are
+    `second_look_by_label` names for labels how their reports are looked at again; others keep their score. Reports below `least` are
     not looked at and count as not seen again, so that they stay behind those that were not.
     """
     scores = seen.scores.copy()
     again_odds = np.full(len(scores), log_odds(UNSEEN, _LEAST_SURE))
-    looked_at = opinions(seen, picture, sees, hows)
+    looked_at = opinions(seen, picture, sees, second_look_by_label)
     for row, again in looked_at.items():
         again_odds[row] = log_odds(again, _LEAST_SURE).mean()
-    for label, how in hows.items():
+    for label, how in second_look_by_label.items():
         rows = (seen.labels == label) & (seen.scores < how.least)
         rows[[row for row in looked_at if seen.labels[row] == label]] = True
         own_odds = log_odds(np.minimum(scores[rows], SUREST), _LEAST_SURE)
@@ -77,7 +77,7 @@ def opinions(
     seen: Seen,
     picture: ImageRGB,
     sees: Sees,
-    hows: Mapping[int, SecondLook],
+    second_look_by_label: Mapping[int, SecondLook],
 ) -> dict[int, Floats]:
     """The scores (looks in all positions,) of each report, by its row, for those that are looked at again."""
     fewest, most = _CUTS
@@ -86,7 +86,7 @@ def opinions(
     cuts: list[_Cut] = []
     for row in np.argsort(-seen.scores, kind="stable").tolist():
         label, box_px = int(seen.labels[row]), seen.boxes_px[row].astype(float)
-        how = hows.get(label)
+        how = second_look_by_label.get(label)
         if how is None or seen.scores[row] < how.least:
             continue
         sides_px = how.sides_px(float(max(box_px[2:] - box_px[:2])))
@@ -94,9 +94,11 @@ def opinions(
             break
         cuts += [_Cut(row, label, *cut_out(picture, box_px, side_px)) for side_px in sides_px]
     scores: dict[int, list[float]] = {}
-    for position in range(max((how.positions for how in hows.values()), default=0)):
+    for position in range(max((how.positions for how in second_look_by_label.values()), default=0)):
         shown = [
-            _cut_in_position(cut, position) for cut in cuts if position < hows[cut.label].positions
+            _cut_in_position(cut, position)
+            for cut in cuts
+            if position < second_look_by_label[cut.label].positions
         ]
         for cut, score in zip(shown, _scores(shown, sees).tolist() if shown else []):
             scores.setdefault(cut.row, []).append(score)

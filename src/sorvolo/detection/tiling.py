@@ -269,8 +269,8 @@ def closer_for(
     looks: Sequence[Seen],
     times: Sequence[float],
 ) -> dict[float, tuple[str, ...]]:
-    """The same of closer looks: for the classes of which the `looks` so far, `times` as large (the first of the picture
-    as it is), show something small.
+    """Return upscaling factors of closer looks: for classes of which the `looks` so far, `times` as large, show
+    something small. The first look shows the picture as it is.
 
     Small is what the model knows better as large as it is shown there than in any look so far.
     """

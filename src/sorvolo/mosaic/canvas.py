@@ -70,8 +70,8 @@ class Canvas:
     `tiles` is where the picture is kept; `images(id)` gives the undistorted image of a frame and should
     remember the last few. `painted` are the frames whose picture is in `tiles` already, for a site that is
     opened again. With `keeps_known_ground` every pixel that `tiles` shows now stays byte for byte, whoever painted
-    it, but for the ground of a painted frame that is moved or forgotten; and painted frames, of which it may not be
-    known any more which of their pixels exist, show no ground but that.
+    it, but for the ground of a painted frame that is moved or forgotten. Frames painted earlier contribute only
+    pixels already in `tiles`.
     """
 
     def __init__(

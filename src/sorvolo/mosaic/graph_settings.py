@@ -66,9 +66,9 @@ class PoseGraphSettings:
         joins_map: bool,
         priors: FlightPriors = FlightPriors(),
     ) -> "PoseGraphSettings":
-        """What is free on a flight whose focal length is known to `focal_sigma` (relative) and the zero of whose
-        heights to `altitude_offset_sigma_m` (infinite: not at all; None: a flight without telemetry). `joins_map`: a
-        known map fixes where it lies.
+        """Choose free parameters from the uncertainty of focal length, `focal_sigma` (relative), and of the zero of
+        heights, `altitude_offset_sigma_m` (infinite: unknown; None: no telemetry). `joins_map`: a known map fixes
+        where the flight lies.
         """
         calibrated = focal_sigma <= priors.calibrated
         has_telemetry = altitude_offset_sigma_m is not None

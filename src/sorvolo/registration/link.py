@@ -186,7 +186,7 @@ def _fit_learned(
     settings: LinkSettings,
     cache: LinkCache,
 ) -> _Fit | None:
-    """By learned features of the old picture laid as predicted: they bear faint ground and noise, but no turn."""
+    """Fit learned features of the old picture, warped as predicted: robust to low texture and noise, not to rotation."""
     size = (new.gray.shape[1], new.gray.shape[0])
     laid = np.asarray(
         cv2.warpPerspective(old.gray, prediction.new_from_old, size, borderValue=128), np.uint8

@@ -162,7 +162,7 @@ class _Camera:
 
 
 def main() -> int:
-    """Do one job until its camera has ended, or whoever ordered it is gone; state in lines of JSON how it goes."""
+    """Do one job until its stream ends or its parent exits; log progress as JSON lines."""
     logging.basicConfig(format="%(levelname)s %(name)s: %(message)s")
     job = CameraJob(**json.loads(sys.stdin.readline()))
     stop = threading.Event()

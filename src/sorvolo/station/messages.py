@@ -76,7 +76,7 @@ class Message:
 
 
 def message_from_bytes(data: bytes) -> Message:
-    """The inverse of `Message.to_bytes`. Raises InputError for what is none."""
+    """The inverse of `Message.to_bytes`. Raises InputError for anything else."""
     if len(data) < _HEAD.size:
         raise InputError(f"a message of {len(data)} bytes; {_HEAD.size} at least were needed")
     letter, flags, seq, pts_us, dts_us = _HEAD.unpack_from(data)
@@ -131,7 +131,7 @@ class Hello:
 
 
 def hello_from_json(text: str | bytes) -> Hello:
-    """The inverse of `Hello.to_json`; unknown keys are ignored. Raises InputError for what is none."""
+    """The inverse of `Hello.to_json`; unknown keys are ignored. Raises InputError for anything else."""
     found = _json_object(text, _MOST_HELLO_BYTES, "a hello")
     try:
         return Hello(
@@ -174,7 +174,7 @@ class Sample:
 
 
 def sample_from_json(text: str | bytes) -> Sample:
-    """The inverse of `Sample.to_json`; unknown names are ignored. Raises InputError for what is none."""
+    """The inverse of `Sample.to_json`; unknown names are ignored. Raises InputError for anything else."""
     found = _json_object(text, _MOST_TELEMETRY_BYTES, "telemetry")
     try:
         time_ns = int(found["time_ns"])

@@ -387,7 +387,7 @@ class Runs:
             lines, end = _new_lines(folder / JOURNAL_FILE, offset)
             run, events = self._advanced(self.get(run.id), lines)
             if has_ended and end == offset and self._is_gone(run):
-                run, event = self._without_a_word(run, folder)
+                run, event = self._mark_lost(run, folder)
                 events.append(event)
             if events or end > offset:
                 self._keep(run, events, end)
@@ -427,7 +427,7 @@ class Runs:
             self._processes.pop(run_id, None)
             del self._lingering_s[run_id]
 
-    def _without_a_word(self, run: Run, folder: Path) -> tuple[Run, NewEvent]:
+    def _mark_lost(self, run: Run, folder: Path) -> tuple[Run, NewEvent]:
         """A run whose process ended without its last line: killed, crashed, or switched off with the machine."""
         process = self._processes.get(run.id)
         code = process.poll() if process is not None else None

@@ -39,7 +39,7 @@ class ChangeKind(StrEnum):
     APPEARED = "appeared"
     DISAPPEARED = "disappeared"
     REPLACED = "replaced"
-    AREA = "area"  # ground that is another one now: paved, ploughed, heaped, flooded, built over
+    AREA = "area"  # ground whose surface changed: paved, ploughed, heaped, flooded, built over
     MOVING = "moving"  # someone or something that moves while it is seen: no change of the ground
 
 

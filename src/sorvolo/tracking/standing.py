@@ -31,7 +31,7 @@ _SAME_BOX = 0.55  # overlap of two boxes of one frame from which they show one o
 # of the fewer views: what is seen twice in more frames than these is two objects
 _SHARED_FRAMES = 0.25
 
-_TOP = 0.85  # of a body's height: tops are narrower than feet
+_TOP = 0.85  # of a body's height: where the top of its box is projected
 _HEIGHT_SIGMA = 0.3  # people stand, sit and lie
 _SIZE_SIGMA = 0.3  # of length and width
 
@@ -59,7 +59,7 @@ _WOBBLE_M_S2 = 0.4  # how much walkers turn and change their pace
 class Standing:
     """One object; `members` are the indices of its sightings, in order of time, `best` that of its clearest.
 
-    `score` counts all frames that could show it (`view_evidence`); of what moves it is the mean where it was seen.
+    `score` counts all frames that could show it (`view_evidence`); for moving objects it is the mean over frames that show them.
     `position_m` (2,) is its foot, where it was last seen if it moves, with `sigma_m`, per axis, against other objects
     of the same map. `size_m` (2,) are the longer and the shorter side, NaN of what the picture's edge always cut.
     `velocity_m_s` (2,) is zero unless it moves. `possible_views` counts the frames that show its place and what stands

@@ -297,7 +297,7 @@ class Tracker:
         """How far pairs miss each other: ids, seen less known places (M, 2), and their variances (M,)."""
         matched = odds.motions.only(pairs.tracks)
         known_m2 = np.trace(matched.place_covariances_m2, axis1=1, axis2=2) / 2
-        # a mover knows no place of its own that could hold the map
+        # moving objects cannot anchor the map
         restless_m2 = matched.weights[:, MOVES] * self._shared_m**2
         return (
             [ids[row] for row in pairs.tracks],

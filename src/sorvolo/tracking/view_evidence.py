@@ -9,7 +9,7 @@ USUAL_LOG_ODDS = -1.7
 from it is 0.16 of people by day, 0.31 of cars, thermal 0.19 and 0.12; one for all, by choice."""
 
 
-LEAST_SEEN = 0.05  # weaker sightings are none, and none counts as this
+LEAST_SEEN = 0.05  # lower scores are misses; a miss scores this
 # share of the variance of log-odds that lies between things, not between views of one
 SHARED = 0.63
 

@@ -220,7 +220,7 @@ def precision_recall(match: ClassMatch) -> tuple[Floats, Floats, Floats]:
 def best_threshold(match: ClassMatch) -> Threshold:
     """The score from which on F1 is highest; NaN where nothing is right.
 
-    It is chosen on the very pictures that it is measured on, so it flatters a little.
+    It is optimistic: the threshold is chosen on the pictures it is measured on.
     """
     scores, precision, recall = precision_recall(match)
     if not match.right[0].any():

@@ -181,7 +181,7 @@ def comparison_headline(
     if not coverage["is_enough"]:
         doubt = "most of the ground could not be compared"
     elif coverage["other_ground_m2"] > _OTHER_GROUND * coverage["compared_m2"]:
-        doubt = "most of the ground is another one now (snow, water, ploughing?), and what stands on it may be missed"
+        doubt = "most of the ground surface changed (snow, water, ploughing?), and objects on it may be missed"
     else:
         return {"quality": "compared", "text": found}
     return {"quality": "doubtful", "text": f"not to be relied on, {doubt}: {found}"}

@@ -79,13 +79,13 @@ class Pending:
 
     @property
     def comes_again(self) -> bool:
-        """Whether it was not looked for by all means; waits for its comparison."""
+        """Whether the frame is to be retried; waits for its comparison."""
         return self.outcome.result().comes_again
 
 
 @dataclass(frozen=True, eq=False)
 class Again:
-    """A frame that is looked for again later; `is_resumed`: so a run that was killed found it."""
+    """A frame queued for retry; `is_resumed`: the interrupted run queued it."""
 
     posed: PosedFrame
     is_resumed: bool
@@ -245,7 +245,7 @@ class CompareRun:
         self._keep(pending)
 
     def leave_out(self, frames: int) -> None:
-        """So many frames were put off and are not tried again: others that overlap them show their ground."""
+        """Count frames skipped because others cover their ground."""
         self._counts.left_out += frames
 
     def view(self, posed: PosedFrame) -> FrameView | None:

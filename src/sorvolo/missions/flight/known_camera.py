@@ -18,8 +18,7 @@ _BETWEEN_CAMERAS = 0.01  # relative: another specimen of the same model, or anot
 def known_camera(guess: CameraModel, archive: Archive) -> CameraModel:
     """The guess with the focal length and distortion that mapping this site found for the same camera.
 
-    The same camera is one whose numbers come from the same words (make, model and lens are in them) for pictures of
-    the same size. Of several flights the surest counts. A calibrated camera, and one that no flight knows much
+    Cameras match if make, model, lens and picture size do. Of several flights the surest counts. A calibrated camera, and one that no flight knows much
     better, comes back as it is. Where nothing at all is known of the camera and an earlier flight was given one for
     pictures of the same size, the words name it: nothing shows that it is the same, so a person has to decide.
     """

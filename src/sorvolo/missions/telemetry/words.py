@@ -12,7 +12,7 @@ _LEAST = {
     "heading": 0.5,
     "tilt": 0.5,
     "height": 0.3,
-}  # s, deg, deg, m: smaller ones matter to nobody
+}  # s, deg, deg, m: smaller errors are not reported
 _NOT_KNOWN = {"clock": 1.0, "heading": 10.0, "height": 10.0}
 """s (10 m of flight, or less), deg, m: right within more than this is no knowledge; by choice."""
 _TOO_FEW = "too few frames have a fix"

@@ -300,7 +300,7 @@ def _arrivals(
 def _wanted(source: Source, settings: WatchSettings) -> Callable[[int, int], bool]:
     """Which frames are searched: all photos, every N-th frame, or a number a second of flight.
 
-    Of a live source all may be: those that nobody has time for give way to newer ones.
+    Of a live source every frame is offered; when behind, old ones are dropped.
     """
     if settings.every is not None:
         step = settings.every

@@ -71,7 +71,7 @@ class WorkingCopy:
         atomic_write_bytes(self.folder / UNSENT, b"")
 
     def fetch(self, scratch: Path) -> Generator[CopyUpdate, None, bool]:
-        """Make the folder what the store has now; whether there is a site. What was not sent yet is sent before.
+        """Send pending changes, then bring the folder up to date; return whether the site exists.
 
         Raises OvertakenError where another writer has changed the site, and StoreError as copies do.
         """

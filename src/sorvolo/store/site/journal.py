@@ -204,7 +204,7 @@ def is_journal_after(path: Path, version: int) -> bool:
 
 
 def _read_run(file: Any) -> Mapping[str, Any]:
-    """Of what run the journal is; empty where it is no journal."""
+    """Return what the journal states of its run, or {} if the file is no journal."""
     first = _read(file) if file.read(len(_MAGIC)) == _MAGIC else None
     return {} if first is None or first.kind != "run" else first.values
 
