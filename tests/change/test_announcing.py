@@ -10,7 +10,7 @@ from sorvolo.change.announcing import (
     Announce,
     Drop,
     Look,
-    Reason,
+    Objection,
     Tally,
     Wait,
     judge,
@@ -41,10 +41,10 @@ def test_what_all_views_show_surely_is_announced_with_its_score():
 @pytest.mark.parametrize(
     ("reported", "reason"),
     [
-        ({"score_sum": 3.0}, Reason.UNSURE),
-        ({"asked": 25}, Reason.UNSURE),
-        ({"restless": 0.2, "score_sum": 7.0}, Reason.UNSURE),
-        ({"score_sum": 5.0, "look": Look(3.0, 2.5)}, Reason.LARGE_AND_UNSURE),
+        ({"score_sum": 3.0}, Objection.UNSURE),
+        ({"asked": 25}, Objection.UNSURE),
+        ({"restless": 0.2, "score_sum": 7.0}, Objection.UNSURE),
+        ({"score_sum": 5.0, "look": Look(3.0, 2.5)}, Objection.LARGE_AND_UNSURE),
     ],
 )
 def test_each_rule_stops_a_candidate_alone_and_names_itself(reported, reason):

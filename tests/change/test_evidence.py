@@ -19,7 +19,7 @@ from blob_world import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sorvolo.change.announcing import Reason
+from sorvolo.change.announcing import Objection
 from sorvolo.change.candidate import Candidate, KeptView
 from sorvolo.change.earlier_pictures import EarlierPicture, EarlierPictures, with_known_pixels
 from sorvolo.change.evidence import EvidenceMap, EvidenceSettings
@@ -370,7 +370,7 @@ def test_what_became_of_the_candidates_is_counted():
     assert len(announced) == 2 and len(evidence.conclude()) == 1
     assert evidence.outcomes() == {
         "announced": {"still": 1, "moving": 0},
-        "withdrawn": {Reason.UNSURE.value: 1},
+        "withdrawn": {Objection.UNSURE.value: 1},
         "never_announced": {},
     }
 

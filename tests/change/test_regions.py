@@ -8,7 +8,7 @@ from blob_world import CAMERA_HEIGHT_M, Thing, view_of
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sorvolo.change.ground import CellGrid, CellWindow, LaidView, lay
+from sorvolo.change.ground import CellWindow, EvidenceGrid, LaidView, lay
 from sorvolo.change.outlines import (
     KnownPlace,
     is_known,
@@ -132,7 +132,7 @@ def test_a_piece_that_only_its_shadow_leaves_is_whole():
 
 @given(st.lists(st.tuples(st.booleans(), st.booleans()), min_size=1, max_size=20))
 def test_a_cell_remembers_the_last_views_that_saw_it(history):
-    grid, window = CellGrid(5), CellWindow(-3, -2, 70, 4)
+    grid, window = EvidenceGrid(5), CellWindow(-3, -2, 70, 4)
     shape = window.shape
     for flag, seen in history:
         evidence = grid.record(laid_of(np.full(shape, flag), np.full(shape, seen), window), True)
@@ -142,7 +142,7 @@ def test_a_cell_remembers_the_last_views_that_saw_it(history):
 
 
 def test_ground_where_nothing_changes_costs_no_memory_and_the_oldest_goes_first():
-    grid = CellGrid(5, most_chunks=3)
+    grid = EvidenceGrid(5, most_chunks=3)
     earlier = CellWindow(-640, 0, -576, 64)
     grid.record(laid_of(np.ones(earlier.shape, bool), np.ones(earlier.shape, bool), earlier), True)
     quiet = CellWindow(0, 0, 640, 640)

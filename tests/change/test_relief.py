@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sorvolo.change.earlier_pictures import EarlierPicture, EarlierPictures, with_known_pixels
-from sorvolo.change.relief import Relief
+from sorvolo.change.relief import ReliefMap
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import apply_homography, site_from_image_homography
 from sorvolo.geometry.pose import NADIR_CAMERA_NORTH_UP, Pose
@@ -45,15 +45,15 @@ def seen(centre) -> tuple[np.ndarray, np.ndarray]:
     return rgb.astype(np.uint8), is_roof.reshape(x.shape)
 
 
-def relief() -> Relief:
+def relief() -> ReliefMap:
     across = np.arange(-HALF_M, HALF_M, CELL_M)
     x, y = np.meshgrid(across, across[::-1])
     top = HALF_M / CELL_M
     cells_from_site = np.array([[1 / CELL_M, 0, top], [0, -1 / CELL_M, top - 1], [0, 0, 1]])
-    return Relief(np.where(stands(x, y), TOWER_M, 0).astype(np.float32), cells_from_site)
+    return ReliefMap(np.where(stands(x, y), TOWER_M, 0).astype(np.float32), cells_from_site)
 
 
-def rendered(over: Relief | None):
+def rendered(over: ReliefMap | None):
     picture, _ = seen(EARLIER)
     pose = Pose(NADIR_CAMERA_NORTH_UP, EARLIER)
     known = EarlierPicture(CAMERA, site_from_image_homography(CAMERA, pose), pose)
@@ -116,6 +116,6 @@ def test_ground_that_the_tower_hid_from_the_earlier_camera_is_not_known(truth) -
 
 
 def test_where_nothing_stands_homographies_suffice() -> None:
-    flat = Relief(np.zeros((50, 50), np.float32), np.diag([10.0, 10, 1]))
+    flat = ReliefMap(np.zeros((50, 50), np.float32), np.diag([10.0, 10, 1]))
     later = site_from_image_homography(CAMERA, Pose(NADIR_CAMERA_NORTH_UP, LATER))
     assert flat.find_in_earlier(later, LATER, np.linalg.inv(later), EARLIER, (320, 240)) is None

@@ -7,7 +7,7 @@ from blob_world import CAMERA_HEIGHT_M, M_PER_PX, Thing, view_of
 
 from sorvolo.change.announcing import Tally, sureness
 from sorvolo.change.evidence import EvidenceMap, EvidenceSettings, restlessness
-from sorvolo.change.ground import CellGrid, CellWindow, LaidView
+from sorvolo.change.ground import CellWindow, EvidenceGrid, LaidView
 
 CELL_M = 0.1
 GROUND = CellWindow(-100, -100, 100, 100)
@@ -21,8 +21,8 @@ def laid(flagged: np.ndarray, seen: np.ndarray | None = None) -> LaidView:
     return LaidView(GROUND, flagged & seen, seen, score, nothing, nothing, legs)
 
 
-def grid_after(views: list[LaidView]) -> CellGrid:
-    grid = CellGrid(5)
+def grid_after(views: list[LaidView]) -> EvidenceGrid:
+    grid = EvidenceGrid(5)
     for each in views:
         grid.record(each, True)
     return grid

@@ -127,7 +127,7 @@ class _Fit:
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class MapPlace:
     """Where a frame lies, in pixels of the size at which frames are aligned. `ratio` is how sure the search is of it:
     infinite for homographies with points all over the frame, 0 for those that may swing where they have none."""
 
@@ -151,7 +151,7 @@ class AlignStep:
     """What a frame left in an `Aligner`: its place (None: it has none), the frames without one up to it, and the parts
     of the map that were held in the end."""
 
-    place: Place | None
+    place: MapPlace | None
     misses: int
     windows: tuple[HeldWindow, ...]
 
@@ -217,7 +217,7 @@ class Aligner:
             return ground if share_known() >= _LEAST_KNOWN else None
 
         frame = _Frame(image, camera, gray, new, prior, time_ns, by_telemetry, inside)
-        placed: Place | NotAligned
+        placed: MapPlace | NotAligned
         is_cautious = caution is Caution.ALWAYS or (
             caution is Caution.AT_FIRST and not self._is_found
         )
@@ -228,7 +228,7 @@ class Aligner:
             misses = self._misses
             placed = self._by_homographies(frame, is_cheap=True)
             self._misses = misses
-            if isinstance(placed, Place) and self._is_doubtful(placed, prior):
+            if isinstance(placed, MapPlace) and self._is_doubtful(placed, prior):
                 placed = NotAligned("its place is in doubt", placed.residual_px)
         else:
             placed = self._by_homographies(frame)
@@ -279,23 +279,23 @@ class Aligner:
             cv2.resize(gray_from_rgb(image), size, interpolation=cv2.INTER_AREA), np.uint8
         )
 
-    def _by_homographies(self, frame: _Frame, *, is_cheap: bool = False) -> Place | NotAligned:
+    def _by_homographies(self, frame: _Frame, *, is_cheap: bool = False) -> MapPlace | NotAligned:
         """The frame placed by the first guess that its points confirm to a part of a pixel, or why none is."""
         nearest = NotAligned("its features are found nowhere in the map where it could be", np.nan)
         for guess, followed in self._guesses(frame, is_cheap=is_cheap):
             found = self._fit(frame.even, guess, followed=followed)
-            if isinstance(found, Place):
+            if isinstance(found, MapPlace):
                 return found
             nearest = _nearer(nearest, found)
         return nearest
 
-    def _is_doubtful(self, placed: Place | NotAligned, prior: CameraPrior) -> bool:
+    def _is_doubtful(self, placed: MapPlace | NotAligned, prior: CameraPrior) -> bool:
         """Whether a frame is nowhere, or where telemetry, as it was so far, hardly can have it."""
         if isinstance(placed, NotAligned):
             return True
         return not placed.followed and (placed.ratio == 0 or self.search.is_odd(placed.pose, prior))
 
-    def _by_search(self, frame: _Frame) -> Place | None:
+    def _by_search(self, frame: _Frame) -> MapPlace | None:
         """The frame placed by learned features, telemetry and its neighbours; what these leave in doubt, or what lies
         far from where telemetry was right so far, a local fit must confirm. Without telemetry's place the search begins
         at the last frame's."""
@@ -308,7 +308,7 @@ class Aligner:
         found = self.search.find(frame.gray, frame.even.gray, frame.even.camera, frame.prior, start)
         if found is None:
             return None
-        place = Place(
+        place = MapPlace(
             found.fit.site_from_image, found.fit.pose, found.fit.residual_px, False, found.ratio
         )
         if found.is_sure and not self.search.is_odd(place.pose, frame.prior):
@@ -316,7 +316,7 @@ class Aligner:
         local = self._local(frame, place)
         return place if local is not None and local.rest <= _CONFIRMS_REST else None
 
-    def _settled(self, frame: _Frame, placed: Place) -> tuple[Place, LocalFit | None, float]:
+    def _settled(self, frame: _Frame, placed: MapPlace) -> tuple[MapPlace, LocalFit | None, float]:
         """The place moved as a camera by local fits where the last fit leaves much; what no camera explains of them, in
         the frame's own pixels, and how far they moved it in all (median, m)."""
         place, left, size_m = placed, None, 0.0
@@ -334,7 +334,7 @@ class Aligner:
                 break
         return place, left, size_m
 
-    def _local(self, frame: "_Frame", placed: Place) -> LocalFit | None:
+    def _local(self, frame: "_Frame", placed: MapPlace) -> LocalFit | None:
         """The local fit of a frame at its place, in pixels of the `_fine` camera."""
         fine = _fine(frame.camera)
         size = fine.width_px, fine.height_px
@@ -417,7 +417,7 @@ class Aligner:
             return None
         return ideal @ np.linalg.inv(last.seen_from_ideal)
 
-    def _remember(self, time_ns: int, placed: Place, prior: CameraPrior, new: Keyframe) -> None:
+    def _remember(self, time_ns: int, placed: MapPlace, prior: CameraPrior, new: Keyframe) -> None:
         # ideal @ inv(seen_from_ideal) gives the fit back
         ideal = site_from_image_homography(new.camera, placed.pose)
         seen_from_ideal = np.linalg.inv(placed.site_from_image) @ ideal
@@ -557,7 +557,7 @@ class Aligner:
             return None
         return site_from_image @ np.linalg.inv(fitted[0])
 
-    def _fit(self, new: Keyframe, guess: Matrix3, *, followed: bool) -> Place | NotAligned:
+    def _fit(self, new: Keyframe, guess: Matrix3, *, followed: bool) -> MapPlace | NotAligned:
         """The place that a guess leads to, to a part of a pixel, or why there is none."""
         seen = self._seen(guess, new.camera)
         if seen is None:
@@ -578,17 +578,17 @@ class Aligner:
         pose = pose_from_homography(fit, new.camera)
         if pose is None:
             return NotAligned("the fit is none that a camera above the ground could have", np.nan)
-        return Place(fit, pose, residual_px, followed, np.inf if is_held else 0.0)
+        return MapPlace(fit, pose, residual_px, followed, np.inf if is_held else 0.0)
 
 
-def _as_known(known: FlightPlace, full: Camera, camera: Camera) -> Place | NotAligned:
+def _as_known(known: FlightPlace, full: Camera, camera: Camera) -> MapPlace | NotAligned:
     """The place of a frame of the `full` size in pixels of the size at which frames are aligned."""
     site_from_image = known.site_from_image @ _small_from(camera, full)
     pose = pose_from_homography(site_from_image, camera)
     if pose is None:
         return NotAligned("the fit is none that a camera above the ground could have", np.nan)
     residual_px = known.residual_m * camera.fx_px / float(pose.translation_m[2])
-    return Place(site_from_image, pose, residual_px, False, 0.0)
+    return MapPlace(site_from_image, pose, residual_px, False, 0.0)
 
 
 def _homography_of(camera: Camera, pose: Pose) -> Matrix3 | None:
@@ -662,8 +662,8 @@ def _small_from(fine: Camera, small: Camera) -> Matrix3:
 
 
 def _as_camera(
-    placed: Place, local: LocalFit, camera: Camera, small_from_image: Matrix3
-) -> tuple[Place, LocalFit]:
+    placed: MapPlace, local: LocalFit, camera: Camera, small_from_image: Matrix3
+) -> tuple[MapPlace, LocalFit]:
     """The place moved as a local fit in this camera's pixels has it, as far as a camera over level ground can; and what
     is left of the fit. `small_from_image` leads to the place's own pixels."""
     old_px = local.places_px(camera.width_px, camera.height_px)

@@ -9,7 +9,7 @@ import numpy as np
 from sorvolo.geometry.arrays import Floats
 
 
-class Reason(StrEnum):
+class Objection(StrEnum):
     """Why a candidate is not announced, or no longer."""
 
     TOO_FEW_VIEWS = "too few views show it"
@@ -29,14 +29,14 @@ class Announce:
 class Wait:
     """Not yet: more views may confirm it."""
 
-    reason: Reason
+    reason: Objection
 
 
 @dataclass(frozen=True)
 class Drop:
     """No view is left to confirm it: not announced, or withdrawn."""
 
-    reason: Reason
+    reason: Objection
 
 
 Verdict = Announce | Wait | Drop
@@ -176,21 +176,21 @@ def views_score(tally: Tally, calm: float = 1.0) -> float:
     return float(np.clip(score * (0.5 if tally.is_from_one_place() else 1.0) * wholeness, 0, 1))
 
 
-def _objection(tally: Tally) -> Reason | None:
+def _objection(tally: Tally) -> Objection | None:
     """The first rule that a candidate fails."""
     score, look = sureness(tally), tally.look
     if score < LEAST_SCORE:
-        return Reason.MOVES if tally.moved > tally.views else Reason.UNSURE
+        return Objection.MOVES if tally.moved > tally.views else Objection.UNSURE
     return None if look is None else _objection_to_look(look, score, tally)
 
 
-def _objection_to_look(look: Look, score: float, tally: Tally) -> Reason | None:
+def _objection_to_look(look: Look, score: float, tally: Tally) -> Objection | None:
     """The first rule that what its pictures and outline show fails."""
     may_be_a_wall = (
         look.area_m2 >= _LARGE_M2 and look.length_m < tally.flying_height_m
     )  # snow is longer
     if may_be_a_wall and score < _LARGE_SCORE and not tally.is_from_one_place():
-        return Reason.LARGE_AND_UNSURE
+        return Objection.LARGE_AND_UNSURE
     return None
 
 

@@ -9,9 +9,9 @@ import numpy as np
 from sorvolo.change.announcing import Tally
 from sorvolo.change.ground import (
     CellEvidence,
-    CellGrid,
     CellReport,
     CellWindow,
+    EvidenceGrid,
     LaidView,
     pieces,
 )
@@ -475,7 +475,7 @@ class Seeds:
 
     def __init__(
         self,
-        grid: CellGrid,
+        grid: EvidenceGrid,
         cell_m: float,
         gap: int,
         least_cells: float,

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sorvolo.change.relief import Relief
+from sorvolo.change.relief import ReliefMap
 from sorvolo.geometry.arrays import ImageBGR, ImageRGB, ImageRGBA, Mask, Matrix3, PointsM, Vector3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import apply_homography, pose_from_homography
@@ -39,7 +39,7 @@ class EarlierPictures:
         self,
         pictures: Sequence[EarlierPicture],
         load: Callable[[int], ImageRGBA],
-        relief: Relief | None = None,
+        relief: ReliefMap | None = None,
     ) -> None:
         self._pictures, self._load, self._relief = pictures, load, relief
         places = []

@@ -16,7 +16,7 @@ from sorvolo.change.announcing import (
     LEAST_SCORE,
     Announce,
     Look,
-    Reason,
+    Objection,
     Tally,
     Verdict,
     judge,
@@ -33,8 +33,8 @@ from sorvolo.change.candidate import (
 )
 from sorvolo.change.ground import (
     CellEvidence,
-    CellGrid,
     CellWindow,
+    EvidenceGrid,
     cell_side_m,
     lay,
     pieces,
@@ -106,7 +106,7 @@ class EvidenceMap:
         self._cell_m = cell_side_m(m_per_px)
         self._join_m = max(_JOIN_M, 3 * self._cell_m) if _JOIN_M else 0.0
         self._gap = int(np.ceil(self._join_m / self._cell_m))
-        self._grid = CellGrid(settings.n)
+        self._grid = EvidenceGrid(settings.n)
         self._tracker = BlobTracker()
         self._found: dict[int, Candidate] = {}  # by number, in order
         self._merged: dict[int, int] = {}
@@ -207,7 +207,7 @@ class EvidenceMap:
         never = Counter(
             each for number, each in reasons.items() if number not in self._announced_ns
         )
-        never[Reason.TOO_FEW_VIEWS.value] += sum(each.number == 0 for each in self._seeds)
+        never[Objection.TOO_FEW_VIEWS.value] += sum(each.number == 0 for each in self._seeds)
         moving = len(self._movers.changes)
         announced = {"still": len(self.changes()) - moving, "moving": moving}
         return {
@@ -634,7 +634,7 @@ class EvidenceMap:
         return True
 
 
-def restlessness(grid: CellGrid, window: CellWindow, own: Mask, cell_m: float) -> float:
+def restlessness(grid: EvidenceGrid, window: CellWindow, own: Mask, cell_m: float) -> float:
     """The share of the views of the ground around a change that flag it although most others do not, 0 to 1.
 
     Crowns, walls that lean into view and wind make views differ from the map all around, now here, now there: where

@@ -322,7 +322,7 @@ class _Chunk:
         self.owner = np.zeros((CHUNK, CHUNK), np.int32)
 
 
-class CellGrid:
+class EvidenceGrid:
     """Histories of the cells, kept only where something changed. `record` and `own` change it.
 
     At most `most_chunks` pieces of 64 x 64 cells are kept; the one not used for the longest time goes first.

@@ -214,7 +214,7 @@ _REACHES = ((3, 1.0), (7, 0.1), (17, 0.01), (49, 0.001))
 
 
 @dataclass(frozen=True, eq=False)
-class Light:
+class PairLight:
     """What turns the reference's light into the query's: query + 8 = 2**offset * (reference + 8)**exponent * gain.
 
     `exponents` and `offsets` (3,) are per channel, blue green red; `gains` (h, w, 3) float32 are factors on a coarse
@@ -235,7 +235,7 @@ class Light:
         return np.asarray(2.0 ** (self.offsets + (self.exponents - 1.0) * middle))
 
 
-def fit_light(reference: Bgr, query: Bgr, known: Mask | None = None) -> Light:
+def fit_light(reference: Bgr, query: Bgr, known: Mask | None = None) -> PairLight:
     """The light of `query` seen against `reference`, aligned to a few pixels; where not `known` it is the middle one.
 
     The exponents come from what both pictures show at middle scales, where neither clouds nor pixels' noise matter;
@@ -248,7 +248,7 @@ def fit_light(reference: Bgr, query: Bgr, known: Mask | None = None) -> Light:
     before, after = (_logarithm(_smaller(each, size)) for each in (reference, query))
     sure = _surely(known, size)
     if sure is not None and sure.sum() < 16:
-        return Light(np.ones(3), np.zeros(3), np.ones((*size[::-1], 3), np.float32), 0.0)
+        return PairLight(np.ones(3), np.zeros(3), np.ones((*size[::-1], 3), np.float32), 0.0)
     window = (9, 9)
     detail_before = _chosen(before - cv2.blur(before, window), sure)[::2]
     detail_after = _chosen(after - cv2.blur(after, window), sure)[::2]
@@ -271,15 +271,15 @@ def fit_light(reference: Bgr, query: Bgr, known: Mask | None = None) -> Light:
     octaves = _spread(steps, same, _REACHES) / STEPS_PER_OCTAVE
     unevenness = float(_chosen(octaves, sure).mean(axis=1).std())
     factors = None if shades is None else np.exp2(shades)
-    return Light(exponents, offsets, np.exp2(octaves).astype(np.float32), unevenness, factors)
+    return PairLight(exponents, offsets, np.exp2(octaves).astype(np.float32), unevenness, factors)
 
 
-def relit(image: Bgr, light: Light, out: Bgr | None = None) -> Bgr:
+def relit(image: Bgr, light: PairLight, out: Bgr | None = None) -> Bgr:
     """`image`, of the reference, in the query's light; written to `out` (h, w, 3) where it is given."""
     return relight(image, *_curves_and_gains(light, image.shape[1]), out=out)
 
 
-def _curves_and_gains(light: Light, width: int) -> tuple[Ints32, Floats32]:
+def _curves_and_gains(light: PairLight, width: int) -> tuple[Ints32, Floats32]:
     """The light of pictures of a width as `relight` takes it."""
     levels = np.log2(np.arange(256) + BLACK_LEVEL)
     curves = 2.0 ** (light.exponents[:, None] * levels + light.offsets[:, None])

@@ -16,7 +16,7 @@ _SAME_M = 0.5  # heights that differ by less are the same surface
 
 
 @dataclass(frozen=True, eq=False)
-class Relief:
+class ReliefMap:
     """`above_m` (H, W) float32, what stands on the bare ground, m above it (0 where that is not known), and the affine
     map (3, 3) from site metres to its columns and rows.
 

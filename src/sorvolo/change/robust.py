@@ -11,7 +11,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sorvolo.change.light import Light, fit_light, relit
+from sorvolo.change.light import PairLight, fit_light, relit
 from sorvolo.change.regions import (
     FEATURES,
     Image,
@@ -106,7 +106,7 @@ class Views:
 
 
 @dataclass(frozen=True, eq=False)
-class Piece:
+class ThingPixels:
     """A thing's pixels: `mask` is a part of the picture, whose place is `window`."""
 
     window: Window
@@ -119,7 +119,7 @@ class Piece:
         return x + self.window[1].start, y + self.window[0].start, wide, high
 
 
-def grown(regions: Regions, region: int, came: bool, views: Views) -> Piece | None:
+def grown(regions: Regions, region: int, came: bool, views: Views) -> ThingPixels | None:
     """The thing that `region` (0 .. N - 1) is a part of; None where it does not stand out from what is around.
 
     Its difference stands out of that of the quiet ground near: at the lowest limit at which it is one nearly convex
@@ -150,12 +150,12 @@ def grown(regions: Regions, region: int, came: bool, views: Views) -> Piece | No
         if _is_thing(thing, bare, limit):
             largest_near = cv2.dilate(strength, np.ones((5, 5), np.uint8))
             is_sharp = strength > np.floor(_BLURRED * np.asarray(largest_near, np.float32))
-            return Piece(window, (thing > 0) & (is_sharp | (surely > 0)))
+            return ThingPixels(window, (thing > 0) & (is_sharp | (surely > 0)))
         limit *= _STEP
     return None
 
 
-def with_weak_ground(regions: Regions, region: int, reach_px: int) -> Piece:
+def with_weak_ground(regions: Regions, region: int, reach_px: int) -> ThingPixels:
     """`region` (0 .. N - 1) with the ground around it that differs weakly, less a rim of blur.
 
     Weak ground may join many regions, and run on along a cloud's edge. Each pixel of it belongs to the nearest
@@ -165,7 +165,7 @@ def with_weak_ground(regions: Regions, region: int, reach_px: int) -> Piece:
     weak, core = regions.weak[window], np.uint8(255) * (regions.labels[window] == region + 1)
     # two blurs of 3 px reach two pixels out
     weak = np.asarray(cv2.erode(held_parts(weak | core, core), np.ones((5, 5), np.uint8)), np.uint8)
-    return Piece(window, ((weak > 0) & (regions.nearest[window] == region + 1)) | (core > 0))
+    return ThingPixels(window, ((weak > 0) & (regions.nearest[window] == region + 1)) | (core > 0))
 
 
 def _is_thing(mask: Image, strength: Image, limit: float) -> bool:
@@ -234,7 +234,7 @@ class RobustResult:
     mask: ImageGray
     boxes: Boxes
     scores: Floats
-    light: Light
+    light: PairLight
     settling: Settling
     noise: float
     known: float
@@ -263,7 +263,7 @@ class Examined(NamedTuple):
     """The regions that differ at half size, before any is judged; and what the pair set itself."""
 
     regions: Regions
-    light: Light
+    light: PairLight
     settling: Settling
     known: float  # share of the picture
     views: Views
@@ -372,7 +372,7 @@ def _result(
         nothing = np.zeros(size[::-1], np.uint8), np.zeros((0, 4), np.int64), np.zeros(0)
         return RobustResult(*nothing, light, settling, regions.noise, known)
     went = _went(regions)
-    pieces: dict[int, Piece] = {}
+    pieces: dict[int, ThingPixels] = {}
     for region in np.flatnonzero(sure & (scores >= _LEAST_GROWN)):
         piece = grown(regions, int(region), not went[region], views)
         if piece is not None:
@@ -405,7 +405,7 @@ def _result(
     return RobustResult(mask, boxes, scores[sure], light, settling, regions.noise, known)
 
 
-def _around(box: Ints32, piece: Piece | None) -> tuple[int, int, int, int]:
+def _around(box: Ints32, piece: ThingPixels | None) -> tuple[int, int, int, int]:
     """x, y, width, height of what holds a region's box and what it has grown to."""
     x, y, wide, high = (int(each) for each in box)
     if piece is None:
@@ -443,7 +443,7 @@ def _went(regions: Regions) -> Mask:
 
 
 def _filled(
-    chosen: Mask, regions: Regions, pieces: Mapping[int, Piece], settings: RobustSettings
+    chosen: Mask, regions: Regions, pieces: Mapping[int, ThingPixels], settings: RobustSettings
 ) -> ImageGray:
     """The things of the `chosen` (N,) regions: their `pieces`, and where there is none the region with the weakly
     differing ground that is its own; without gaps.

@@ -15,7 +15,7 @@ from sorvolo.change.map_update import paint_changes
 from sorvolo.change.outlines import KnownPlace
 from sorvolo.change.reconcile import reported
 from sorvolo.change.reference import ReferenceMap
-from sorvolo.change.relief import Relief
+from sorvolo.change.relief import ReliefMap
 from sorvolo.change.views import FlightCamera, ViewMaker, ViewOutcome, ViewRecord, as_bgr
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Mask, PointsM
@@ -437,7 +437,7 @@ def _earlier_pictures(archive: Archive, superseded: str) -> EarlierPictures:
     relief = (
         None
         if tall is None
-        else Relief(
+        else ReliefMap(
             *standing(
                 read_field(archive, tall, HeightFile.SURFACE),
                 read_field(archive, tall, HeightFile.GROUND),
