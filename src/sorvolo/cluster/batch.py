@@ -326,7 +326,11 @@ def run_batch(
         }
         yield BatchUpdate("looking into flights", 0, len(queues))
         looked = {row.source: row for row in given_up}
-        for row, ending in _run(queues, _inspecting(settings), executor):
+
+        def inspecting(row: Row) -> Order:
+            return Order("inspect", "", row.source, camera=settings.camera)
+
+        for row, ending in _run(queues, inspecting, executor):
             if ending is None or row.state == "waiting":
                 continue
             if row.state == "done":
@@ -400,10 +404,6 @@ def _run(
         elif not waiting[name]:
             del waiting[name]
         yield row, ending
-
-
-def _inspecting(settings: BatchSettings) -> Callable[[Row], Order]:
-    return lambda row: Order("inspect", "", row.source, camera=settings.camera)
 
 
 def _order(row: Row, root: Path, settings: BatchSettings) -> Order:

@@ -97,7 +97,7 @@ class Station:
     @classmethod
     def _opened(cls, settings: StationSettings, lock: RootLock) -> "Station":
         state, shelf = StationState.open(settings.state_folder), SiteShelf(settings.root)
-        events, tiles = EventLog(state, settings.limits.most_events), WebTiles(shelf)
+        events, tiles = EventLog(state), WebTiles(shelf)
         uploads = Uploads(settings, events)
         findings = Findings(state, settings.state_folder / RUNS_FOLDER)
         reviews = Reviews(state, shelf, events, findings)

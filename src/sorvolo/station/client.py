@@ -36,6 +36,9 @@ _REFUSED_CODE = 4400
 """The WebSocket close code of a station that will not have the stream, whatever is tried again."""
 
 
+_PING_S = 5.0  # a link that answers no ping for so long is opened anew
+
+
 @dataclass(frozen=True)
 class StreamSettings:
     """How a flight is sent."""
@@ -44,7 +47,6 @@ class StreamSettings:
     latency_s: float = 5.0  # older pictures are dropped to the next key frame; infinite: none are
     spool_bytes: int = 512_000_000  # kept through an outage
     flush_s: float = 10.0  # after a stop, to send what waits
-    ping_s: float = 5.0  # a link that answers no ping for so long is opened anew
     give_up_s: float = float("inf")  # without a link, once everything was taken
     authority: Path | None = None  # of the station's certificate, PEM
     door: str = (
@@ -233,12 +235,12 @@ class StreamClient:
 
     def _called(self, context: ssl.SSLContext | None) -> connect:
         """A new connection to the station, to be entered."""
-        ping_s, headers = self._settings.ping_s, self._headers()
+        headers = self._headers()
         ways: dict[str, Any] = {
             "compression": None,
             "open_timeout": _CONNECT_S,
-            "ping_interval": ping_s,
-            "ping_timeout": ping_s,
+            "ping_interval": _PING_S,
+            "ping_timeout": _PING_S,
             "close_timeout": 2.0,
             "max_size": 1_000_000,
         }

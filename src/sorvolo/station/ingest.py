@@ -43,6 +43,11 @@ _LIVE_NS = 60_000_000_000  # telemetry that is so old was recorded
 _MOST_REASON_BYTES = 120  # a close frame holds 123
 
 
+_HELLO_S = 10.0  # a new link introduces itself within
+_SPACE_EVERY_S = 1.0  # how often the disk's free space is asked for
+_FLIGHTS_SHOWN = 10  # of a stream, with each of its states: thousands of states are kept
+
+
 @dataclass(frozen=True)
 class IngestLimits:
     """What a station takes from drones."""
@@ -52,9 +57,6 @@ class IngestLimits:
     free_bytes: int = 2_000_000_000  # of the disk, which stay free
     sync_s: float = 0.25  # how often the disk is waited for, and what it has acknowledged
     silent_s: float = 30.0  # a link that sends nothing for so long is closed
-    hello_s: float = 10.0  # a new link introduces itself within
-    space_every_s: float = 1.0  # how often the disk's free space is asked for
-    flights_shown: int = 10  # of a stream, with each of its states: thousands of states are kept
 
 
 class LinkClosed(Exception):
@@ -154,7 +156,7 @@ class Ingest:
             "stream": stream,
             "is_connected": stream in self._links,
             "flight_count": len(files),
-            "flights": [_kept(each) for each in files[-self._limits.flights_shown :]],
+            "flights": [_kept(each) for each in files[-_FLIGHTS_SHOWN:]],
         }
         return found | (flight.figures() if flight is not None else {})
 
@@ -256,9 +258,9 @@ class Ingest:
         """The flight that a drone comes with, open for writing. Raises Refusal, InputError or StoreError."""
         check_stream(stream)
         try:
-            first = message_from_bytes(await asyncio.wait_for(link.receive(), self._limits.hello_s))
+            first = message_from_bytes(await asyncio.wait_for(link.receive(), _HELLO_S))
         except TimeoutError:
-            raise Refusal(f"no hello within {self._limits.hello_s:.0f} s", is_final=False) from None
+            raise Refusal(f"no hello within {_HELLO_S:.0f} s", is_final=False) from None
         if first.kind is not Kind.HELLO:
             raise Refusal("the first message must be a hello")
         hello = hello_from_json(first.payload)
@@ -302,7 +304,7 @@ class Ingest:
         try:
             while True:
                 message = await self._received(link)
-                if time.monotonic() - space_s > self._limits.space_every_s:
+                if time.monotonic() - space_s > _SPACE_EVERY_S:
                     space_s = time.monotonic()
                     self._check_space()
                 if self._links.get(stream) is not link:

@@ -35,7 +35,6 @@ class StationLimits:
     most_missions: int = 4  # at the same time; each takes a core and a gigabyte or more
     most_streams: int = 16  # of drones that send at the same time
     most_uploads: int = 1000  # that are kept
-    most_events: int = 200_000  # that are kept: who asks for older ones loads the site anew
     stop_within_s: float = 30.0  # a mission that was stopped is killed then
     finish_within_s: float = 3600.0  # a live flight that was stopped is finished first
     away_s: float = 900.0  # a mission waits so long for a drone or camera of which nothing comes
@@ -47,7 +46,6 @@ class StationLimits:
             self.most_missions,
             self.most_streams,
             self.most_uploads,
-            self.most_events,
         )
         if min(counts) < 1 or min(self.stop_within_s, self.finish_within_s, self.away_s) <= 0:
             raise SettingsError("limits of a station are counts from 1 and seconds above 0")
