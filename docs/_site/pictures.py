@@ -1,4 +1,4 @@
-"""Make the pictures of the tutorial anew: python docs/_site/pictures.py DEMO (the folder that `sorvolo demo` made).
+"""Make the pictures of the tutorial: python docs/_site/pictures.py DEMO (the folder that `sorvolo demo` made).
 
 Runs the tutorial's commands on the demo's flights in a temporary folder, keeps what they print as SVG and the pages as
 JPEG, taken by Chromium (`chromium` on the PATH). Only simulated flights are shown.
