@@ -267,7 +267,7 @@ def ray_executor(name: str, slots: int | None, root: Path) -> Iterator[RayExecut
         except (OSError, OverflowError, ValueError) as error:
             raise SettingsError(
                 f"--executor {name}: no Ray cluster answers at {address} ({error}); start one there: "
-                "ray start --head, and give ray://HOST:10001 (docs/cluster.md)"
+                "ray start --head, and give ray://HOST:10001 (docs/batch.md)"
             ) from None
     options: dict[str, Any] = {"logging_level": "ERROR", "log_to_driver": False}
     if address == "local":
