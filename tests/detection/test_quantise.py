@@ -9,7 +9,7 @@ from toy_models import draw, onnx, rectangle_model, square_model
 
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import find_model
-from sorvolo.detection.quantise import pool_before_rounding, quantise
+from sorvolo.lab.training.quantise import pool_before_rounding, quantise
 from sorvolo.errors import InputError, SettingsError
 
 

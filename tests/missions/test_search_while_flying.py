@@ -26,7 +26,7 @@ from sorvolo.missions.search.prepare import prepare_search
 from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
 from sorvolo.missions.search.while_flying import Pace, SearchWhileFlying
 from sorvolo.search.cells import cells_of
-from sorvolo.search.plant_places import FieldSettings, PlantField
+from sorvolo.search.plant_places import PlantField
 from sorvolo.store.site.archive import Archive
 
 _SETTINGS = SearchSettings(plants=30, classes=("car", "person"), sun_deg=(215, 48))
@@ -130,7 +130,7 @@ def test_a_flight_that_climbs_is_sown_anew(site: Path) -> None:
         keep_off_m=[],
         free_m=4.0,
         seed=1,
-        settings=FieldSettings(square_m=0.5),
+        square_m=0.5,
     )
     assert field.fits(frames[0].placed.outline_m) and not small.fits(frames[0].placed.outline_m)
     growing.add(frames[0])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sorvolo.geometry.calibration_bins import calibration_bins, wilson
-from sorvolo.search.figures import figures, segment, together
+from sorvolo.search.recall import figures, segment, together
 from sorvolo.search.recall import Chances, fit_recall, held_out_chances, map_chances
 
 

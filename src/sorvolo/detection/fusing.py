@@ -15,14 +15,12 @@ from sorvolo.geometry.box_overlap import areas, cover_matrix, iou_matrix
 SAME_IOU = 0.4
 """Two tiles' boxes of a class are one object if they overlap this much in what both tiles show."""
 
-_COVERED = (
-    0.7  # so much of a cut piece within a box that another tile saw whole: the piece adds nothing
-)
+# so much of a cut piece within a box that another tile saw whole: the piece adds nothing
+_COVERED = 0.7
 # a box that ends so near its tile's border may go on beyond; boxes are imprecise
 _TOUCH_SHARE, _TOUCH_PX = 0.2, 2.0
-_MORE = (
-    1.1  # times the piece's area: a box of its own size is no whole that it is part of; by choice
-)
+# times the piece's area: a box of its own size is no whole that it is part of; by choice
+_MORE = 1.1
 
 # The thresholds on models' cards (`turned`, `pyramid`) hold for these values.
 LOOK_QUARTERS = (0, 1)  # quarter turns, one for each look at a picture from straight above

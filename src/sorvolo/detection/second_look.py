@@ -30,9 +30,8 @@ SHARE = 0.25  # of the picture's pixels that a position has at most; in a crowd 
 _CUTS = (8, 96)  # cut-outs of one picture in one position, best first: at least, and at most
 SAME_IOU = 0.3  # a box that overlaps the first one so much is the same object
 SUREST = 0.98  # no first score counts for more, so that the second look can overrule it
-_LEAST_SURE = (
-    1e-3  # no score counts for less, nor for more than 1 less this: log-odds stay within 7
-)
+# no score counts for less, nor for more than 1 less this: log-odds stay within 7
+_LEAST_SURE = 1e-3
 UNSEEN = 0.02  # the score of what a look does not show: models report nothing below it
 _FILLING = 114  # beyond the picture's edge, as in training
 

@@ -41,9 +41,8 @@ _MUCH_LONGER = 1.4  # times what the model knows: from there on a class gets a l
 _LEAST_OVERLAP_PX, _SPARE = 64, 1.15
 _LEAST_SIDE_PX = 64  # of a tile: less is a typing error
 MOST_MAGNIFIED_PX = 20_000_000  # of a magnified picture: what a photo of that size costs; by choice
-_LEAST_SMALL = (
-    0.3  # a score from which on something small is worth a closer look: as of the second look
-)
+# a score from which on something small is worth a closer look: as of the second look
+_LEAST_SMALL = 0.3
 
 
 @dataclass(frozen=True)

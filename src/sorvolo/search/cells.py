@@ -19,12 +19,8 @@ from sorvolo.survey.flight import Site
 _Number = TypeVar("_Number", np.uint8, np.float64)
 
 
-@dataclass(frozen=True)
-class CellSettings:
-    """How fine a map of chances is."""
-
-    most: int = 40_000  # cells, which bounds its time
-    least_m: float = 1.0  # a cell's side
+_MOST = 40_000  # cells, which bounds its time
+_LEAST_M = 1.0  # a cell's side
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,11 +79,11 @@ class Cells:
         return float(corner[0]), float(corner[1])
 
 
-def cell_side_m(outlines_m: Sequence[PointsM], settings: CellSettings = CellSettings()) -> float:
+def cell_side_m(outlines_m: Sequence[PointsM]) -> float:
     """The side of cells so that not too many cover these outlines: 1, 2, 5, 10 ... metres."""
     points = np.concatenate([np.asarray(each) for each in outlines_m])
     wide_m = float(np.prod(np.maximum(np.ptp(points, axis=0), 1.0)))
-    least_m = max(settings.least_m, (wide_m / settings.most) ** 0.5)
+    least_m = max(_LEAST_M, (wide_m / _MOST) ** 0.5)
     power = 10.0 ** np.floor(np.log10(least_m))
     return float(next(step * power for step in (1, 2, 5, 10) if step * power >= least_m - 1e-9))
 

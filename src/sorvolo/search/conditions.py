@@ -1,18 +1,154 @@
 """Under which conditions ground was seen: how finely, how often, how sharp, in which light, on what ground."""
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
-from typing import TypeAlias
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-
+from sorvolo.geometry.arrays import Floats, ImageRGB, Mask
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
 from sorvolo.geometry.arrays import Floats, Floats16, ImageRGB, Mask, PointsM, Vector3, frozen
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.level_ground import footprint, is_on_ground
 from sorvolo.geometry.pose import Pose
-from sorvolo.search.crowns import crowns_in, plants_in
+
+
+_Grey = NDArray[np.float32]
+
+
+# Metres on the ground over which crowns are recognised: each by choice, since only what all of them give together was
+# measured.
+_LEAF_M = 0.1  # along a pixel on which leaves show ...
+_LEAVES_M = 0.5  # ... and over which their roughness is taken
+_AROUND_M = 1.25  # over which a wood's roughness is taken
+_EVEN_M = 0.75  # over which lightness is taken for shadows: grass in one has lighter spots
+_SHADOWS_M = (1.0, 2.0, 4.0)  # the widths of shadows that are followed to what throws them
+_CROWN_M = 1.5  # the narrowest crown, and over which it must be so
+_WOOD_M = 8.0  # the narrowest wood: shadows of single trees are narrower
+# a gap among crowns that is no wider is forest: smooth or dark crowns, and their shade ...
+_GAP_M = 6.0
+# ... where the crowns themselves are so wide: shrubs on a lawn and rims of things are none
+_STAND_M = 2.5
+
+# How crowns are recognised on a small picture.
+_GREEN = 0.05  # excess green, (2 g - r - b) / (r + g + b), of plants
+_PLANTS = 0.6  # share of green ground around a place of plants; by choice
+_LEAVES = 0.14  # rms of lightness within `_LEAVES_M` over its mean, or the frame's where lighter: lit crowns
+_ROUGH = 0.2  # rms of lightness over its mean within `_AROUND_M`: woods, shadows too
+_DARK = 0.6  # of the frame's lightness: shadows
+# of a shadow's width: how far from within it, towards the sun, what throws it reaches
+_THROWN = 2.5
+_LEAST_GREY = 8.0  # grey levels: below, a mean is noise; by choice
+
+
+def plants_in(small: _Grey, m_per_px: float) -> Mask:
+    """(H, W) where a small colour picture (H, W, 3) shows plants."""
+    green = (2 * small[..., 1] - small[..., 0] - small[..., 2]) / np.maximum(small.sum(axis=2), 1)
+    wide = _odd_px(_CROWN_M, m_per_px)
+    return np.asarray(cv2.blur((green > _GREEN).astype(np.float32), (wide, wide)) > _PLANTS, bool)
+
+
+def crowns_in(
+    image: ImageRGB,
+    small: _Grey,
+    image_m_per_px: float,
+    m_per_px: float,
+    sunward: Floats | None,
+) -> Mask:
+    """(H, W) where crowns show in a frame; `small` (H, W, 3) is its small picture, whose pixel covers `m_per_px`.
+
+    `sunward` (2,) is the direction to the sun in the picture, x before y; None where it is unknown or straight above:
+    then crowns that are as smooth as grass go unseen.
+    """
+    lightness = small.mean(axis=2)
+    usual = max(float(np.median(lightness)), _LEAST_GREY)
+    plants, wide = plants_in(small, m_per_px), _odd_px(_CROWN_M, m_per_px)
+    even = _odd_px(_EVEN_M, m_per_px)
+    dark = cv2.blur(lightness, (even, even)) < _DARK * usual
+    leaf_roughness = _leaf_roughness(image, image_m_per_px, usual, lightness.shape)
+    leaves = cv2.blur(leaf_roughness, (wide, wide)) > _LEAVES
+    single = _opened(plants & leaves & ~dark, _CROWN_M, m_per_px)
+    if sunward is not None:
+        thrower = plants & ~dark & _towards_sun(dark, sunward, m_per_px)
+        single |= _opened(thrower, _SHADOWS_M[0], m_per_px)
+    around = _odd_px(_AROUND_M, m_per_px)
+    mean = cv2.blur(lightness, (around, around))
+    roughness = _rms(lightness, around) / np.maximum(mean, _LEAST_GREY)
+    is_rough = cv2.blur(roughness, (wide, wide)) > _ROUGH
+    wood = _wood(plants & (is_rough | single), m_per_px) & plants
+    return _closed(single | wood, m_per_px)
+
+
+def _leaf_roughness(
+    image: ImageRGB, m_per_px: float, usual: float, shape: tuple[int, ...]
+) -> _Grey:
+    """The roughness of leaves, laid on a small picture of (H, W)."""
+    scale = max(1.0, _LEAF_M / m_per_px)
+    size = max(8, round(image.shape[1] / scale)), max(8, round(image.shape[0] / scale))
+    fine = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32).mean(
+        axis=2
+    )
+    around = _odd_px(_LEAVES_M, max(m_per_px, _LEAF_M))
+    # over the frame's lightness where it is darker there: shadows are rough over their own mean by their rims alone
+    rough = _rms(fine, around) / np.maximum(cv2.blur(fine, (around, around)), usual)
+    return np.asarray(
+        cv2.resize(rough, (shape[1], shape[0]), interpolation=cv2.INTER_AREA), np.float32
+    )
+
+
+def _towards_sun(dark: Mask, sunward: Floats, m_per_px: float) -> Mask:
+    """(H, W) where what throws the shadows may stand: about as wide as they are, on their sunny side."""
+    found = np.zeros_like(dark)
+    for width_m in _SHADOWS_M:
+        reach_px = max(1, round(_THROWN * width_m / m_per_px))
+        line = np.zeros((2 * reach_px + 1, 2 * reach_px + 1), np.uint8)
+        end_x, end_y = (round(reach_px - reach_px * float(each)) for each in sunward)
+        cv2.line(line, (reach_px, reach_px), (end_x, end_y), 1)
+        found |= cv2.dilate(_opened(dark, width_m, m_per_px).astype(np.uint8), line) > 0
+    return found
+
+
+def _wood(rough: Mask, m_per_px: float) -> Mask:
+    """The wide parts of rough plants, with the narrow gaps in them."""
+    spare = round(_WOOD_M / m_per_px)
+    # beyond the picture the forest may go on: what lies at its edge is judged by what the picture shows
+    wide = cv2.copyMakeBorder(
+        rough.astype(np.uint8), spare, spare, spare, spare, cv2.BORDER_REFLECT
+    )
+    closed = cv2.morphologyEx(wide, cv2.MORPH_CLOSE, _disc(_STAND_M, m_per_px))
+    return _opened(closed > 0, _WOOD_M, m_per_px)[spare:-spare, spare:-spare]
+
+
+def _closed(crowns: Mask, m_per_px: float) -> Mask:
+    """The crowns (H, W) with the narrow gaps between them, where they are those of a stand of trees."""
+    spare = max(3, round(_GAP_M / m_per_px))
+    wide = cv2.copyMakeBorder(
+        crowns.astype(np.uint8), spare, spare, spare, spare, cv2.BORDER_REFLECT
+    )
+    stand = _opened(wide > 0, _STAND_M, m_per_px).astype(np.uint8)
+    closed = cv2.morphologyEx(stand, cv2.MORPH_CLOSE, _disc(_GAP_M, m_per_px))
+    return np.asarray(crowns | (closed[spare:-spare, spare:-spare] > 0), bool)
+
+
+def _opened(mask: Mask, width_m: float, m_per_px: float) -> Mask:
+    return np.asarray(
+        cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, _disc(width_m, m_per_px)) > 0, bool
+    )
+
+
+def _disc(width_m: float, m_per_px: float) -> NDArray[np.uint8]:
+    side_px = max(3, round(width_m / m_per_px))
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side_px, side_px)), np.uint8)
+
+
+def _rms(lightness: _Grey, around_px: int) -> _Grey:
+    mean = cv2.blur(lightness, (around_px, around_px))
+    return np.sqrt(np.maximum(cv2.blur(lightness**2, (around_px, around_px)) - mean**2, 0))
+
+
+def _odd_px(width_m: float, m_per_px: float) -> int:
+    return max(3, 2 * round(width_m / m_per_px / 2) + 1)
+
 
 CONDITIONS = ("resolution", "views", "single view", "blur", "texture", "light", "slant", "trees")
 """What a probability of detection is explained by: the columns of `Conditions.columns`."""
@@ -27,12 +163,8 @@ AboveGround: TypeAlias = Callable[[PointsM], tuple[Floats, Floats]]
 """How high the surface lies above the bare ground at places (N, 2), m, and its sigma, m; NaN where unknown."""
 
 
-@dataclass(frozen=True)
-class LookSettings:
-    """How ground is judged on a small picture."""
-
-    look_m: float = 0.25  # along its pixels
-    window: int = 5  # of them: 1.25 m, about a person and what is around
+_LOOK_M = 0.25  # along its pixels
+_WINDOW = 5  # of them: 1.25 m, about a person and what is around
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,16 +241,15 @@ def look_at(
     site_from_camera: Pose,
     blur_px: float,
     sun: Vector3 | None = None,
-    settings: LookSettings = LookSettings(),
 ) -> FrameLook:
     """The small maps of a frame (H, W, 3); `sun` (3,) is the direction to the sun in the site, None: not known."""
     m_per_px = max(float(site_from_camera.translation_m[2]), 1.0) / camera.fx_px
-    scale = max(1.0, settings.look_m / m_per_px)
-    small_m = max(m_per_px, settings.look_m)
+    scale = max(1.0, _LOOK_M / m_per_px)
+    small_m = max(m_per_px, _LOOK_M)
     size = max(8, round(camera.width_px / scale)), max(8, round(camera.height_px / scale))
     small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
     lightness = small.mean(axis=2)
-    around = max(3, 2 * round(settings.window * settings.look_m / small_m / 2) + 1)
+    around = max(3, 2 * round(_WINDOW * _LOOK_M / small_m / 2) + 1)
     mean = cv2.blur(lightness, (around, around))
     texture = np.sqrt(
         np.maximum(cv2.blur(lightness**2, (around, around)) - mean**2, 0)

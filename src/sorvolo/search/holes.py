@@ -1,7 +1,6 @@
 """Ground where little would have been found, and why."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
@@ -20,13 +19,9 @@ POD_EDGES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 """The classes of probability that polygons are drawn of."""
 
 
-@dataclass(frozen=True)
-class HoleSettings:
-    """When a condition is the reason of a hole."""
-
-    dark: float = 45.0  # grey levels: below, people and ground are alike in most pictures
-    blurred_share: float = 0.25  # of a body's longest side: blurred so far along, it is a smear
-    least_pull: float = 0.35  # of log odds: a smaller one is no reason
+_DARK = 45.0  # grey levels: below, people and ground are alike in most pictures
+_BLURRED_SHARE = 0.25  # of a body's longest side: blurred so far along, it is a smear
+_LEAST_PULL = 0.35  # of log odds: a smaller one is no reason
 
 
 class Reason(StrEnum):
@@ -81,7 +76,6 @@ def hole_reasons(
     enough: float,
     needed_m_per_px: float,
     length_m: float,
-    settings: HoleSettings = HoleSettings(),
 ) -> Holes:
     """(N,) the number in REASONS of why each wanted cell has less than `enough` of a chance; 0 where it has it.
 
@@ -99,10 +93,10 @@ def hole_reasons(
             (Reason.ROOF, seen.roofs),
             (Reason.TREES, seen.under_trees),
             (Reason.COARSE, seen.m_per_px() > needed_m_per_px),
-            (Reason.BLUR, blur_m > settings.blurred_share * length_m),
-            (Reason.DARK, light < settings.dark),
+            (Reason.BLUR, blur_m > _BLURRED_SHARE * length_m),
+            (Reason.DARK, light < _DARK),
         ]
-    worst = _worst_condition(seen.columns, recall, settings.least_pull)
+    worst = _worst_condition(seen.columns, recall, _LEAST_PULL)
     for reason, holds in (*rules, *worst):
         numbers[poor & holds & (numbers == 0)] = REASONS.index(reason)
     return numbers

@@ -14,12 +14,8 @@ _ROOM_M = {"person": 4.0, "car": 10.0, "small object": 3.0}  # around one that i
 _OTHER_ROOM_M = 5.0  # of a class of a user's own model
 
 
-@dataclass(frozen=True)
-class PlaceSettings:
-    """How long places are searched for."""
-
-    tries: int = 40  # cells for one plant, until there is no room for it in a round
-    most_rounds: int = 40  # by choice: a map without room ends
+_TRIES = 40  # cells for one plant, until there is no room for it in a round
+_MOST_ROUNDS = 40  # by choice: a map without room ends
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +41,6 @@ def plant_places(
     free_m: float,
     rng: np.random.Generator,
     usable: Mask,
-    settings: PlaceSettings = PlaceSettings(),
 ) -> list[list[PlantPlace]]:
     """Rounds of places: this many of each class in all, those of a round so far apart that all stand at once.
 
@@ -57,13 +52,11 @@ def plant_places(
         return []
     left, taken_m = dict.fromkeys(labels, plants), np.reshape(keep_off_m, (-1, 2))
     rounds: list[list[PlantPlace]] = []
-    while any(left.values()) and len(rounds) < settings.most_rounds:
+    while any(left.values()) and len(rounds) < _MOST_ROUNDS:
         placed: list[PlantPlace] = []
         for label in sorted(left, key=lambda name: -_room_m(name)):
             for _ in range(left[label]):
-                place_m = _free_place(
-                    cells, chances, label, placed, taken_m, free_m, rng, settings.tries
-                )
+                place_m = _free_place(cells, chances, label, placed, taken_m, free_m, rng, _TRIES)
                 if place_m is None:
                     break
                 placed.append(PlantPlace(label, place_m))
@@ -74,13 +67,11 @@ def plant_places(
     return rounds
 
 
-@dataclass(frozen=True)
-class FieldSettings:
-    """How dense a field of plants is; all by choice."""
-
-    square_m: float = 7.0  # the side of the square that holds one plant, at least
-    free: float = 0.5  # of the side: plants stand in the middle of their square, so far from those of the next
-    most_in_view: float = 80.0  # squares that a picture shows: from high up they are larger
+# How dense a field of plants is; all by choice.
+# of the side: plants stand in the middle of their square, so far from those of the next
+_FREE = 0.5
+_MOST_IN_VIEW = 80.0  # squares that a picture shows: from high up they are larger
+_SQUARE_M = 7.0  # the side of the square that holds one plant, at least
 
 
 class PlantField:
@@ -99,11 +90,11 @@ class PlantField:
         keep_off_m: Sequence[Floats],
         free_m: float,
         seed: int,
-        settings: FieldSettings = FieldSettings(),
+        square_m: float = _SQUARE_M,
     ) -> None:
-        self._seed, self._settings = seed, settings
+        self._seed, self._square_m = seed, square_m
         self._keep_off_m, self._free_m = np.reshape(keep_off_m, (-1, 2)), free_m
-        self._side_m = _side_m(outline_m, settings)
+        self._side_m = _side_m(outline_m, square_m)
         self._wide = tuple(each for each in labels if _room_m(each) > self._side_m)
         self._others = tuple(each for each in labels if each not in self._wide)
         self._numbers: dict[
@@ -114,7 +105,7 @@ class PlantField:
 
     def fits(self, outline_m: PointsM) -> bool:
         """Whether a frame of this outline shows no more than twice as many plants as it should."""
-        return _side_m(outline_m, self._settings) <= 2**0.5 * self._side_m
+        return _side_m(outline_m, self._square_m) <= 2**0.5 * self._side_m
 
     def near(self, outline_m: PointsM, reach_m: float) -> list[int]:
         """The numbers of the plants of all squares that lie within `reach_m` of the box around this ground (N, 2)."""
@@ -141,9 +132,7 @@ class PlantField:
         if not labels:
             return None
         rng = np.random.default_rng([self._seed, 43, column & 0xFFFFFFFF, row & 0xFFFFFFFF])
-        place_m = (
-            np.array([column, row]) + 0.5 + self._settings.free * rng.uniform(-0.5, 0.5, 2)
-        ) * self._side_m
+        place_m = (np.array([column, row]) + 0.5 + _FREE * rng.uniform(-0.5, 0.5, 2)) * self._side_m
         label = labels[int(rng.integers(len(labels)))]
         least_m = max(self._free_m, _room_m(label) / 2 + 1.0)
         if len(self._keep_off_m) and np.hypot(*(self._keep_off_m - place_m).T).min() < least_m:
@@ -151,10 +140,10 @@ class PlantField:
         return PlantPlace(label, place_m)
 
 
-def _side_m(outline_m: PointsM, settings: FieldSettings) -> float:
+def _side_m(outline_m: PointsM, square_m: float) -> float:
     """The side of squares of which a frame shows as many as it should."""
     wide_m2 = float(np.prod(np.ptp(outline_m, axis=0)))
-    return max(settings.square_m, (wide_m2 / settings.most_in_view) ** 0.5)
+    return max(square_m, (wide_m2 / _MOST_IN_VIEW) ** 0.5)
 
 
 def seeded(seed: int) -> np.random.Generator:

@@ -6,25 +6,20 @@ a logistic function of the conditions, with weights held near zero (Gelman et al
 from the weights' own (Laplace's approximation).
 """
 
-from dataclasses import dataclass, field
-
+from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
-
 from sorvolo.geometry.arrays import Floats, Mask, frozen
+from collections.abc import Sequence
+from sorvolo.geometry.arrays import Floats, Mask
 
 
-@dataclass(frozen=True)
-class RecallSettings:
-    """What is held for likely before any plant, and how the regression is computed."""
-
-    slope_sigma: float = 0.5  # of a weight, for one standard deviation of its condition
-    chance_sigma: float = 2.5  # of the log odds
-    # standard deviations: beyond what plants covered, nothing is extrapolated
-    farthest: float = 2.5
-    least_spread: float = 0.05  # of a condition: what hardly varies explains nothing
-    draws: int = 400  # of the weights, for the interval
-    steps: int = 40  # of Newton's method, at most
+_SLOPE_SIGMA = 0.5  # of a weight, for one standard deviation of its condition
+_CHANCE_SIGMA = 2.5  # of the log odds
+_FARTHEST = 2.5  # standard deviations: beyond what plants covered, nothing is extrapolated
+_LEAST_SPREAD = 0.05  # of a condition: what hardly varies explains nothing
+_DRAWS = 400  # of the weights, for the interval
+_STEPS = 40  # of Newton's method, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +32,6 @@ class Recall:
     covariance: Floats
     plants: int
     found: int
-    settings: RecallSettings = field(default_factory=RecallSettings)
 
     def __post_init__(self) -> None:
         for name in ("middle", "spread", "weights", "covariance"):
@@ -48,9 +42,7 @@ class Recall:
         rows = self._rows(columns)
         known = np.isfinite(rows).all(axis=1)
         rng = np.random.default_rng(1)
-        drawn = rng.multivariate_normal(
-            self.weights, self.covariance, self.settings.draws, method="cholesky"
-        )
+        drawn = rng.multivariate_normal(self.weights, self.covariance, _DRAWS, method="cholesky")
         mean, low, high = (np.full(len(rows), np.nan) for _ in range(3))
         for part in np.array_split(np.flatnonzero(known), max(1, int(known.sum()) // 5000)):
             chances = _logistic(rows[part] @ drawn.T)
@@ -63,8 +55,7 @@ class Recall:
         return self._rows(columns)[:, 1:] * self.weights[1:]
 
     def _rows(self, columns: Floats) -> Floats:
-        farthest = self.settings.farthest
-        scaled = np.clip((columns - self.middle) / self.spread, -farthest, farthest)
+        scaled = np.clip((columns - self.middle) / self.spread, -_FARTHEST, _FARTHEST)
         return np.column_stack([np.ones(len(scaled)), scaled])
 
 
@@ -87,18 +78,16 @@ class Chances:
         )
 
 
-def fit_recall(columns: Floats, found: Mask, settings: RecallSettings = RecallSettings()) -> Recall:
+def fit_recall(columns: Floats, found: Mask) -> Recall:
     """The regression of which plants were found, (N,), on the conditions of their places, (N, K); N at least 1."""
     middle = columns.mean(axis=0)
-    spread = np.maximum(columns.std(axis=0), settings.least_spread)
-    scaled = np.clip((columns - middle) / spread, -settings.farthest, settings.farthest)
+    spread = np.maximum(columns.std(axis=0), _LEAST_SPREAD)
+    scaled = np.clip((columns - middle) / spread, -_FARTHEST, _FARTHEST)
     rows = np.column_stack([np.ones(len(scaled)), scaled])
-    prior = np.diag(
-        [1 / settings.chance_sigma**2] + [1 / settings.slope_sigma**2] * columns.shape[1]
-    )
+    prior = np.diag([1 / _CHANCE_SIGMA**2] + [1 / _SLOPE_SIGMA**2] * columns.shape[1])
     right = found.astype(np.float64)
     weights = np.zeros(rows.shape[1])
-    for _ in range(settings.steps):
+    for _ in range(_STEPS):
         chances = _logistic(rows @ weights)
         curvature = (rows * (chances * (1 - chances))[:, None]).T @ rows + prior
         step = np.linalg.solve(curvature, rows.T @ (right - chances) - prior @ weights)
@@ -107,9 +96,7 @@ def fit_recall(columns: Floats, found: Mask, settings: RecallSettings = RecallSe
             break
     chances = _logistic(rows @ weights)
     curvature = (rows * (chances * (1 - chances))[:, None]).T @ rows + prior
-    return Recall(
-        middle, spread, weights, np.linalg.inv(curvature), len(found), int(found.sum()), settings
-    )
+    return Recall(middle, spread, weights, np.linalg.inv(curvature), len(found), int(found.sum()))
 
 
 def map_chances(recall: Recall | None, columns: Floats, hidden: Mask) -> Chances:
@@ -136,3 +123,107 @@ def held_out_chances(columns: Floats, found: Mask, parts: int = 5) -> Floats:
 
 def _logistic(odds: Floats) -> Floats:
     return np.asarray(1.0 / (1.0 + np.exp(-np.clip(odds, -35, 35))), np.float64)
+
+
+@dataclass(frozen=True)
+class SearchFigures:
+    """Of one class over the wanted ground. Chances count unseen ground as 0.
+
+    `pod` with its interval is the chance that one who lay anywhere in the area was found, by all flights together.
+    `swept_m2` is the ground times its chance, summed over the flights: effort adds up, even over the same ground.
+    `coverage` is that over the area, so it may exceed 1. `sweep_width_m` is all ground that the flights saw, within the
+    area or not, times its chance, over the path of all flights; NaN without a path, or where no cell was seen.
+    `random_pod` is what Koopman's formula of random search, 1 - exp(-coverage), makes of it.
+    """
+
+    area_m2: float
+    seen_m2: float
+    pod: float
+    pod_low: float
+    pod_high: float
+    swept_m2: float
+    sweep_width_m: float
+    coverage: float
+    random_pod: float
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A piece of the area with the probability that the missing is in it: POA, POD and POS = POA x POD.
+
+    `left` is the probability that the missing is in it and was not found.
+    """
+
+    name: str
+    poa: float
+    pod: float
+    pos: float
+    left: float
+    area_m2: float
+    seen_m2: float
+
+
+def together(flights: Sequence[Chances]) -> Chances:
+    """One or more flights over the same cells: 1 - prod(1 - p), the flights taken as independent looks.
+
+    What no flight saw stays NaN. The bounds are those of all flights being as bad, or as good, as they may be.
+    """
+    seen = np.any([np.isfinite(each.mean) for each in flights], axis=0)
+    mean, low, high = (
+        np.where(
+            seen,
+            1 - np.prod([1 - np.nan_to_num(getattr(each, name)) for each in flights], axis=0),
+            np.nan,
+        )
+        for name in ("mean", "low", "high")
+    )
+    return Chances(mean, low, high)
+
+
+def figures(
+    flights: Sequence[Chances], wanted: Mask, cell_m: float, path_m: float
+) -> SearchFigures:
+    """The figures of the wanted cells, (N,), of one or more flights; `path_m` is how far their cameras flew in all."""
+    cell_m2 = cell_m**2
+    inside = np.asarray(wanted, bool)
+    area_m2 = float(inside.sum()) * cell_m2
+    total = together(flights)
+    mean, low, high = (np.nan_to_num(each[inside]) for each in (total.mean, total.low, total.high))
+    swept_m2 = sum(float(np.nansum(each.mean[inside])) for each in flights) * cell_m2
+    anywhere_m2 = sum(float(np.nansum(each.mean)) for each in flights) * cell_m2
+    is_seen = any(np.isfinite(each.mean).any() for each in flights)
+    width_m = anywhere_m2 / path_m if path_m > 0 and is_seen else float("nan")
+    coverage = swept_m2 / area_m2 if area_m2 else 0.0
+    pod, pod_low, pod_high = (
+        float(each.mean()) if len(each) else 0.0 for each in (mean, low, high)
+    )
+    return SearchFigures(
+        area_m2,
+        float(np.isfinite(total.mean[inside]).sum()) * cell_m2,
+        pod,
+        pod_low,
+        pod_high,
+        swept_m2,
+        width_m,
+        coverage,
+        float(1 - np.exp(-coverage)),
+    )
+
+
+def segment(
+    name: str, poa: float, chances: Chances, inside: Mask, cell_m: float, area_m2: float
+) -> Segment:
+    """A segment's figures. `inside` (N,) are its cells; ground of it beyond all cells, of `area_m2`, was not seen."""
+    sum_of_chances = float(np.nansum(chances.mean[inside])) * cell_m**2
+    pod = min(1.0, sum_of_chances / area_m2) if area_m2 else 0.0
+    seen_m2 = float(np.isfinite(chances.mean[inside]).sum()) * cell_m**2
+    return Segment(name, poa, pod, poa * pod, poa * (1 - pod), area_m2, min(seen_m2, area_m2))
+
+
+def path_length_m(places_m: Sequence[Floats]) -> float:
+    """The length over ground of a way over places, (2,) or (3,) each, in order."""
+    return (
+        float(np.hypot(*np.diff(np.array(places_m)[:, :2], axis=0).T).sum())
+        if len(places_m) > 1
+        else 0.0
+    )

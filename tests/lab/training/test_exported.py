@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch")
 import onnx
 import onnxruntime
 
-from sorvolo.detection.quantise import quantise
+from sorvolo.lab.training.quantise import quantise
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.lab.thesis.network import thesis_network

@@ -4,7 +4,7 @@ import re
 from pathlib import Path, PurePath
 
 from sorvolo.errors import SettingsError
-from sorvolo.survey.splits import stem_of
+from sorvolo.lab.datasets.splits import stem_of
 
 _NUMBERED = re.compile(
     r"(?P<video>.*?)[ _.\-]*(?:(?<![a-z])(?:frames?|img|image|picture|[if]))?[ _.\-]*\(?\d+\)?[ _.\-]*",

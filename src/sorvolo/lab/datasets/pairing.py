@@ -8,7 +8,7 @@ from sorvolo.errors import InputError
 from sorvolo.lab.datasets.groups import group_of
 from sorvolo.lab.datasets.parsed import Finding
 from sorvolo.lab.datasets.picture_files import PICTURE_ENDINGS, pictures_below
-from sorvolo.survey.splits import frame_number
+from sorvolo.lab.datasets.splits import frame_number
 
 _PICTURE_FOLDERS = frozenset({"images", "jpegimages", "sequences", "pictures", "frames", "photos"})
 

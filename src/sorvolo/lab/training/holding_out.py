@@ -2,7 +2,7 @@
 
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.survey.labels import LabelledSet
-from sorvolo.survey.splits import split_by_blocks, split_by_group
+from sorvolo.lab.datasets.splits import split_by_blocks, split_by_group
 
 _BLOCKS, _GAP = (
     10,

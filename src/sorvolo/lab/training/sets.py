@@ -17,7 +17,7 @@ from sorvolo.lab.training.holding_out import hold_out
 from sorvolo.lab.training.samples import Share
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES
-from sorvolo.survey.splits import shared_groups, shuffled
+from sorvolo.lab.datasets.splits import shared_groups, shuffled
 
 _SMALL = CLASSES[2]
 _LOOKED_AT = 40  # pictures of a set that decide whether it is thermal
