@@ -9,8 +9,8 @@ from toy_models import draw, onnx, rectangle_model, square_model
 
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import find_model
-from sorvolo.lab.training.quantise import pool_before_rounding, quantise
 from sorvolo.errors import InputError, SettingsError
+from sorvolo.lab.training.quantise import pool_before_rounding, quantise
 
 
 def _pictures(count: int) -> list[np.ndarray]:

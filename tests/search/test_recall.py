@@ -4,8 +4,15 @@ import numpy as np
 import pytest
 
 from sorvolo.geometry.calibration_bins import calibration_bins, wilson
-from sorvolo.search.recall import figures, segment, together
-from sorvolo.search.recall import Chances, fit_recall, held_out_chances, map_chances
+from sorvolo.search.recall import (
+    Chances,
+    figures,
+    fit_recall,
+    held_out_chances,
+    map_chances,
+    segment,
+    together,
+)
 
 
 def _tried(count: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

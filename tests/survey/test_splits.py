@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.lab.datasets.splits import frame_number, shared_groups, split_by_blocks, split_by_group
+from sorvolo.survey.labels import LabelledPicture, LabelledSet
 
 NOTHING = np.zeros((0, 4), np.float32)
 SHARES = {"train": 0.7, "val": 0.1, "test": 0.2}

@@ -1,17 +1,17 @@
 """Under which conditions ground was seen: how finely, how often, how sharp, in which light, on what ground."""
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
-from sorvolo.geometry.arrays import Floats, ImageRGB, Mask
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
 from sorvolo.geometry.arrays import Floats, Floats16, ImageRGB, Mask, PointsM, Vector3, frozen
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.level_ground import footprint, is_on_ground
 from sorvolo.geometry.pose import Pose
-
 
 _Grey = NDArray[np.float32]
 

@@ -6,13 +6,13 @@ a logistic function of the conditions, with weights held near zero (Gelman et al
 from the weights' own (Laplace's approximation).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
-from sorvolo.geometry.arrays import Floats, Mask, frozen
-from collections.abc import Sequence
-from sorvolo.geometry.arrays import Floats, Mask
 
+from sorvolo.geometry.arrays import Floats, Mask, frozen
 
 _SLOPE_SIGMA = 0.5  # of a weight, for one standard deviation of its condition
 _CHANCE_SIGMA = 2.5  # of the log odds

@@ -1,8 +1,8 @@
 """Which pictures of a set are held out from training: the same ones whenever share and seed are the same."""
 
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.survey.labels import LabelledSet
 from sorvolo.lab.datasets.splits import split_by_blocks, split_by_group
+from sorvolo.survey.labels import LabelledSet
 
 _BLOCKS, _GAP = (
     10,

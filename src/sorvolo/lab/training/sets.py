@@ -10,6 +10,7 @@ from sorvolo.capture.photos import read_picture
 from sorvolo.detection.light import is_thermal
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.lab.datasets import read_dataset, read_datasets
+from sorvolo.lab.datasets.splits import shared_groups, shuffled
 from sorvolo.lab.simulation.folder import PICTURES_MARK
 from sorvolo.lab.simulation.picture_sets import simulate_pictures
 from sorvolo.lab.simulation.pictures import PictureSettings
@@ -17,7 +18,6 @@ from sorvolo.lab.training.holding_out import hold_out
 from sorvolo.lab.training.samples import Share
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES
-from sorvolo.lab.datasets.splits import shared_groups, shuffled
 
 _SMALL = CLASSES[2]
 _LOOKED_AT = 40  # pictures of a set that decide whether it is thermal

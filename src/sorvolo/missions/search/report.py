@@ -15,9 +15,15 @@ from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.search.measure import MeasuredClass, MeasuredFlight, SearchFrame
 from sorvolo.missions.search.settings import SearchSettings
 from sorvolo.search.cells import Cells
-from sorvolo.search.recall import figures, path_length_m, segment, together
 from sorvolo.search.holes import Holes, Reason, hole_areas_m2, hole_reasons, reasons_together
-from sorvolo.search.recall import Chances, held_out_chances
+from sorvolo.search.recall import (
+    Chances,
+    figures,
+    held_out_chances,
+    path_length_m,
+    segment,
+    together,
+)
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.survey.area import Area, inside_any
 from sorvolo.survey.flight import Site
