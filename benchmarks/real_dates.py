@@ -76,7 +76,7 @@ from sorvolo.missions.compare.flights import compare_flights
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.store.site.archive import Archive
-from sorvolo.survey.frame_rows import FrameRow
+from sorvolo.survey.mosaic import FrameRow
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "real_dates.json"

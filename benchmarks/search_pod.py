@@ -26,11 +26,11 @@ import numpy as np
 from provenance import commit, machine, seeds_or_drawn
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.fusing import is_from_above
-from sorvolo.geometry.calibration_bins import calibration_bins
 from sorvolo.geometry.geodesy import utm_epsg
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.homography import site_from_image_homography
 from sorvolo.geometry.level_ground import footprint
+from sorvolo.geometry.summary import calibration_bins
 from sorvolo.geometry.sun import direction_from_angles
 from sorvolo.lab.simulation.flight import SimulatedFlight, simulate_flight
 from sorvolo.lab.simulation.rendering import render, render_labels

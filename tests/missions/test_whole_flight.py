@@ -22,7 +22,7 @@ from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.findings import CompareUpdate, ViewStatus
-from sorvolo.survey.frame_rows import FrameRow
+from sorvolo.survey.mosaic import FrameRow
 
 
 class Flown:

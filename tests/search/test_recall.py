@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sorvolo.geometry.calibration_bins import calibration_bins, wilson
+from sorvolo.geometry.summary import calibration_bins, wilson
 from sorvolo.search.recall import (
     Chances,
     figures,

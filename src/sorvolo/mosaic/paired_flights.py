@@ -8,8 +8,7 @@ import numpy as np
 
 from sorvolo.geometry.arrays import Matrix3
 from sorvolo.geometry.homography import apply_homography, fit_similarity
-from sorvolo.survey.frame_rows import FrameRow
-from sorvolo.survey.mosaic import Status
+from sorvolo.survey.mosaic import FrameRow, Status
 
 _NOT_PLACED = {"not-aligned", "outside", "lost", Status.REJECTED.value}
 _SAME_FLIGHT_NS = 60 * 10**9  # clocks differ, flights lie hours apart

@@ -20,7 +20,7 @@ from pycocotools.cocoeval import COCOeval
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import BoxesPx, Counts, Floats, Mask, Rows
 from sorvolo.geometry.box_overlap import iou_matrix
-from sorvolo.geometry.calibration_bins import CalibrationBin, calibration_bins
+from sorvolo.geometry.summary import CalibrationBin, calibration_bins
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import Detections
 

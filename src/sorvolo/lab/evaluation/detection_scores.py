@@ -7,7 +7,7 @@ import numpy as np
 
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Counts, Floats, Rows
-from sorvolo.geometry.calibration_bins import CalibrationBin
+from sorvolo.geometry.summary import CalibrationBin
 from sorvolo.lab.evaluation.detection_metrics import (
     IOUS,
     SIZES_M,

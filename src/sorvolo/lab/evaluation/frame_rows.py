@@ -11,7 +11,7 @@ from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.mosaic.paired_flights import PairedFlights, true_names
 from sorvolo.store.site.catalogue_place import is_site
 from sorvolo.survey.flight import Site
-from sorvolo.survey.frame_rows import FrameRow
+from sorvolo.survey.mosaic import FrameRow
 
 _NO_OUTLINE = [[float("nan"), float("nan")]] * 4
 

@@ -38,8 +38,7 @@ from sorvolo.registration.features import gray_from_rgb
 from sorvolo.store.rasters.geotiff import Raster, read_raster
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.flight import Site
-from sorvolo.survey.frame_rows import FrameRow
-from sorvolo.survey.mosaic import Status
+from sorvolo.survey.mosaic import FrameRow, Status
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.tiling import TASK
-from sorvolo.geometry.calibration_bins import calibration_bins, wilson
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.planning import BOTTOM_CRITICAL_M
-from sorvolo.geometry.summary import median_of_known
+from sorvolo.geometry.summary import calibration_bins, median_of_known, wilson
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.search.measure import MeasuredClass, MeasuredFlight, SearchFrame
 from sorvolo.missions.search.settings import SearchSettings
