@@ -18,8 +18,8 @@ from sorvolo.lab.training.exported import load_exported
 from sorvolo.lab.training.faster_rcnn import FasterRCNN
 from sorvolo.lab.training.onnx_export import check_export, export_onnx
 from sorvolo.lab.training.presets import accurate, fast
-from sorvolo.lab.training.quantise import quantise
 from sorvolo.lab.training.proposals import Stem
+from sorvolo.lab.training.quantise import quantise
 from sorvolo.lab.training.resnet import ResNet50
 
 _CLASSES = ("person", "car")
