@@ -109,9 +109,7 @@ class PlacedFrame:
     status: Status
     reason: str
     camera: Camera
-    site_from_camera: (
-        Pose | None
-    )  # None: the method (thesis) or the status (rejected) has no 6-DoF pose
+    site_from_camera: Pose | None  # None: a rejected frame, or a method without 6-DoF poses
     site_from_image: Matrix3
     outline_m: PointsM
     residual_px: float
