@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from sorvolo.cli.main import main
-from sorvolo.cluster.batch import TABLE, BatchTable, Row
-from sorvolo.cluster.executors import Ending
+from sorvolo.cluster.batch import TABLE, BatchRow, BatchTable
+from sorvolo.cluster.executors import TryEnding
 from sorvolo.cluster.flights import Scouted, find_flights, sites_of
 from sorvolo.errors import InputError, StoreError
 from sorvolo.store.exports.detection_files import claimed_folder
@@ -116,9 +116,9 @@ def test_by_place_flights_join_sites_that_exist_and_stay_where_they_are() -> Non
     assert found == {"first": "its-own", "later": "its-own"}
 
 
-def _row(fingerprint: str, **values: object) -> Row:
+def _row(fingerprint: str, **values: object) -> BatchRow:
     scouted = Scouted(fingerprint, 9, 1, (1.0, 2.0, 3.0, 4.0))
-    row = Row(f"/flights/{fingerprint}.mp4", "map", "stamp", "request", scouted)
+    row = BatchRow(f"/flights/{fingerprint}.mp4", "map", "stamp", "request", scouted)
     return replace(row, **values)  # type: ignore[arg-type]
 
 
@@ -178,11 +178,11 @@ def test_roots_that_cannot_be_used(tmp_path: Path) -> None:
 
 
 def test_the_tries_of_a_flight_add_up() -> None:
-    crashed = Ending("crashed", "killed", "", 3.0, 2.0, 900.0, "one")
+    crashed = TryEnding("crashed", "killed", "", 3.0, 2.0, 900.0, "one")
     row = _row("a", tries=1).after(crashed)
     assert (row.state, row.crashes) == ("waiting", 1)
     assert row.after(crashed).state == "set aside"
-    row = row.after(Ending("done", "fine", "a", 4.0, 3.0, 400.0, "two"))
+    row = row.after(TryEnding("done", "fine", "a", 4.0, 3.0, 400.0, "two"))
     assert (row.seconds, row.cpu_s, row.peak_memory_mb, row.host, row.flight) == (
         7.0,
         5.0,

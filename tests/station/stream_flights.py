@@ -8,7 +8,7 @@ from pathlib import Path
 import av
 import numpy as np
 
-from sorvolo.station.footage import Footage, Format, Piece
+from sorvolo.station.footage import Footage, FootagePiece, Format
 from sorvolo.station.messages import Kind
 
 RATE = 10
@@ -33,7 +33,7 @@ class HeldFootage:
         """See `Footage`."""
         return self._footage.format
 
-    def pieces(self, begin_us: int, stop: threading.Event) -> Iterator[Piece]:
+    def pieces(self, begin_us: int, stop: threading.Event) -> Iterator[FootagePiece]:
         """See `Footage`."""
         pictures = 0
         for each in self._footage.pieces(begin_us, stop):

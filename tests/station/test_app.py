@@ -12,7 +12,7 @@ from starlette.testclient import TestClient
 
 from sorvolo.errors import SettingsError
 from sorvolo.station.app import station_app
-from sorvolo.station.pyramid import BytesCache, Pyramid
+from sorvolo.station.pyramid import BytesCache, TilePyramid
 from sorvolo.station.settings import StationSettings
 from sorvolo.station.sites import bounds_lonlat
 from sorvolo.station.tiles import render
@@ -183,7 +183,9 @@ def test_a_small_map_is_shown_from_afar_without_gathering_the_country(tmp_path: 
         archive.create_site(SITE)
         grid = archive.site_grid()
     picture = np.full((512, 512, 4), 200, np.uint8)
-    state = Pyramid(_OneTile({(1, 1): picture}), 512, BytesCache(10**8, lambda each: each.nbytes))  # type: ignore[arg-type]
+    state = TilePyramid(
+        _OneTile({(1, 1): picture}), 512, BytesCache(10**8, lambda each: each.nbytes)
+    )  # type: ignore[arg-type]
     west, south, east, north = bounds_lonlat(state.corner_tiles, grid) or [0.0] * 4
     z, x, y = (int(each) for each in tile_of((west + east) / 2, (south + north) / 2, 16).split("/"))
     tracemalloc.start()

@@ -5,16 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sorvolo.station.pyramid import BytesCache, Pyramid, halved
+from sorvolo.station.pyramid import BytesCache, TilePyramid, halved
 from sorvolo.station.tiles import MapOverview
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.tiles import TileView
 
 
-def pyramid(archive: Archive, version: int = 2) -> Pyramid:
+def pyramid(archive: Archive, version: int = 2) -> TilePyramid:
     """Of the site's version, computed from its tiles."""
     cache = BytesCache[str, np.ndarray](10**9, lambda each: int(each.nbytes))
-    return Pyramid(archive.tiles(version), 512, cache)
+    return TilePyramid(archive.tiles(version), 512, cache)
 
 
 def test_halved_tiles_average_the_ground_and_keep_its_edge(made_site: Path) -> None:

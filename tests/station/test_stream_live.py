@@ -15,7 +15,7 @@ from test_stream_messages import units
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.errors import InputError
 from sorvolo.station.client import StreamClient, StreamSettings, remains_of, stream_url
-from sorvolo.station.footage import ArrivalClock, Piece, Timeline, open_footage
+from sorvolo.station.footage import ArrivalClock, FootagePiece, Timeline, open_footage
 from sorvolo.station.messages import Hello, Kind
 from sorvolo.station.spool import Spool
 from sorvolo.station.transport_stream import FlightFile
@@ -62,7 +62,7 @@ class Camera:
                 self.off.wait(self._pause_s)
 
 
-def taken(port: int, seconds: float) -> tuple[list[Piece], list[str]]:
+def taken(port: int, seconds: float) -> tuple[list[FootagePiece], list[str]]:
     """What a client takes from the camera in so many seconds, and what it noticed."""
     stop = threading.Event()
     footage = open_footage(

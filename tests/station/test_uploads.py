@@ -21,7 +21,7 @@ from starlette.testclient import TestClient
 
 from sorvolo.station import check_upload, uploads
 from sorvolo.station.app import station_app
-from sorvolo.station.check_upload import Refusal, look
+from sorvolo.station.check_upload import UploadRefusal, look
 from sorvolo.station.problems import Problem
 from sorvolo.station.runs import Run
 from sorvolo.station.settings import StationLimits, StationSettings
@@ -219,7 +219,7 @@ def test_the_floor_holds_for_every_piece_and_for_what_is_unpacked(
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=GIGA))
     assert send(client, address, 0, b"1").status_code == 507
-    with pytest.raises(Refusal, match="are there; delete"):
+    with pytest.raises(UploadRefusal, match="are there; delete"):
         look(part, tmp_path / "photos", GIGA, 2 * GIGA)
     assert not (tmp_path / "photos").exists()
 
@@ -308,7 +308,7 @@ def test_zip_files_made_to_do_harm(tmp_path: Path, files: dict[str, bytes], word
     """Zip slip, disguises, bombs: refused, and nothing is written outside."""
     target = tmp_path / "deep" / "photos"
     target.parent.mkdir()
-    with pytest.raises(Refusal, match=words):
+    with pytest.raises(UploadRefusal, match=words):
         look(packed(tmp_path / "part", files), target, GIGA)
     outside = [
         each for each in tmp_path.rglob("*") if each.is_file() and target not in each.parents
@@ -320,16 +320,16 @@ def test_links_in_zip_files_and_sizes_that_lie(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A link could lead anywhere; what an archive announces is not trusted."""
-    with pytest.raises(Refusal, match="link"):
+    with pytest.raises(UploadRefusal, match="link"):
         look(
             packed(tmp_path / "part", {"a.jpg": b"/etc/passwd"}, mode=0o120777),
             tmp_path / "photos",
             GIGA,
         )
-    with pytest.raises(Refusal, match="taken"):
+    with pytest.raises(UploadRefusal, match="taken"):
         look(packed(tmp_path / "large", {"a.jpg": photo(900)}), tmp_path / "photos", 100)
     monkeypatch.setattr(check_upload, "_MOST_PIXELS", 100)
-    with pytest.raises(Refusal, match="pixels"):
+    with pytest.raises(UploadRefusal, match="pixels"):
         look(packed(tmp_path / "wide", {"a.jpg": photo()}), tmp_path / "wide-photos", GIGA)
 
 
@@ -345,7 +345,7 @@ def test_links_in_zip_files_and_sizes_that_lie(
 def test_playlists_named_as_videos(tmp_path: Path, data: bytes) -> None:
     """FFmpeg would open what they name."""
     (tmp_path / "part").write_bytes(data)
-    with pytest.raises(Refusal):
+    with pytest.raises(UploadRefusal):
         look(tmp_path / "part", tmp_path / "flight.mp4", GIGA)
 
 

@@ -20,7 +20,7 @@ from sorvolo.errors import SettingsError
 from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
-    from sorvolo.cluster.batch import BatchReport, BatchUpdate, Row
+    from sorvolo.cluster.batch import BatchReport, BatchRow, BatchUpdate
 
 _MOST_ROWS = 40  # of a table on a terminal; longer ones show what failed first; by choice
 _COLOURS = {
@@ -153,7 +153,7 @@ def _show_update(progress: ProgressReport, update: "BatchUpdate") -> None:
     progress.show(update.task, update.done, update.total, words)
 
 
-def _state_name(row: "Row", is_known: bool) -> str:
+def _state_name(row: "BatchRow", is_known: bool) -> str:
     if row.state == "waiting":
         return "again" if row.tries else "waiting"
     return "known" if is_known and row.state == "done" else row.state

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 import sorvolo
-from sorvolo.cluster.executors import LOCK, Ending, Executor
+from sorvolo.cluster.executors import LOCK, Executor, TryEnding
 from sorvolo.cluster.flights import (
-    FoundFlight,
+    FlightFiles,
     Scouted,
     existing_site,
     find_flights,
@@ -79,7 +79,7 @@ class BatchSettings:
 
 
 @dataclass(frozen=True)
-class Row:
+class BatchRow:
     """One flight: its files, its site, and what became of it.
 
     `request` is what is asked for, `stamp` its files', `tries` how often it was begun for this request, of which
@@ -110,7 +110,7 @@ class Row:
         """The mission and the flight, by its fingerprint, or by its path while that is unknown."""
         return self.mission, self.scouted.fingerprint if self.scouted else self.source
 
-    def after(self, ending: Ending) -> Self:
+    def after(self, ending: TryEnding) -> Self:
         """The row after a try; it waits for another one after its first crash."""
         crashes = self.crashes + (ending.outcome == "crashed")
         state, words = ending.outcome, ending.words
@@ -132,9 +132,9 @@ class Row:
 
 
 class BatchTable:
-    """The rows of a folder of sites, by `Row.key`. Only `put` changes them. A context manager; made by `open`."""
+    """The rows of a folder of sites, by `BatchRow.key`. Only `put` changes them. A context manager; made by `open`."""
 
-    def __init__(self, root: Path, lock: int, rows: dict[tuple[str, str], Row]) -> None:
+    def __init__(self, root: Path, lock: int, rows: dict[tuple[str, str], BatchRow]) -> None:
         self.root, self.lock, self._rows = root, lock, rows
         self._file = (root / TABLE).open("ab")
 
@@ -177,14 +177,14 @@ class BatchTable:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def __iter__(self) -> Iterator[Row]:
+    def __iter__(self) -> Iterator[BatchRow]:
         return iter(list(self._rows.values()))
 
-    def get(self, key: tuple[str, str]) -> Row | None:
+    def get(self, key: tuple[str, str]) -> BatchRow | None:
         """The newest row of a flight."""
         return self._rows.get(key)
 
-    def put(self, row: Row) -> Row:
+    def put(self, row: BatchRow) -> BatchRow:
         """Keep the newest row of a flight: on the disk when this returns; the row as it is kept."""
         row = replace(row, changed_utc=utc_now())
         with writing(self.root / TABLE):
@@ -217,9 +217,9 @@ def _lock(root: Path) -> int:
     return lock
 
 
-def _read(path: Path) -> dict[tuple[str, str], Row]:
+def _read(path: Path) -> dict[tuple[str, str], BatchRow]:
     """The newest row of each flight; a last line that a kill tore is passed over."""
-    rows: dict[tuple[str, str], Row] = {}
+    rows: dict[tuple[str, str], BatchRow] = {}
     try:
         lines = path.read_bytes().split(b"\n")
     except FileNotFoundError:
@@ -234,7 +234,7 @@ def _read(path: Path) -> dict[tuple[str, str], Row]:
             elif plain is not None:
                 if (seen := plain["scouted"]) is not None:
                     seen = Scouted(**{**seen, "box": tuple(seen["box"]) if seen["box"] else None})
-                row = Row(**{**plain, "scouted": seen})
+                row = BatchRow(**{**plain, "scouted": seen})
                 rows.pop((row.mission, row.source), None)  # from when its files could not be read
                 rows[row.key] = row
         except (ValueError, TypeError, KeyError) as error:
@@ -268,7 +268,7 @@ class BatchUpdate:
     task: str
     done: int
     total: int
-    row: Row | None = None
+    row: BatchRow | None = None
     is_known: bool = False  # it was through before this batch
     running: tuple[str, ...] = ()
 
@@ -277,7 +277,7 @@ class BatchUpdate:
 class BatchReport:
     """All flights of a batch and their results; those in `known` were through before it began."""
 
-    rows: tuple[Row, ...]
+    rows: tuple[BatchRow, ...]
     known: frozenset[tuple[str, str]]
     seconds: float
     tries: int
@@ -327,7 +327,7 @@ def run_batch(
         yield BatchUpdate("looking into flights", 0, len(queues))
         looked = {row.source: row for row in given_up}
 
-        def inspecting(row: Row) -> Order:
+        def inspecting(row: BatchRow) -> Order:
             return Order("inspect", "", row.source, camera=settings.camera)
 
         for row, ending in _run(queues, inspecting, executor):
@@ -348,7 +348,7 @@ def run_batch(
         rows = [current.get(row.key, row) if row.state != "duplicate" else row for row in rows]
         known = frozenset(row.key for row in rows if row.state in FINAL and row.key in through)
 
-        def update(row: Row, *, is_known: bool = False) -> BatchUpdate:
+        def update(row: BatchRow, *, is_known: bool = False) -> BatchUpdate:
             done = sum(each.state not in ("waiting", "running") for each in current.values())
             copies = sum(each.state == "duplicate" for each in rows)
             running = [
@@ -380,14 +380,16 @@ def run_batch(
 
 
 def _run(
-    queues: Mapping[str, Sequence[Row]], order_of: Callable[[Row], Order], executor: Executor
-) -> Iterator[tuple[Row, Ending | None]]:
+    queues: Mapping[str, Sequence[BatchRow]],
+    order_of: Callable[[BatchRow], Order],
+    executor: Executor,
+) -> Iterator[tuple[BatchRow, TryEnding | None]]:
     """Run the rows of each queue one after another, queues beside each other: each row as it begins, and as it ends.
 
     A row whose process crashed is tried once more.
     """
     waiting = {name: list(rows) for name, rows in queues.items()}
-    running: dict[str, Row] = {}
+    running: dict[str, BatchRow] = {}
     while waiting or running:
         for name in [name for name in waiting if name not in running]:
             if len(running) >= executor.slots:
@@ -406,7 +408,7 @@ def _run(
         yield row, ending
 
 
-def _order(row: Row, root: Path, settings: BatchSettings) -> Order:
+def _order(row: BatchRow, root: Path, settings: BatchSettings) -> Order:
     """One try at a flight; the first flight over a site is mapped where flights are compared."""
     site, mission = root.resolve() / row.site, settings.mission
     if mission == "compare":
@@ -421,10 +423,10 @@ def _order(row: Row, root: Path, settings: BatchSettings) -> Order:
 
 
 def _new_row(
-    found: FoundFlight,
+    found: FlightFiles,
     settings: BatchSettings,
     seen: Mapping[tuple[str, str], Scouted],
-) -> Row:
+) -> BatchRow:
     """A flight as it is asked for now; `scouted` where somebody looked into the same files before."""
     camera = Path(settings.camera)
     facts = None
@@ -433,18 +435,18 @@ def _new_row(
     wish = replace(settings, by_place=False, retries=False)
     text = repr((sorvolo.__version__, software(), found.stamp, wish, facts))
     request = hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:32]
-    row = Row(str(found.path), settings.mission, found.stamp, request, None)
+    row = BatchRow(str(found.path), settings.mission, found.stamp, request, None)
     if found.why_not:
         return replace(row, state="skipped", words=found.why_not)
     return replace(row, scouted=seen.get((row.source, row.stamp)))
 
 
-def _new_row_of(row: Row) -> Row:
+def _new_row_of(row: BatchRow) -> BatchRow:
     """The row before it was begun."""
-    return Row(row.source, row.mission, row.stamp, row.request, row.scouted)
+    return BatchRow(row.source, row.mission, row.stamp, row.request, row.scouted)
 
 
-def _continued(fresh: Row, table: BatchTable, settings: BatchSettings) -> Row:
+def _continued(fresh: BatchRow, table: BatchTable, settings: BatchSettings) -> BatchRow:
     """The row to go on with: the earlier one where the same is asked for and stands, else one that waits."""
     before = table.get(fresh.key)
     if before is None or fresh.state != "waiting":
@@ -461,7 +463,7 @@ def _continued(fresh: Row, table: BatchTable, settings: BatchSettings) -> Row:
     )
 
 
-def _has_results(row: Row, root: Path) -> bool:
+def _has_results(row: BatchRow, root: Path) -> bool:
     """Whether the site has the flight, or the folder a complete watch of it."""
     if row.scouted is None:
         return False
@@ -472,9 +474,9 @@ def _has_results(row: Row, root: Path) -> bool:
     return site is not None and row.scouted.fingerprint in site.flights
 
 
-def _without_duplicates(rows: Sequence[Row], through: set[tuple[str, str]]) -> list[Row]:
+def _without_duplicates(rows: Sequence[BatchRow], through: set[tuple[str, str]]) -> list[BatchRow]:
     """Of rows that are one flight, the one with most frames, and of these the first; the others name it."""
-    own: dict[tuple[str, str], Row] = {}
+    own: dict[tuple[str, str], BatchRow] = {}
     for row in rows:
         if row.key not in own or _frames(row) > _frames(own[row.key]):
             own[row.key] = row
@@ -488,7 +490,7 @@ def _without_duplicates(rows: Sequence[Row], through: set[tuple[str, str]]) -> l
     return named
 
 
-def _place(rows: Sequence[Row], table: BatchTable, settings: BatchSettings) -> list[Row]:
+def _place(rows: Sequence[BatchRow], table: BatchTable, settings: BatchSettings) -> list[BatchRow]:
     """The rows with the site of each flight, or the folder of its watch; one that has a place already stays there."""
     is_watch, root = settings.mission == "watch", table.root
     flights = [(Path(row.source), row.scouted) for row in rows if row.scouted is not None]
@@ -515,9 +517,9 @@ def _place(rows: Sequence[Row], table: BatchTable, settings: BatchSettings) -> l
     ]
 
 
-def _moment(row: Row) -> tuple[int, str]:
+def _moment(row: BatchRow) -> tuple[int, str]:
     return (row.scouted.start_ns if row.scouted is not None else 0), row.source
 
 
-def _frames(row: Row) -> int:
+def _frames(row: BatchRow) -> int:
     return row.scouted.frames if row.scouted is not None else 0

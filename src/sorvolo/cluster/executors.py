@@ -29,7 +29,7 @@ _REACH_S = 8.0  # for a connection to a cluster's head, which takes milliseconds
 
 
 @dataclass(frozen=True)
-class Ending:
+class TryEnding:
     """How a mission's process ended, and what it took: `outcome` is "done", "doubtful", "failed" or "crashed"."""
 
     outcome: str
@@ -50,7 +50,7 @@ class Executor(Protocol):
     def start(self, key: str, order: Order) -> None:
         """Start a mission."""
 
-    def next_ended(self) -> tuple[str, Ending]:
+    def next_ended(self) -> tuple[str, TryEnding]:
         """Wait for a mission to end. Raises SorvoloError where the executor is gone."""
 
 
@@ -59,7 +59,7 @@ def run_order(
     stall_s: float = STALL_S,
     lock: int | None = None,
     started: Callable[["subprocess.Popen[bytes]"], None] = lambda _: None,
-) -> Ending:
+) -> TryEnding:
     """Do an order in a process of its own, which keeps the descriptor `lock` open, and wait for its end."""
     began_s, last = time.monotonic(), dict[str, Any]()
     inspected: Mapping[str, Any] = {}
@@ -91,7 +91,7 @@ def run_order(
         process.stdout.close()
         outcome, words = _outcome(last, process.returncode, why, log)
     kilobytes = usage.ru_maxrss / (1024.0 if sys.platform == "darwin" else 1.0)
-    return Ending(
+    return TryEnding(
         outcome,
         words,
         str(last.get("data", {}).get("flight", "")),
@@ -151,7 +151,7 @@ class LocalExecutor:
         self.slots, self._lock, self._stall_s = slots, lock, stall_s
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
         self._threads: dict[str, threading.Thread] = {}
-        self._ended: queue.SimpleQueue[tuple[str, Ending]] = queue.SimpleQueue()
+        self._ended: queue.SimpleQueue[tuple[str, TryEnding]] = queue.SimpleQueue()
 
     def __enter__(self) -> Self:
         return self
@@ -177,7 +177,7 @@ class LocalExecutor:
         self._threads[key].start()
         has_begun.wait()
 
-    def next_ended(self) -> tuple[str, Ending]:
+    def next_ended(self) -> tuple[str, TryEnding]:
         """Wait for a mission to end."""
         key, ending = self._ended.get()
         del self._threads[key], self.processes[key]
@@ -203,7 +203,7 @@ class RayExecutor:
             )
             self._running[key] = task.remote(order, self._root, sorvolo.__version__)
 
-    def next_ended(self) -> tuple[str, Ending]:
+    def next_ended(self) -> tuple[str, TryEnding]:
         """Wait for a mission to end. Raises SettingsError where the cluster is gone."""
         with self._cluster():
             ended, _ = self._ray.wait(list(self._running.values()), num_returns=1)
@@ -215,12 +215,12 @@ class RayExecutor:
                 if isinstance(error.cause, StoreError):  # what every flight would meet there
                     raise error.cause from None
                 words = f"{type(error.cause).__name__}: {error.cause}"
-                return key, Ending("crashed", f"its task failed ({words[:300]})")
+                return key, TryEnding("crashed", f"its task failed ({words[:300]})")
             except (
                 self._ray.exceptions.WorkerCrashedError,
                 self._ray.exceptions.NodeDiedError,
             ) as error:
-                return key, Ending("crashed", f"its machine was lost ({type(error).__name__})")
+                return key, TryEnding("crashed", f"its machine was lost ({type(error).__name__})")
 
     def end(self) -> None:
         """End what runs; a mission continues from its journal when it is asked for again."""
@@ -292,7 +292,7 @@ def _is_started() -> bool:
     return Path(os.environ.get("RAY_TMPDIR", "/tmp"), "ray", "ray_current_cluster").is_file()
 
 
-def _run_there(order: Order, root: str, version: str) -> Ending:
+def _run_there(order: Order, root: str, version: str) -> TryEnding:
     """On a machine of the cluster: the mission in a process of its own, which ends with Ray's worker.
 
     Raises StoreError on a machine with another Sorvolo, or without the batch's disk.

@@ -26,7 +26,7 @@ Box = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
-class FoundFlight:
+class FlightFiles:
     """A video, or a folder of photos; `stamp` changes with its files. `why_not`: why it is no flight after all."""
 
     path: Path
@@ -34,19 +34,19 @@ class FoundFlight:
     why_not: str = ""
 
 
-def find_flights(places: Sequence[Path], root: Path) -> list[FoundFlight]:
+def find_flights(places: Sequence[Path], root: Path) -> list[FlightFiles]:
     """Every video and every folder of photos in these folders and below, by path.
 
     Hidden folders, links to folders, folders of sites and watches, and `root` are passed over. A place may also be
     a video. Raises InputError for a place that is not there, or when there is no flight at all.
     """
-    found: dict[Path, FoundFlight] = {}
+    found: dict[Path, FlightFiles] = {}
     files = 0
     for place in places:
         if not place.exists():
             raise InputError(f"no such folder: {place}; folders with flights were needed")
         if place.is_file():
-            found[place.resolve()] = FoundFlight(place.resolve(), _stamp([place]))
+            found[place.resolve()] = FlightFiles(place.resolve(), _stamp([place]))
             continue
         for folder, paths in _folders(place.resolve(), root.resolve()):
             files += len(paths)
@@ -54,10 +54,10 @@ def find_flights(places: Sequence[Path], root: Path) -> list[FoundFlight]:
             photos = [path for path in paths if path.suffix.lower() in _PHOTOS]
             beside = sorted({*paths} - {*videos, *photos})  # a video's telemetry may be here
             for path in videos:
-                found[path] = FoundFlight(path, _stamp([path, *beside]))
+                found[path] = FlightFiles(path, _stamp([path, *beside]))
             if photos:
                 few = f"a single photo ({photos[0].name}): a flight needs 2 or more"
-                found[folder] = FoundFlight(folder, _stamp(photos), few if not photos[1:] else "")
+                found[folder] = FlightFiles(folder, _stamp(photos), few if not photos[1:] else "")
     if all(flight.why_not for flight in found.values()):
         raise InputError(
             f"no flights among {counted(files, 'file')} in {', '.join(map(str, places))}: videos, or folders with two "

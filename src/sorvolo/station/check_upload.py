@@ -41,12 +41,12 @@ _PLAIN_KINDS = (0, stat.S_IFREG, stat.S_IFDIR)  # 0: packed where files have no 
 _SAFE = re.compile(r"[^\w.() -]", re.ASCII)
 
 
-class Refusal(Exception):
+class UploadRefusal(Exception):
     """What is wrong with the upload."""
 
 
 def look(part: Path, target: Path, most_bytes: int, keep_free_bytes: int = 0) -> dict[str, Any]:
-    """What an upload holds; photos are unpacked into the folder `target`. Raises Refusal."""
+    """What an upload holds; photos are unpacked into the folder `target`. Raises UploadRefusal."""
     ending = target.suffix.lower()
     if ending in _CONTAINERS:
         return _video(part, _CONTAINERS[ending])
@@ -55,9 +55,9 @@ def look(part: Path, target: Path, most_bytes: int, keep_free_bytes: int = 0) ->
     if head[:4] == b"PK\x03\x04":
         return _photos(part, target, most_bytes, keep_free_bytes)
     if not ending:
-        raise Refusal("it is no zip file; pack the photos with zip")
+        raise UploadRefusal("it is no zip file; pack the photos with zip")
     if b"\0" in head:
-        raise Refusal("it is no text; telemetry and camera files are")
+        raise UploadRefusal("it is no text; telemetry and camera files are")
     return {"kind": "text"}
 
 
@@ -67,18 +67,18 @@ def _video(part: Path, container: str) -> dict[str, Any]:
     with part.open("rb") as file:
         head = file.read(16)
     if not _has_signature(head, container):
-        raise Refusal(f"its content is no {container} video, whatever its name is")
+        raise UploadRefusal(f"its content is no {container} video, whatever its name is")
     try:
         # the demuxer is given: a playlist or a list of files in disguise would make FFmpeg open other things
         with av.open(str(part), format=container, options={"protocol_whitelist": "file"}) as video:
             if not video.streams.video:
-                raise Refusal("it has no pictures; was the upload cut off before it ended?")
+                raise UploadRefusal("it has no pictures; was the upload cut off before it ended?")
             stream = video.streams.video[0]
             if stream.codec_context is None:  # announced by a head whose body is missing
-                raise Refusal("no picture in it can be decoded; was it cut off?")
+                raise UploadRefusal("no picture in it can be decoded; was it cut off?")
             width_px, height_px = stream.codec_context.width, stream.codec_context.height
             if not 0 < width_px * height_px <= _MOST_PIXELS:
-                raise Refusal(
+                raise UploadRefusal(
                     f"its pictures have {width_px} x {height_px} pixels, at most {_MOST_PIXELS:,} are taken"
                 )
             next(video.decode(stream))
@@ -97,9 +97,9 @@ def _video(part: Path, container: str) -> dict[str, Any]:
                 "missing_bytes": max(0, whole_bytes - part.stat().st_size),
             }  # a flight that was cut is still one
     except StopIteration:
-        raise Refusal("no picture in it can be decoded; was it cut off?") from None
+        raise UploadRefusal("no picture in it can be decoded; was it cut off?") from None
     except (av.FFmpegError, OSError) as error:
-        raise Refusal(
+        raise UploadRefusal(
             f"it cannot be read as a video ({error.strerror}); was the file cut off?"
         ) from error
 
@@ -129,33 +129,33 @@ def _photos(part: Path, target: Path, most_bytes: int, keep_free_bytes: int) -> 
                 if path.suffix.lower() in _PHOTOS:
                     _check_picture(path)
     except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
-        raise Refusal(f"it cannot be unpacked ({error}); was the file cut off?") from error
+        raise UploadRefusal(f"it cannot be unpacked ({error}); was the file cut off?") from error
     except OSError as error:
-        raise Refusal(
+        raise UploadRefusal(
             f"it cannot be unpacked here ({error.strerror}); check the station's disk"
         ) from error
     photos = sum(Path(name).suffix.lower() in _PHOTOS for name in taken)
     if not photos:
-        raise Refusal("there is no photo in it")
+        raise UploadRefusal("there is no photo in it")
     return {"kind": "photos", "photos": photos}
 
 
 def _demand_room(part: Path, wanted_bytes: int) -> None:
     free_bytes = shutil.disk_usage(part.parent).free
     if wanted_bytes > free_bytes:
-        raise Refusal(
+        raise UploadRefusal(
             f"unpacked it needs {wanted_bytes / 1e9:.1f} GB with what stays free, {free_bytes / 1e9:.1f} GB are there; "
             "delete uploads or flights that you no longer need, and upload it again"
         )
 
 
 def _entries(archive: zipfile.ZipFile, most_bytes: int) -> Iterator[zipfile.ZipInfo]:
-    """The files in it that are wanted, others left out. Raises Refusal for what was made to do harm."""
+    """The files in it that are wanted, others left out. Raises UploadRefusal for what was made to do harm."""
     entries = archive.infolist()
     if len(entries) > _MOST_FILES:
-        raise Refusal(f"{len(entries)} files are in it, at most {_MOST_FILES} are taken")
+        raise UploadRefusal(f"{len(entries)} files are in it, at most {_MOST_FILES} are taken")
     if sum(each.file_size for each in entries) > most_bytes:
-        raise Refusal(
+        raise UploadRefusal(
             f"unpacked it would have more than the {most_bytes / 1e9:.0f} GB that are taken"
         )
     for each in entries:
@@ -167,16 +167,18 @@ def _entries(archive: zipfile.ZipFile, most_bytes: int) -> Iterator[zipfile.ZipI
 
 
 def _demand_harmless(entry: zipfile.ZipInfo, path: PurePosixPath) -> None:
-    """Raise Refusal for a file that leads outside, is a link, is encrypted, or unpacks to more than a photo does."""
+    """Raise UploadRefusal for a file that leads outside, is a link, is encrypted, or unpacks to more than a photo does."""
     name = repr(entry.filename[:80])
     if path.is_absolute() or ".." in path.parts or re.match(r"[A-Za-z]:", entry.filename):
-        raise Refusal(f"the name {name} in it leads outside; pack the photos' folder itself")
+        raise UploadRefusal(f"the name {name} in it leads outside; pack the photos' folder itself")
     if stat.S_IFMT(entry.external_attr >> 16) not in _PLAIN_KINDS:
-        raise Refusal(f"{name} in it is a link or no plain file")
+        raise UploadRefusal(f"{name} in it is a link or no plain file")
     if entry.flag_bits & 1:
-        raise Refusal("it is encrypted; pack it without a password")
+        raise UploadRefusal("it is encrypted; pack it without a password")
     if entry.file_size > max(1_000_000, _MOST_RATIO * max(entry.compress_size, 1)):
-        raise Refusal(f"{name} in it would unpack to {entry.file_size / 1e6:.0f} MB: no photo does")
+        raise UploadRefusal(
+            f"{name} in it would unpack to {entry.file_size / 1e6:.0f} MB: no photo does"
+        )
 
 
 def _free_name(name: str, taken: dict[str, Path]) -> str:
@@ -197,13 +199,13 @@ def _unpacked(packed: IO[bytes], path: Path, left: int) -> int:
         while chunk := packed.read(1 << 20):
             count += len(chunk)
             if count > left:
-                raise Refusal("unpacked it has more bytes than it announces")
+                raise UploadRefusal("unpacked it has more bytes than it announces")
             file.write(chunk)
     return count
 
 
 def _check_picture(path: Path) -> None:
-    """Raise Refusal unless the file is a picture of a size that a camera has; only its head is read."""
+    """Raise UploadRefusal unless the file is a picture of a size that a camera has; only its head is read."""
     from PIL import Image, UnidentifiedImageError
 
     with path.open("rb") as file:
@@ -214,7 +216,7 @@ def _check_picture(path: Path) -> None:
         if not any(
             head[at : at + len(sign)] == sign for at, sign in _SIGNATURES[path.suffix.lower()]
         ):
-            raise Refusal(
+            raise UploadRefusal(
                 f"{path.name} is no {path.suffix[1:].upper()} picture, whatever its name is"
             )
         return
@@ -228,11 +230,11 @@ def _check_picture(path: Path) -> None:
         SyntaxError,
         Image.DecompressionBombError,
     ) as error:
-        raise Refusal(
+        raise UploadRefusal(
             f"{path.name} is no picture that can be read, whatever its name is"
         ) from error
     if not 0 < width_px * height_px <= _MOST_PIXELS:
-        raise Refusal(
+        raise UploadRefusal(
             f"{path.name} has {width_px} x {height_px} pixels, at most {_MOST_PIXELS:,} are taken"
         )
 
@@ -245,7 +247,7 @@ def main(part: str, target: str, most_bytes: str, keep_free_bytes: str) -> None:
     try:
         facts = look(Path(part), Path(target), int(most_bytes), int(keep_free_bytes))
         answer: dict[str, Any] = {"error": None, "facts": facts}
-    except Refusal as refusal:
+    except UploadRefusal as refusal:
         answer = {"error": str(refusal), "facts": None}
     except MemoryError:
         answer = {"error": "looking into it takes more memory than a flight needs", "facts": None}

@@ -57,7 +57,7 @@ class Format:
 
 
 @dataclass(frozen=True)
-class Piece:
+class FootagePiece:
     """One access unit or one moment of telemetry, on the flight's clock."""
 
     kind: Kind
@@ -66,7 +66,7 @@ class Piece:
     is_key: bool = False
     dts_us: int = 0
 
-    def shifted(self, shift_us: int) -> "Piece":
+    def shifted(self, shift_us: int) -> "FootagePiece":
         """The same at another time."""
         return replace(self, pts_us=self.pts_us + shift_us, dts_us=self.dts_us + shift_us)
 
@@ -90,7 +90,7 @@ class Footage(Protocol):
     def format(self) -> Format:
         """What its pictures are."""
 
-    def pieces(self, begin_us: int, stop: threading.Event) -> Iterator[Piece]:
+    def pieces(self, begin_us: int, stop: threading.Event) -> Iterator[FootagePiece]:
         """Everything in order of time; a live flight's clock goes on from `begin_us`."""
 
     def notices(self) -> Sequence[str]:
@@ -132,7 +132,7 @@ class Remains:
     def __init__(self, name: str, form: Format) -> None:
         self.name, self.format = name, form
 
-    def pieces(self, begin_us: int, stop: threading.Event) -> Iterator[Piece]:
+    def pieces(self, begin_us: int, stop: threading.Event) -> Iterator[FootagePiece]:
         """See `Footage`."""
         return iter(())
 
@@ -154,9 +154,9 @@ class Recording:
             self.format = _format_of(container.streams.video[0], path.name)
         self._restarts = 0
 
-    def pieces(self, begin_us: int, stop: threading.Event) -> Iterator[Piece]:
+    def pieces(self, begin_us: int, stop: threading.Event) -> Iterator[FootagePiece]:
         """See `Footage`. Raises InputError where the file becomes unreadable."""
-        samples: deque[Piece] | None = None
+        samples: deque[FootagePiece] | None = None
         timeline = Timeline(0)
         try:
             with self._opened() as container:
@@ -184,7 +184,7 @@ class Recording:
     def _opened(self) -> Any:
         return av.open(f"file:{self._path}", options={"protocol_whitelist": "file"})
 
-    def _samples(self, first_us: int) -> list[Piece]:
+    def _samples(self, first_us: int) -> list[FootagePiece]:
         """The telemetry, or the time alone, on the flight's clock, whose first picture is shown at `first_us`."""
         source = self._source
         lens = _lens_of(source.camera)
@@ -251,7 +251,7 @@ class LiveFootage:
         self._container: Any = self._first()
         self.format = _format_of(self._container.streams.video[0], address.shown)
 
-    def pieces(self, begin_us: int, stop: threading.Event) -> Iterator[Piece]:
+    def pieces(self, begin_us: int, stop: threading.Event) -> Iterator[FootagePiece]:
         """See `Footage`. Raises InputError when the camera comes back with pictures of another kind."""
         self._timeline = Timeline(begin_us)
         if self._link is not None:
@@ -286,7 +286,7 @@ class LiveFootage:
             )
         return [*found, *self._units.notices()]
 
-    def _connected(self, container: Any) -> Iterator[Piece]:
+    def _connected(self, container: Any) -> Iterator[FootagePiece]:
         """The pieces of one connection, the one given or a new one, until it breaks."""
         try:
             with closing(container or self._open(max(0.2, self._settings.give_up_s))) as opened:
@@ -327,7 +327,7 @@ class LiveFootage:
             raise ValueError("a stream without video")
         return container
 
-    def _read(self, container: Any) -> Iterator[Piece]:
+    def _read(self, container: Any) -> Iterator[FootagePiece]:
         video = container.streams.video[0]
         found = _format_of(video, self._address.shown)
         if found.codec != self.format.codec:
@@ -352,7 +352,7 @@ class LiveFootage:
                 )
             yield placed
 
-    def _stated(self, data: "_Data", shift_us: int) -> list[Piece]:
+    def _stated(self, data: "_Data", shift_us: int) -> list[FootagePiece]:
         pts_us = self._timeline.last_us if data.pts_us is None else data.pts_us + shift_us
         return [
             _piece(pts_us, _sample_of(each))
@@ -360,7 +360,7 @@ class LiveFootage:
             if each.time_ns
         ]
 
-    def _fixed(self, pts_us: int) -> Iterator[Piece]:
+    def _fixed(self, pts_us: int) -> Iterator[FootagePiece]:
         """The receiver's moments that came since the last picture."""
         while self._fixes:
             arrived_ns, epoch = self._fixes.popleft()
@@ -440,7 +440,7 @@ class _Units:
         self._damaged = self._timeless = 0
 
     def of(self, container: Any, video: Any, metadata: Sequence[Any] = ()) -> Iterator[Any]:
-        """The pictures as `Piece`, the metadata as `_Data`, in the container's order and on its clock."""
+        """The pictures as `FootagePiece`, the metadata as `_Data`, in the container's order and on its clock."""
         codec = video.codec_context.name
         filtering = av.BitStreamFilterContext(f"{codec}_mp4toannexb", video)
         sets = b""
@@ -461,7 +461,7 @@ class _Units:
                 if (piece := self._piece(codec, unit, data)) is not None:
                     yield piece
 
-    def _piece(self, codec: str, unit: Any, data: bytes) -> Piece | None:
+    def _piece(self, codec: str, unit: Any, data: bytes) -> FootagePiece | None:
         dts_us, pts_us = _us(unit.dts, unit.time_base), _us(unit.pts, unit.time_base)
         pts_us = dts_us if pts_us is None else pts_us
         if pts_us is None:
@@ -470,7 +470,7 @@ class _Units:
         if not has_picture(codec, data):
             self._damaged += 1
             return None
-        return Piece(
+        return FootagePiece(
             Kind.VIDEO, pts_us, data, bool(unit.is_keyframe), pts_us if dts_us is None else dts_us
         )
 
@@ -503,14 +503,14 @@ def _format_of(video: Any, name: str) -> Format:
     return Format(codec, context.width, context.height, float(rate) if rate else 0.0)
 
 
-def _until(samples: deque[Piece], time_us: int) -> Iterator[Piece]:
+def _until(samples: deque[FootagePiece], time_us: int) -> Iterator[FootagePiece]:
     """Take the samples up to a moment."""
     while samples and samples[0].pts_us <= time_us:
         yield samples.popleft()
 
 
-def _piece(pts_us: int, sample: Sample) -> Piece:
-    return Piece(Kind.TELEMETRY, pts_us, sample.to_json().encode(), dts_us=pts_us)
+def _piece(pts_us: int, sample: Sample) -> FootagePiece:
+    return FootagePiece(Kind.TELEMETRY, pts_us, sample.to_json().encode(), dts_us=pts_us)
 
 
 def _sample_of(stated: LocalSet) -> Sample:

@@ -63,7 +63,7 @@ class LinkClosed(Exception):
     """The other side is gone."""
 
 
-class Link(Protocol):
+class DroneLink(Protocol):
     """One connection of a drone."""
 
     async def receive(self) -> bytes:
@@ -99,13 +99,13 @@ class Ingest:
     ) -> None:
         self._folder, self._limits, self._announce = folder, limits, announce
         self._flights: dict[str, Flight] = {}
-        self._links: dict[str, Link] = {}
+        self._links: dict[str, DroneLink] = {}
         self._hubs: dict[str, VideoHub] = {}
         self._loop: asyncio.AbstractEventLoop | None = (
             None  # in which drones and viewers are served
         )
 
-    async def serve(self, stream: str, link: Link) -> None:
+    async def serve(self, stream: str, link: DroneLink) -> None:
         """Take one connection until it ends; why it was refused is sent to the drone."""
         self._loop = asyncio.get_running_loop()
         try:
@@ -234,7 +234,7 @@ class Ingest:
 
     # ---- inside -----------------------------------------------------------------------------------------------
 
-    async def _let_go(self, stream: str, link: Link) -> None:
+    async def _let_go(self, stream: str, link: DroneLink) -> None:
         """A link has ended, also one that was refused: where it is still the stream's own, the stream is free again."""
         if self._links.get(stream) is not link:
             return
@@ -254,7 +254,7 @@ class Ingest:
         folder = self._folder / stream
         return sorted(folder.glob("*.ts")) if folder.is_dir() else []
 
-    async def _greeted(self, stream: str, link: Link) -> "Flight":
+    async def _greeted(self, stream: str, link: DroneLink) -> "Flight":
         """The flight that a drone comes with, open for writing. Raises Refusal, InputError or StoreError."""
         check_stream(stream)
         try:
@@ -276,7 +276,7 @@ class Ingest:
         self._announce(stream, self.state(stream))
         return flight
 
-    async def _make_room(self, stream: str, hello: Hello, link: Link) -> None:
+    async def _make_room(self, stream: str, hello: Hello, link: DroneLink) -> None:
         """End an older link of the same drone. Raises Refusal where another one sends, or too many do."""
         older = self._links.get(stream)
         if older is None:
@@ -297,7 +297,7 @@ class Ingest:
         if before is not None:
             await asyncio.to_thread(before.close)
 
-    async def _take_all(self, stream: str, flight: "Flight", link: Link) -> None:
+    async def _take_all(self, stream: str, flight: "Flight", link: DroneLink) -> None:
         hub = self.hub(stream)
         syncing = asyncio.create_task(self._acknowledge(flight, link))
         space_s = 0.0
@@ -326,7 +326,7 @@ class Ingest:
         finally:
             syncing.cancel()
 
-    async def _received(self, link: Link) -> Message:
+    async def _received(self, link: DroneLink) -> Message:
         try:
             data = await asyncio.wait_for(link.receive(), self._limits.silent_s)
         except TimeoutError:
@@ -344,7 +344,7 @@ class Ingest:
         if short := shortage(self._folder, self._limits.free_bytes / 1e9):
             raise Refusal(f"the station's disk is full: {short}", is_final=False)
 
-    async def _acknowledge(self, flight: "Flight", link: Link) -> None:
+    async def _acknowledge(self, flight: "Flight", link: DroneLink) -> None:
         """Acknowledge what the disk has, step by step."""
         done = flight.last_seq
         while True:
@@ -492,7 +492,7 @@ def _ended(path: Path) -> Path:
     return path.with_name(path.name + ENDED_SUFFIX)
 
 
-async def _close(link: Link, code: int, reason: str) -> None:
+async def _close(link: DroneLink, code: int, reason: str) -> None:
     try:
         short = reason.encode()[:_MOST_REASON_BYTES].decode("utf-8", "ignore")
         await link.close(code, short)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from sorvolo.errors import SorvoloError
 from sorvolo.station.events import EventLog, NewEvent
 from sorvolo.station.problems import Problem
-from sorvolo.station.pyramid import Pyramid
+from sorvolo.station.pyramid import TilePyramid
 from sorvolo.station.reviews import Reviews
 from sorvolo.station.sites import SiteShelf, bounds_lonlat
 from sorvolo.station.tiles import WebTiles
@@ -23,7 +23,7 @@ class _Seen:
     """A site as it was seen last."""
 
     mark: tuple[int, int]
-    state: Pyramid | None
+    state: TilePyramid | None
     versions: int
 
 
@@ -95,7 +95,7 @@ class MapWatch:
             self._events.append(NewEvent("site.changed", {"versions": versions}, site_id))
             self._reviews.settle(site_id)
 
-    def _is_news(self, site_id: str, state: Pyramid | None) -> bool:
+    def _is_news(self, site_id: str, state: TilePyramid | None) -> bool:
         """Whether a map that is seen for the first time grew since it was announced last."""
         if state is None:
             return False
@@ -113,7 +113,7 @@ class MapWatch:
         self._covered[site_id] = written_ns
 
     def _announce(
-        self, site_id: str, archive: Archive, state: Pyramid | None, before: Pyramid | None
+        self, site_id: str, archive: Archive, state: TilePyramid | None, before: TilePyramid | None
     ) -> None:
         """The tiles that changed; all of them where nobody knows what was before."""
         if state is None or not state.keys[0]:
@@ -132,6 +132,6 @@ class MapWatch:
                 self._ending.wait(2.0)
 
 
-def _differs(now: Pyramid | None, before: Pyramid | None) -> bool:
+def _differs(now: TilePyramid | None, before: TilePyramid | None) -> bool:
     """Whether there is a map, and another one than before."""
     return now is not None and (before is None or before.revision != now.revision)

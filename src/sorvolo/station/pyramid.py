@@ -56,7 +56,7 @@ class BytesCache(Generic[Key, Kept]):
         return made
 
 
-class Pyramid:
+class TilePyramid:
     """The tiles of one state of a map at halved resolutions. Level 0 is the map's own.
 
     Pictures are known by the hashes of what they are made of: where the map did not change, one made for an earlier
@@ -109,7 +109,7 @@ class Pyramid:
         columns, rows = zip(*self._tiles.hashes)
         return [(min(columns), min(rows)), (max(columns), max(rows))]
 
-    def changed_since(self, before: "Pyramid") -> list[TileIndex]:
+    def changed_since(self, before: "TilePyramid") -> list[TileIndex]:
         """The tiles that are others than in an earlier state, those that are gone included."""
         now, then = self._tiles.hashes, before._tiles.hashes
         return [index for index in now.keys() | then.keys() if now.get(index) != then.get(index)]

@@ -22,7 +22,7 @@ from sorvolo.errors import SorvoloError
 from sorvolo.geometry.arrays import Floats, Floats32, ImageRGBA
 from sorvolo.geometry.grid import Grid, SiteGrid, TileIndex
 from sorvolo.station.problems import Problem
-from sorvolo.station.pyramid import BytesCache, Pyramid
+from sorvolo.station.pyramid import BytesCache, TilePyramid
 from sorvolo.station.security import needs
 from sorvolo.station.sites import SiteShelf, bounds_lonlat
 from sorvolo.station.tokens import Role
@@ -58,10 +58,10 @@ class WebTiles:
         self._answers = BytesCache[tuple[str, ...], bytes](
             _ANSWERS_BYTES, lambda each: len(each) + 100
         )
-        self._states: dict[tuple[str, str], tuple[object, Pyramid]] = {}
+        self._states: dict[tuple[str, str], tuple[object, TilePyramid]] = {}
         self._lock = threading.Lock()
 
-    def live(self, site_id: str) -> Pyramid:
+    def live(self, site_id: str) -> TilePyramid:
         """The map as it is now: the growing one as of its last flush, else the newest version. Raises as `open`."""
         archive = self._shelf.open(site_id)
         return self._state(site_id, "live", archive, archive.change_mark())
@@ -91,7 +91,7 @@ class WebTiles:
             self._answers.get(key, lambda: render(state, grid, z, x, y, ending)), is_final
         )
 
-    def _version(self, site_id: str, archive: Archive, number: int) -> Pyramid:
+    def _version(self, site_id: str, archive: Archive, number: int) -> TilePyramid:
         if number not in {each.id for each in archive.versions() if each.complete}:
             raise Problem(
                 404, f"the map has no version {number}; /api/sites/{site_id} lists those there are"
@@ -100,16 +100,16 @@ class WebTiles:
             site_id, str(number), archive, archive
         )  # never changes while the site is the same
 
-    def _state(self, site_id: str, name: str, archive: Archive, mark: object) -> Pyramid:
+    def _state(self, site_id: str, name: str, archive: Archive, mark: object) -> TilePyramid:
         with self._lock:
             known = self._states.get((site_id, name))
             if known is not None and known[0] == mark:
                 return known[1]
         tiles = archive.live_tiles() if name == "live" else archive.tiles(int(name))
         grid = archive.site_grid().grid
-        made = Pyramid(tiles, grid.tile_px, self._pictures)
+        made = TilePyramid(tiles, grid.tile_px, self._pictures)
         if _is_exported(archive, name):
-            made = Pyramid(
+            made = TilePyramid(
                 tiles, grid.tile_px, self._pictures, MapOverview(archive.mosaic_path, grid).tile
             )
         with self._lock:
@@ -128,7 +128,7 @@ def _is_exported(archive: Archive, name: str) -> bool:
 
 
 def render(
-    state: Pyramid, site_grid: SiteGrid, z: int, x: int, y: int, ending: str = ".webp"
+    state: TilePyramid, site_grid: SiteGrid, z: int, x: int, y: int, ending: str = ".webp"
 ) -> bytes:
     """An encoded tile of 256 x 256 pixels; b"" where the map has nothing there."""
     if z < _SHALLOWEST_ZOOM or not _meets_map(state, site_grid, z, x, y):
@@ -180,7 +180,7 @@ def _pixels_from_lattice(places: Floats32) -> Floats32:
     return rows[:, low] * (1 - share) + rows[:, low + 1] * share
 
 
-def _meets_map(state: Pyramid, site_grid: SiteGrid, z: int, x: int, y: int) -> bool:
+def _meets_map(state: TilePyramid, site_grid: SiteGrid, z: int, x: int, y: int) -> bool:
     """Whether a tile's ground meets the map's: far around the Earth the site's plane would show it again."""
     bounds = bounds_lonlat(state.corner_tiles, site_grid)
     if bounds is None:
@@ -194,7 +194,7 @@ def _meets_map(state: Pyramid, site_grid: SiteGrid, z: int, x: int, y: int) -> b
     )
 
 
-def _gathered(state: Pyramid, level: int, places_px: Floats) -> tuple[ImageRGBA | None, Floats]:
+def _gathered(state: TilePyramid, level: int, places_px: Floats) -> tuple[ImageRGBA | None, Floats]:
     """The part of a level under these places in one picture, and where its first pixel lies; None without any."""
     size, there = state.pieces(level)
     flat = places_px.reshape(-1, 2)
