@@ -92,9 +92,7 @@ def test_what_moves_has_course_and_speed() -> None:
 def test_names_from_elsewhere_stay_xml() -> None:
     odd = _track(label='<"&\x00\x1bdog>')
     site = replace(_SITE, height_reference="above ground")
-    event = fromstring(
-        cot_event(odd, site, uid="u", now_ns=_NOW_NS, stale_s=9, types={"person": "x"})
-    )
+    event = fromstring(cot_event(odd, site, uid="u", now_ns=_NOW_NS, stale_s=9))
     contact, point = event.find("detail/contact"), event.find("point")
     assert contact is not None and contact.get("callsign") == '<"&dog> 7'
     assert point is not None and point.get("hae") == "9999999.0"

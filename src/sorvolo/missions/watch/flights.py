@@ -28,7 +28,6 @@ from sorvolo.missions.watch.places import Places, places_of
 from sorvolo.missions.watch.run import EarlyFound, WatchRun, WatchUpdate, utc_ns
 from sorvolo.missions.watch.settings import DEFAULT_FRAMES_PER_SECOND, WatchOutputs, WatchSettings
 from sorvolo.mosaic.selection import every
-from sorvolo.store.exports.cursor_on_target import COT_TYPES
 from sorvolo.store.exports.detection_files import JOURNAL, claimed_folder
 from sorvolo.store.site.journal import RunJournal, content_sha256
 from sorvolo.survey.flight import Frame, LostFrame
@@ -153,21 +152,11 @@ def _checked_detector(
         check_host(cot_place(outputs.cot))
         outputs.cot_tls.context()
     finder = Detector.load(settings.model) if detector is None else detector
-    _demand_known_classes(finder, settings, outputs)
+    if unknown := sorted(set(settings.classes) - set(finder.classes)):
+        raise SettingsError(
+            f"the model knows no {unknown[0]!r}; it knows {', '.join(finder.classes)}"
+        )
     return finder
-
-
-def _demand_known_classes(
-    detector: ObjectDetector, settings: WatchSettings, outputs: WatchOutputs
-) -> None:
-    if unknown := sorted(set(settings.classes) - set(detector.classes)):
-        raise SettingsError(
-            f"the model knows no {unknown[0]!r}; it knows {', '.join(detector.classes)}"
-        )
-    if unknown := sorted(set(outputs.cot_types) - {*detector.classes, *COT_TYPES}):
-        raise SettingsError(
-            f"--cot-type {unknown[0]}: no such class; the model knows {', '.join(detector.classes)}"
-        )
 
 
 def _watch_one(

@@ -72,7 +72,7 @@ class Notifier:
             self._alert(track, crops.get(track.id), segments.get(track.id, 0))
         for track in seen:
             if self._cot is not None and self._pace.allows(track.id):
-                self._sent_types[track.id] = cot_type(track.label, self._outputs.cot_types)
+                self._sent_types[track.id] = cot_type(track.label)
                 self._cot.put(self._event(track))
 
     def withdraw(self, track_ids: Iterable[int]) -> None:
@@ -147,5 +147,4 @@ class Notifier:
             uid=f"{self._uid}.{track.id}",
             now_ns=time.time_ns(),
             stale_s=self._outputs.cot_stale_s,
-            types=self._outputs.cot_types,
         )

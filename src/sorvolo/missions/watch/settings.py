@@ -1,6 +1,5 @@
 """What a person may choose for a watch: what is searched for in which frames, and who is notified."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -9,7 +8,6 @@ from sorvolo.errors import SettingsError
 from sorvolo.missions.flight.settings import check_offset
 from sorvolo.missions.watch import alerts
 from sorvolo.missions.watch.cot_sender import CotTls, cot_place
-from sorvolo.store.exports.cursor_on_target import COT_TYPES
 
 DEFAULT_FRAMES_PER_SECOND = 10.0
 """Frames searched a second of a recorded flight: what a camera sees for half a second only is seen five times."""
@@ -72,9 +70,6 @@ class WatchOutputs:
         str, ...
     ] = ()  # of "coco", "yolo": what was found, as labels to correct and train with
     cot: str = ""  # udp://host:port, tcp://host:port or tls://host:port
-    cot_types: Mapping[str, str] = field(
-        default_factory=lambda: COT_TYPES
-    )  # Cursor on Target's type of each class
     cot_every_s: float = 3.0  # of one track, once it was reported
     cot_stale_s: float = 300.0
     alert_command: str = ""

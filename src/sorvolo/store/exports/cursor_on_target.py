@@ -31,9 +31,9 @@ _OTHER_TYPE = "a-u-G"
 UNKNOWN_M = "9999999.0"  # what the schema wants where a height or an error is not known
 
 
-def cot_type(label: str, types: Mapping[str, str] = COT_TYPES) -> str:
+def cot_type(label: str) -> str:
     """The event type of a class; something unknown on the ground for one that is not named."""
-    return types.get(label, _OTHER_TYPE)
+    return COT_TYPES.get(label, _OTHER_TYPE)
 
 
 def cot_event(
@@ -43,7 +43,6 @@ def cot_event(
     uid: str,
     now_ns: int,
     stale_s: float,
-    types: Mapping[str, str] = COT_TYPES,
 ) -> bytes:
     """One track as one event: an XML element without a declaration, as streams of events want it.
 
@@ -55,7 +54,7 @@ def cot_event(
     label = _printable(track.label)
     event, detail = begin_event(
         uid,
-        cot_type(track.label, types),
+        cot_type(track.label),
         *place_deg(track.position_m, site),
         now_ns=now_ns,
         stale_s=stale_s,
