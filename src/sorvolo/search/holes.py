@@ -24,7 +24,7 @@ _BLURRED_SHARE = 0.25  # of a body's longest side: blurred so far along, it is a
 _LEAST_PULL = 0.35  # of log odds: a smaller one is no reason
 
 
-class Reason(StrEnum):
+class HoleReason(StrEnum):
     """Why little would have been found."""
 
     NONE = ""
@@ -44,26 +44,26 @@ class Reason(StrEnum):
     def can_be_flown_again(self) -> bool:
         """Whether another flight may see what this one did not."""
         return self not in (
-            Reason.NONE,
-            Reason.TREES,
-            Reason.ROOF,
-            Reason.DETECTOR,
-            Reason.UNMEASURED,
+            HoleReason.NONE,
+            HoleReason.TREES,
+            HoleReason.ROOF,
+            HoleReason.DETECTOR,
+            HoleReason.UNMEASURED,
         )
 
 
-REASONS = tuple(Reason)
+REASONS = tuple(HoleReason)
 """The reasons by the numbers that `hole_reasons` gives."""
 
 _BY_CONDITION = {
-    "resolution": Reason.COARSE,
-    "views": Reason.FEW_VIEWS,
-    "single view": Reason.FEW_VIEWS,
-    "blur": Reason.BLUR,
-    "texture": Reason.TEXTURE,
-    "light": Reason.DARK,
-    "slant": Reason.SLANT,
-    "trees": Reason.TREES,
+    "resolution": HoleReason.COARSE,
+    "views": HoleReason.FEW_VIEWS,
+    "single view": HoleReason.FEW_VIEWS,
+    "blur": HoleReason.BLUR,
+    "texture": HoleReason.TEXTURE,
+    "light": HoleReason.DARK,
+    "slant": HoleReason.SLANT,
+    "trees": HoleReason.TREES,
 }
 
 
@@ -88,13 +88,13 @@ def hole_reasons(
     blur_m = np.exp(seen.columns[:, CONDITIONS.index("blur")])
     light = seen.columns[:, CONDITIONS.index("light")]
     with np.errstate(invalid="ignore"):
-        rules: list[tuple[Reason, Mask]] = [
-            (Reason.NOT_SEEN, ~seen.seen),
-            (Reason.ROOF, seen.roofs),
-            (Reason.TREES, seen.under_trees),
-            (Reason.COARSE, seen.m_per_px() > needed_m_per_px),
-            (Reason.BLUR, blur_m > _BLURRED_SHARE * length_m),
-            (Reason.DARK, light < _DARK),
+        rules: list[tuple[HoleReason, Mask]] = [
+            (HoleReason.NOT_SEEN, ~seen.seen),
+            (HoleReason.ROOF, seen.roofs),
+            (HoleReason.TREES, seen.under_trees),
+            (HoleReason.COARSE, seen.m_per_px() > needed_m_per_px),
+            (HoleReason.BLUR, blur_m > _BLURRED_SHARE * length_m),
+            (HoleReason.DARK, light < _DARK),
         ]
     worst = _worst_condition(seen.columns, recall, _LEAST_PULL)
     for reason, holds in (*rules, *worst):
@@ -104,18 +104,18 @@ def hole_reasons(
 
 def _worst_condition(
     columns: Floats, recall: Recall | None, least_pull: float
-) -> list[tuple[Reason, Mask]]:
+) -> list[tuple[HoleReason, Mask]]:
     """The condition that lowers the chance of each cell most, by reasons; the detector where none does."""
     everything = np.ones(len(columns), bool)
     if recall is None:
-        return [(Reason.UNMEASURED, everything)]
+        return [(HoleReason.UNMEASURED, everything)]
     pulls = np.nan_to_num(recall.pulls(columns))
     is_lowest = pulls.argmin(axis=1)
     is_strong = pulls.min(axis=1) < -least_pull
     found = [
         (_BY_CONDITION[name], is_strong & (is_lowest == k)) for k, name in enumerate(CONDITIONS)
     ]
-    return [*found, (Reason.DETECTOR, everything)]
+    return [*found, (HoleReason.DETECTOR, everything)]
 
 
 def reasons_together(

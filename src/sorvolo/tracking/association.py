@@ -16,7 +16,7 @@ _MOST_VOTES = 24  # pairs that are asked for the frame's shift
 
 
 @dataclass(frozen=True, eq=False)
-class Pairs:
+class TrackPairs:
     """Rows of tracks and of sightings that belong together, (M,) each, in order of the tracks."""
 
     tracks: Rows
@@ -65,13 +65,13 @@ class PairOdds:
         logs = np.where(squared <= _GATE, logs + np.log(motions.weights)[:, :, None], _NEVER)
         return np.logaddexp(logs[:, 0], logs[:, 1]) + self.fits - self.unseen
 
-    def assign(self, gain: Floats) -> Pairs:
+    def assign(self, gain: Floats) -> TrackPairs:
         """The best pairs, sure sightings first."""
         first = assigned(np.where(self.sure, gain, -1.0))
         gain = gain.copy()
         gain[first.tracks], gain[:, first.sightings], gain[:, self.sure] = -1.0, -1.0, -1.0
         rest = assigned(gain)
-        return Pairs(
+        return TrackPairs(
             np.concatenate([first.tracks, rest.tracks]),
             np.concatenate([first.sightings, rest.sightings]),
         )
@@ -148,11 +148,11 @@ def least_cost(costs: Floats) -> tuple[Rows, Rows]:
     return rows, columns
 
 
-def assigned(gains: Floats) -> Pairs:
+def assigned(gains: Floats) -> TrackPairs:
     """The pairs with the largest sum of gains (tracks, sightings); pairs without gain stay apart."""
     rows, columns = least_cost(np.minimum(-gains, 0.0))
     keep = gains[rows, columns] > 0
-    return Pairs(rows[keep], columns[keep])
+    return TrackPairs(rows[keep], columns[keep])
 
 
 def _squared(inverse: Floats, x: Floats, y: Floats) -> Floats:

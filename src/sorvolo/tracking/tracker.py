@@ -11,7 +11,7 @@ from sorvolo.geometry.arrays import Floats, Labels, PointsM, Rows
 from sorvolo.survey.objects import Sighting, Track
 from sorvolo.tracking.association import (
     PairOdds,
-    Pairs,
+    TrackPairs,
     class_likelihoods,
     looks_likelihoods,
     size_likelihoods,
@@ -180,7 +180,7 @@ class Tracker:
         return time_ns, elapsed_s
 
     def _prolong(
-        self, near: list[Followed], motions: Motions, pairs: Pairs, seen: "_Seen", time_ns: int
+        self, near: list[Followed], motions: Motions, pairs: TrackPairs, seen: "_Seen", time_ns: int
     ) -> list[int]:
         """Give matched tracks their sightings; the ids confirmed by it."""
         new: list[int] = []
@@ -212,9 +212,9 @@ class Tracker:
 
     def _matched(
         self, near: list[Followed], motions: Motions, seen: "_Seen"
-    ) -> tuple[Pairs, Motions]:
+    ) -> tuple[TrackPairs, Motions]:
         """Which sightings are which tracks, and the tracks' motions with those taken in."""
-        none = Pairs(np.zeros(0, np.int64), np.zeros(0, np.int64))
+        none = TrackPairs(np.zeros(0, np.int64), np.zeros(0, np.int64))
         if not near or not len(seen.places_m):
             return none, motions
         ids = [each.id for each in near]
@@ -231,7 +231,7 @@ class Tracker:
             return none, motions
         return pairs, self._corrected(odds, ids, pairs)
 
-    def _paired(self, odds: PairOdds, ids: list[int]) -> Pairs:
+    def _paired(self, odds: PairOdds, ids: list[int]) -> TrackPairs:
         """The likeliest pairs, while the frame's shift is found from their pattern."""
         shift, own_m2 = self._shift, odds.mean_own_m2
         shares, loose_m2 = shift.predict(ids)
@@ -259,7 +259,7 @@ class Tracker:
             pairs = odds.assign(odds.gains(*shift.offsets(fitted, ids)))
         return pairs
 
-    def _corrected(self, odds: PairOdds, ids: list[int], pairs: Pairs) -> Motions:
+    def _corrected(self, odds: PairOdds, ids: list[int], pairs: TrackPairs) -> Motions:
         """The tracks' motions with their sightings taken in, the map's places and shift settled by them."""
         motions = odds.motions
         matched, gaps_m, variances_m2 = self._misses(odds, ids, pairs)
@@ -292,7 +292,7 @@ class Tracker:
         return replace(motions, means=means, covariances=covariances, weights=weights)
 
     def _misses(
-        self, odds: PairOdds, ids: list[int], pairs: Pairs
+        self, odds: PairOdds, ids: list[int], pairs: TrackPairs
     ) -> tuple[list[int], PointsM, Floats]:
         """How far pairs miss each other: ids, seen less known places (M, 2), and their variances (M,)."""
         matched = odds.motions.only(pairs.tracks)

@@ -14,7 +14,7 @@ from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.search.measure import MeasuredClass, MeasuredFlight, SearchFrame
 from sorvolo.missions.search.settings import SearchSettings
 from sorvolo.search.cells import Cells
-from sorvolo.search.holes import Holes, Reason, hole_areas_m2, hole_reasons, reasons_together
+from sorvolo.search.holes import HoleReason, Holes, hole_areas_m2, hole_reasons, reasons_together
 from sorvolo.search.recall import (
     Chances,
     figures,
@@ -161,7 +161,7 @@ def needed_m_per_px(label: str, info: ModelInfo) -> float:
 def is_coarse(searched: Searched, settings: SearchSettings, info: ModelInfo) -> bool:
     """Whether any hole is one since its pixels are too coarse."""
     numbers = hole_numbers(searched, searched.labels[0], settings, info)
-    return Reason.COARSE.value in hole_areas_m2(numbers, searched.cells.cell_m)
+    return HoleReason.COARSE.value in hole_areas_m2(numbers, searched.cells.cell_m)
 
 
 def build_search_report(
