@@ -376,7 +376,7 @@ def test_the_process_that_looks_has_limits(
     child = Child()
 
     def run(command: Sequence[str], timeout_s: float) -> bytes:
-        return child.run([command[0], "-c", LIMITED.format(work=work), *command[3:]], timeout_s)
+        return child.run([command[0], "-c", LIMITED.format(work=work), *command[4:]], timeout_s)
 
     error, facts = uploads.checked_apart(tmp_path / "part", tmp_path / "a.mp4", GIGA, 0, run)
     assert error is not None and words in error and facts is None
