@@ -30,7 +30,7 @@ from sorvolo.missions.compare.flights import _begun, compare_flights
 from sorvolo.missions.flight.known_camera import known_camera
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.flight.setup import _check_place, prepare
-from sorvolo.missions.heights.flight_views import run_of
+from sorvolo.missions.heights.run import run_of
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.map.painting import KnownKeyframes
 from sorvolo.mosaic.selection import every

@@ -15,8 +15,7 @@ from sorvolo.geometry.homography import site_from_image_homography
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
 from sorvolo.lab.simulation.flight_files import video_writer
-from sorvolo.missions.flight.headline import MapQuality, map_headline
-from sorvolo.missions.flight.warnings import _angle_warnings, unlevelled
+from sorvolo.missions.flight.headline import MapQuality, _angle_warnings, map_headline, unlevelled
 from sorvolo.mosaic.consistency import Consistency
 from sorvolo.mosaic.flight_figures import flight_figures
 from sorvolo.mosaic.graph_report import GraphReport

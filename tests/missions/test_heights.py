@@ -35,7 +35,7 @@ from sorvolo.missions.heights.measure import (
 )
 from sorvolo.missions.heights.run import HeightSettings, make_heights
 from sorvolo.missions.map.flights import map_flights
-from sorvolo.missions.search.frames import heights_for
+from sorvolo.missions.search.prepare import heights_for
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.files import HeightFile
 from sorvolo.survey.findings import ChangeKind

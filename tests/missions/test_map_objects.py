@@ -26,8 +26,8 @@ from sorvolo.missions.compare.classes import ChangeClasses, object_at, seen_at
 from sorvolo.missions.compare.flights import compare_flights
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.map_objects import ObjectFinder, open_detector
-from sorvolo.missions.flight.priority import made_at_low_priority
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
+from sorvolo.missions.flight.threads import made_at_low_priority
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.findings import Change, ChangeKind, Patch

@@ -15,8 +15,8 @@ from sorvolo.cli.main import main
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
+from sorvolo.missions.search.earlier import Basis, read_plants
 from sorvolo.missions.search.flights import search_site
-from sorvolo.missions.search.measured_before import Basis, read_plants
 from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
 from sorvolo.store.site.archive import Archive
 

@@ -3,7 +3,7 @@
 import json
 import shutil
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,10 +19,8 @@ from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.search import while_flying
 from sorvolo.missions.search.earlier import EarlierFlights
 from sorvolo.missions.search.flights import search_site
-from sorvolo.missions.search.frames import flights_to_search, search_frames
-from sorvolo.missions.search.growing import GrowingMeasure
-from sorvolo.missions.search.measure import MeasuredFlight, measure_flight
-from sorvolo.missions.search.prepare import prepare_search
+from sorvolo.missions.search.measure import GrowingMeasure, MeasuredFlight, measure_flight
+from sorvolo.missions.search.prepare import flights_to_search, prepare_search, search_frames
 from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
 from sorvolo.missions.search.while_flying import Pace, SearchWhileFlying
 from sorvolo.search.cells import cells_of
@@ -46,6 +44,14 @@ def _chance(flight: MeasuredFlight, label: str) -> float:
     return float(np.nanmean(own.chances.mean))
 
 
+def _returned(work: Generator[object, None, MeasuredFlight]) -> MeasuredFlight:
+    while True:
+        try:
+            next(work)
+        except StopIteration as end:
+            return end.value
+
+
 def test_frame_by_frame_comes_to_what_the_whole_flight_comes_to(site: Path) -> None:
     with Archive.open(site, write=False) as archive:
         (name,) = flights_to_search(archive, ())
@@ -61,8 +67,8 @@ def test_frame_by_frame_comes_to_what_the_whole_flight_comes_to(site: Path) -> N
                 planted.append([len(each.outcomes) for each in flight.classes])
                 assert len(flight.classes[0].chances.mean) == len(cells)
         whole = cells_of([each.placed.outline_m for each in frames], place, None)
-        *_, at_once = measure_flight(name, frames, whole, place, Comparing(site), _SETTINGS, [])
-    assert isinstance(at_once, MeasuredFlight)
+        measuring = measure_flight(name, frames, whole, place, Comparing(site), _SETTINGS, [])
+        at_once = _returned(measuring)
     assert (np.diff(planted, axis=0) >= 0).all()
     assert planted[-1][0] >= 4 and planted[-1][1] >= 2 * planted[0][1] > 8
     for label in ("car", "person"):

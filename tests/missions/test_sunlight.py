@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sorvolo.geometry.geodesy import Geodetic
-from sorvolo.missions.flight.sunlight import sun_over
+from sorvolo.missions.flight.setup import sun_over
 from sorvolo.survey.flight import Site
 
 ROME = Site("field", Geodetic(41.9, 12.5, 80.0), "EPSG:32633", 0.03)

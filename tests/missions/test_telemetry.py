@@ -25,8 +25,12 @@ from sorvolo.geometry.pose import Pose, gimbal_angles_from_rotation, site_from_g
 from sorvolo.lab.simulation.settings import OutputSettings
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
-from sorvolo.missions.telemetry.doctor import CotReceiver, correct_telemetry, mapped_flights
-from sorvolo.missions.telemetry.words import fault_sentences
+from sorvolo.missions.telemetry.doctor import (
+    CotReceiver,
+    correct_telemetry,
+    fault_sentences,
+    mapped_flights,
+)
 from sorvolo.missions.watch.cot_sender import CotPlace
 from sorvolo.survey.corrected import AS_THE_MAP, Bias
 from sorvolo.survey.flight import CameraPrior

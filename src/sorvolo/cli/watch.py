@@ -163,7 +163,7 @@ def _show_progress(
 ) -> Iterator[Path]:
     """Take all updates, printing each new object; yield the folder of each."""
     from sorvolo.geometry.coordinates import Coordinates
-    from sorvolo.missions.watch.report import found_words
+    from sorvolo.missions.watch.run import found_words
 
     resumed = Resumed(console)
     with ProgressReport(console) as progress:

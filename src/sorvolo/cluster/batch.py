@@ -25,7 +25,7 @@ from sorvolo.cluster.flights import (
     sites_of,
 )
 from sorvolo.errors import SettingsError, StoreError
-from sorvolo.missions.flight.software import software
+from sorvolo.missions.flight.request import software
 from sorvolo.missions.worker import Order
 from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.exports.detection_files import REPORT, find_watched

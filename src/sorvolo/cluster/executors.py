@@ -313,7 +313,7 @@ def _run_there(order: Order, root: str, version: str) -> TryEnding:
 
 def default_slots() -> int:
     """A mission for each core, and for each GB of four fifths of the memory: most flights take less."""
-    from sorvolo.missions.flight.memory import available_bytes
+    from sorvolo.missions.flight.settings import available_bytes
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return max(1, min(cores or 1, int(0.8e-9 * available_bytes())))

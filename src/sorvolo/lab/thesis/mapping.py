@@ -19,7 +19,7 @@ from sorvolo.missions.flight.map_objects import ObjectFinder, crops_of
 from sorvolo.missions.flight.report import FlightResult, build_report
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup
-from sorvolo.missions.map.run import FlightRun
+from sorvolo.missions.map.planar_run import FlightRun
 from sorvolo.registration.lens import Undistorter, at_size
 from sorvolo.store.exports.map_pictures import picture
 from sorvolo.store.pages.flight import report_page

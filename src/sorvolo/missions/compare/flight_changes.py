@@ -15,7 +15,7 @@ from sorvolo.geometry.arrays import Floats, Mask
 from sorvolo.geometry.sun import slide_of
 from sorvolo.missions.compare.extension import NIGHT
 from sorvolo.missions.flight.settings import CompareSettings
-from sorvolo.missions.flight.sunlight import sun_over
+from sorvolo.missions.flight.setup import sun_over
 from sorvolo.mosaic.selection import StretchSelection
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView
 from sorvolo.survey.flight import Site

@@ -20,7 +20,6 @@ from sorvolo.missions.compare.run import Again, CompareRun, Pending
 from sorvolo.missions.compare.whole_flight import MANY, OVERLAP
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.disk import check_room
-from sorvolo.missions.flight.frames_ahead import read_ahead
 from sorvolo.missions.flight.headline import contradicts_itself
 from sorvolo.missions.flight.known_camera import known_camera
 from sorvolo.missions.flight.map_objects import check_classes, open_detector
@@ -35,6 +34,7 @@ from sorvolo.missions.flight.setup import (
     prepare,
     repeated,
 )
+from sorvolo.missions.flight.threads import read_ahead
 from sorvolo.missions.heights.measure import damaged_heights, heights_stamp, own_heights_stamp
 from sorvolo.mosaic.selection import StretchSelection, every
 from sorvolo.registration.lens import single_threaded_opencv

@@ -2,7 +2,6 @@
 
 import shutil
 import warnings
-from dataclasses import dataclass
 from pathlib import Path
 
 from sorvolo.capture.source import LiveSource
@@ -11,21 +10,13 @@ from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.wording import counted
 
-
-@dataclass(frozen=True)
-class DiskSettings:
-    """What a flight needs on the disk, measured on simulated flights and photos of meadows and beaches."""
-
-    picture_bytes_per_px: float = 0.45  # of a key frame's JPEG
-    map_bytes_per_px: float = (
-        2.0  # of a key frame, for tiles, mosaic.tif, preview and KMZ at 70 % overlap
-    )
-    journal_bytes: float = (
-        1.5e6  # of a key frame while the flight is mapped, with what does not stay in memory
-    )
-    surely: float = 0.5  # share of the need without which it cannot end well
-    enough: float = 1.5  # times the need with which it will
-    ahead: int = 60  # frames of a live flight that are still to fit: a few minutes
+# Measured on simulated flights and photos of meadows and beaches
+_PICTURE_BYTES_PER_PX = 0.45  # of a key frame's JPEG
+_MAP_BYTES_PER_PX = 2.0  # of a key frame, for tiles, mosaic.tif, preview and KMZ at 70 % overlap
+_JOURNAL_BYTES = 1.5e6  # of a key frame while the flight is mapped, with what leaves memory
+_SURELY = 0.5  # share of the need without which it cannot end well
+_ENOUGH = 1.5  # times the need with which it will
+_AHEAD = 60  # frames of a live flight that are still to fit: a few minutes
 
 
 def check_room(
@@ -34,7 +25,6 @@ def check_room(
     m_per_px: float | None,
     *,
     keeps_pictures: bool = True,
-    settings: DiskSettings = DiskSettings(),
 ) -> None:
     """Announce a disk that is too full for a flight's map: pictures no finer than `m_per_px` (None: than their own).
 
@@ -42,7 +32,7 @@ def check_room(
     were new. Raises StoreError where the disk is far too full, and warns where it may be, with the figures.
     """
     camera, count = setup.source.camera.camera, setup.plan.expected
-    kept, painted = _frame_bytes(setup, m_per_px, settings)
+    kept, painted = _frame_bytes(setup, m_per_px)
     need = count * (painted + (kept if keeps_pictures else 0.0))
     mosaic = archive.mosaic_path
     if mosaic.is_file():  # the old one stays until the new one is whole
@@ -58,14 +48,14 @@ def check_room(
         f"the disk of {archive.folder} has {_words(free)} free, and {what} {setup.source.name} needs about "
         f"{_words(need)}{flown}"
     )
-    if free < settings.surely * need:
+    if free < _SURELY * need:
         coarser = (
             ", or a coarser map (--gsd)"
             if keeps_pictures
             else ", or do not update the map (--no-update)"
         )
         raise StoreError(f"{text}: free some space, choose another disk{coarser}")
-    if free < settings.enough * need:
+    if free < _ENOUGH * need:
         warnings.warn(f"{text}: it may become full", SorvoloWarning, stacklevel=2)
 
 
@@ -77,10 +67,9 @@ class LiveRoom:
         setup: FlightSetup,
         folder: Path,
         m_per_px: float | None,
-        settings: DiskSettings = DiskSettings(),
     ) -> None:
-        self._name, self._folder, self._ahead = setup.source.name, folder, settings.ahead
-        self._kept, self._painted = _frame_bytes(setup, m_per_px, settings)
+        self._name, self._folder = setup.source.name, folder
+        self._kept, self._painted = _frame_bytes(setup, m_per_px)
         self._is_announced = not isinstance(setup.source, LiveSource)
 
     def look(self, frames: int) -> None:
@@ -89,7 +78,7 @@ class LiveRoom:
             return
         free = _free(self._folder)
         more = max(0, int((free - frames * self._painted) / (self._kept + self._painted)))
-        if more < self._ahead:
+        if more < _AHEAD:
             self._is_announced = True
             text = (
                 f"the disk of {self._folder} has {_words(free)} free: about {counted(more, 'more frame')} of "
@@ -98,17 +87,15 @@ class LiveRoom:
             warnings.warn(text, SorvoloWarning, stacklevel=2)
 
 
-def _frame_bytes(
-    setup: FlightSetup, m_per_px: float | None, settings: DiskSettings
-) -> tuple[float, float]:
+def _frame_bytes(setup: FlightSetup, m_per_px: float | None) -> tuple[float, float]:
     """What a key frame takes while the flight is mapped, and what its ground takes in the map's files."""
     camera, shrink = setup.source.camera.camera, 1.0
     if m_per_px is not None and setup.usual_height_m > 0:
         shrink = min(1.0, setup.usual_height_m / camera.fx_px / m_per_px)
     pixels = camera.width_px * camera.height_px * shrink**2
     return (
-        pixels * settings.picture_bytes_per_px + settings.journal_bytes,
-        pixels * settings.map_bytes_per_px,
+        pixels * _PICTURE_BYTES_PER_PX + _JOURNAL_BYTES,
+        pixels * _MAP_BYTES_PER_PX,
     )
 
 

@@ -5,11 +5,119 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from sorvolo.missions.flight.warnings import OBLIQUE_DEG, doubts
+from sorvolo.missions.flight.log import FlightLog
+from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.mosaic.consistency import NOTHING_KNOWN, Consistency
 from sorvolo.mosaic.flight_figures import FlightFigures
+from sorvolo.mosaic.graph_report import GraphReport
 from sorvolo.survey.mosaic import PlacedFrame, Status
-from sorvolo.survey.wording import counted
+from sorvolo.survey.wording import counted, plural
+
+OBLIQUE_DEG = 35.0  # pictures that look to opposite sides share too little to be linked
+_MANY = 0.1  # share of the frames
+_BAD_FIT_PX = 3.0  # median residual of a map's matches from which on it is warned of; by choice
+_TURNED_DEG = 6.0  # by which all stated angles may be off without a word
+_GUESSED = 0.1  # relative: a focal length that is hardly known
+
+
+def flight_warnings(
+    placed: Sequence[PlacedFrame],
+    figures: FlightFigures,
+    setup: FlightSetup,
+    log: FlightLog,
+    agreement: Consistency = NOTHING_KNOWN,
+    graph: GraphReport | None = None,
+) -> list[str]:
+    """The warnings of a flight's report."""
+    camera, clock, warnings = (
+        setup.source.camera,
+        setup.clock,
+        [*agreement.faults, *agreement.steps],
+    )
+    lost = sum(each.status is Status.REJECTED for each in placed)
+    if lost > _MANY * len(placed):
+        warnings.append(
+            f"{lost} of {counted(len(placed), 'frame')} have no place in the map; `reasons` lists why"
+        )
+    warnings += [*doubts(placed, figures), *agreement.remarks]
+    # ground that is not level, where the pictures still fit each other; where they do not, `doubts` reports it
+    residual_px = figures.residual_median_px
+    fits = residual_px is not None and residual_px <= _BAD_FIT_PX
+    if graph is not None and graph.is_uneven and fits:
+        warnings.append(
+            "the ground is not level, or tall things cover much of it: slopes and tall things lie off their place in the "
+            "flat map; `sorvolo heights` measures the ground and makes a true orthophoto"
+        )
+    # whether telemetry states where the camera or the aircraft looked; else it is taken to have looked down
+    has_angles = setup.track is not None and setup.track.attitude != "none"
+    warnings += _angle_warnings(placed, graph, has_angles=has_angles)
+    if not has_angles and figures.tilt_deg > OBLIQUE_DEG:  # measured from the pictures' perspective
+        lack = "there is no telemetry" if setup.track is None else "telemetry has no camera angles"
+        warnings.append(
+            f"the camera looks {figures.tilt_deg:.0f} deg away from straight down and {lack}: "
+            "strips flown in opposite directions may not fit each other; give telemetry with the camera's angles"
+        )
+    if camera.focal_sigma > _GUESSED:
+        warnings.append(f"camera: {camera.origin}; until then the scale is not sure")
+    if clock is not None and abs(log.offset_applied_s) > 2 * clock.sigma_s:
+        warnings.append(
+            f"the pictures fit this telemetry best {log.offset_applied_s:+.1f} s from where its clock puts them, more "
+            f"than clocks tied like these differ ({clock.tie}): is it the telemetry of this flight? --offset 0 keeps to "
+            "its clock"
+        )
+    return warnings
+
+
+def doubts(placed: Sequence[PlacedFrame], figures: FlightFigures) -> list[str]:
+    """What makes the map doubtful: steps in it, or pictures that fit each other badly."""
+    warnings = []
+    by_gps = sum(each.status is Status.GPS_ONLY for each in placed)
+    if by_gps > _MANY * len(placed):
+        warnings.append(
+            f"{counted(by_gps, 'frame')} {plural('is', by_gps)} placed by GPS alone: expect steps of some metres at "
+            "their edges"
+        )
+    if figures.residual_median_px is not None and figures.residual_median_px > _BAD_FIT_PX:
+        warnings.append(
+            "pictures fit each other badly: high trees or houses (`sorvolo heights` makes an upright map of them), a "
+            "wrong camera, or a rolling shutter"
+        )
+    return warnings
+
+
+def unlevelled(
+    placed: Sequence[PlacedFrame], graph: GraphReport | None, setup: FlightSetup
+) -> list[str]:
+    """Why the map may be no view from above: pictures look aside, and neither angles nor positions level them."""
+    if setup.track is not None or graph is None or graph.angles_contradicted <= _MANY * len(placed):
+        return []
+    return [
+        "the camera looked to the side, and without telemetry nothing shows where level ground is: this is no view "
+        "from straight above"
+    ]
+
+
+def _angle_warnings(
+    placed: Sequence[PlacedFrame], graph: GraphReport | None, *, has_angles: bool
+) -> list[str]:
+    """Where the pictures contradict the stated angles of the camera or the aircraft, or the view straight down."""
+    warnings = []
+    if graph is not None and graph.angles_contradicted > _MANY * len(placed):
+        frames = f"{counted(graph.angles_contradicted, 'frame')} of {len(placed)}"
+        warnings.append(
+            f"the stated angles of {frames} contradict the pictures by 15 deg or more and were not used"
+            if has_angles
+            else "no angles are stated, so the camera was taken to look straight down; by the pictures it looked 15 "
+            f"deg or more to the side in {frames}"
+        )
+    if graph is not None and max(graph.turned_deg[0], abs(graph.turned_deg[1])) > _TURNED_DEG:
+        tilt_deg, heading_deg = graph.turned_deg
+        warnings.append(
+            f"all stated angles are off from the pictures: tilt by {tilt_deg:.0f} deg, heading by {heading_deg:+.0f} "
+            "deg (a compass beside motors, a mount that is not level); the pictures were followed"
+        )
+    return warnings
+
 
 _HOVERING = 0.05  # of a frame's diagonal on the ground: views that spread less are one view
 

@@ -16,9 +16,9 @@ from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.camera import Camera
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
-from sorvolo.missions.flight.memory import MemorySettings
-from sorvolo.missions.flight.priority import lower_priority, made_at_low_priority
 from sorvolo.missions.flight.result_cache import ResultCache
+from sorvolo.missions.flight.settings import WAITING_MB
+from sorvolo.missions.flight.threads import lower_priority, made_at_low_priority
 from sorvolo.registration.lens import at_most
 from sorvolo.store.exports.detection_files import crop_around
 from sorvolo.store.exports.plain import plain_json
@@ -38,6 +38,7 @@ NO_MODEL, DEFAULT_MODEL = "none", "default"
 _AHEAD = (
     3  # frames of a recorded flight that may wait for the detector before the mapping waits for it
 )
+_WAITING_ON_DISK = 256  # frames of a live flight at most: 1.6 GB of 1080p
 _CROP_PX = 256  # longer side of a picture on a page
 _MOST_CROPS = 60  # of one frame, the surest
 
@@ -142,14 +143,13 @@ class ObjectFinder:
         knows_height = math.isfinite(sigma_m) and height_m > 1.0
         m_per_px = float(height_m) / self._camera.fx_px if knows_height else None
         from_above = is_from_above(posed.prior.rotation)
-        memory = MemorySettings()
         given: Frame | FrameOnDisk = posed.frame
-        in_memory = max(1, int(1e6 * memory.waiting_mb // posed.frame.image.nbytes))
+        in_memory = max(1, int(1e6 * WAITING_MB // posed.frame.image.nbytes))
         waiting = sum(not each.done() for each in self._waiting)
         if self._live_folder is not None and waiting >= in_memory:
             given = FrameOnDisk.of(posed.frame, self._live_folder)
         self._waiting.append(self._thread.submit(self._look, given, m_per_px, from_above))
-        self._take(min(_AHEAD, in_memory) if self._live_folder is None else memory.waiting_on_disk)
+        self._take(min(_AHEAD, in_memory) if self._live_folder is None else _WAITING_ON_DISK)
 
     def rest(self) -> None:
         """Wait until all frames so far are searched, and have the detector give its memory back."""

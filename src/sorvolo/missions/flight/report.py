@@ -10,16 +10,14 @@ import sorvolo
 from sorvolo.capture.clock_offset import OffsetEstimate
 from sorvolo.capture.video import VideoSource
 from sorvolo.geometry.camera import Camera
-from sorvolo.missions.flight.headline import map_headline
+from sorvolo.missions.flight.headline import flight_warnings, map_headline, unlevelled
 from sorvolo.missions.flight.log import FlightLog, Stage
+from sorvolo.missions.flight.request import software
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup
-from sorvolo.missions.flight.software import software
-from sorvolo.missions.flight.warnings import flight_warnings, unlevelled
 from sorvolo.mosaic.base_ties import BaseReport
-from sorvolo.mosaic.consistency import Consistency, Stated, consistency
+from sorvolo.mosaic.consistency import Stated, consistency
 from sorvolo.mosaic.flight_figures import (
-    FlightFigures,
     delay_figures,
     flight_figures,
     stated_height_m,
@@ -68,29 +66,50 @@ def build_report(
     source, placed, graph = setup.source, result.placed, result.graph
     figures = flight_figures(placed, result.camera.fx_px)
     agreement = consistency(placed, result.pieces, figures, _stated(setup, result), graph)
+    headline = {}
+    if result.makes_map:
+        others = unlevelled(placed, graph, setup)
+        headline["headline"] = asdict(
+            map_headline(
+                placed,
+                figures,
+                is_video=source.kind == "video",
+                agreement=agreement,
+                others=others,
+            )
+        )
     return {
-        "sorvolo": sorvolo.__version__,
-        "flight": source.name,
+        **report_head(setup, is_local=site.is_local),
         "site": site.name,
         "method": settings.method_name,
-        "inputs": list(source.inputs),
-        "georeferenced": not site.is_local,
         "flown": utc_text(setup.flown_ns) if setup.flown_ns else None,
-        **_headline(
-            result,
-            figures,
-            agreement,
-            unlevelled(placed, graph, setup),
-            is_video=source.kind == "video",
-        ),
-        "frames": _frames(placed, source.frame_count),
+        **headline,
+        "frames": {
+            "total": source.frame_count,
+            "selected": len(placed),
+            **{status.value: sum(each.status is status for each in placed) for status in Status},
+            "reasons": dict(Counter(each.reason for each in placed if each.reason).most_common()),
+        },
         "reading": asdict(source.reading) if isinstance(source, VideoSource) else None,
-        "camera": _camera(source.camera, result.camera, graph),
-        "telemetry": _telemetry(setup),
+        "camera": {
+            **camera_facts(source.camera),
+            "focal_found_px": result.camera.fx_px,
+            "focal_found_sigma_relative": graph.focal_scale_sigma if graph else None,
+            "distortion_k1_k2_p1_p2_k3": list(source.camera.camera.distortion),
+            "radial_found": graph.radial if graph else None,
+        },
+        "telemetry": telemetry_facts(setup),
         "time_offset": _offset(settings, log, result.offset),
         "pieces": [asdict(each) for each in agreement.pieces],
-        **_figures(figures),
-        **_known_ground(result),
+        "residual_px": {"median": figures.residual_median_px, "p95": figures.residual_p95_px},
+        "gps_residual_m": {
+            "median": figures.gps_median_m,
+            "rms": figures.gps_rms_m,
+            "vertical_median": figures.gps_vertical_median_m,
+        },
+        "sigma_m": figures.sigma_m,
+        "control": control_summary(result.control) if result.control else None,
+        "base": asdict(result.base) if result.base else None,
         "relief_m": graph.relief_m if graph else None,
         "altitude_offset_m": graph.altitude_offset_m if graph else None,
         "links": {"kept": graph.links, "dropped_as_false": graph.links_dropped} if graph else None,
@@ -112,29 +131,6 @@ def build_report(
     }
 
 
-def _headline(
-    result: FlightResult,
-    figures: FlightFigures,
-    agreement: Consistency,
-    others: Sequence[str],
-    *,
-    is_video: bool,
-) -> dict[str, Any]:
-    if not result.makes_map:
-        return {}
-    headline = map_headline(
-        result.placed, figures, is_video=is_video, agreement=agreement, others=others
-    )
-    return {"headline": asdict(headline)}
-
-
-def _known_ground(result: FlightResult) -> dict[str, Any]:
-    return {
-        "control": control_summary(result.control) if result.control else None,
-        "base": asdict(result.base) if result.base else None,
-    }
-
-
 def _stated(setup: FlightSetup, result: FlightResult) -> Stated:
     """What telemetry states, to hold the map against; heights only where they are known to count from the ground."""
     telemetry, graph = setup.telemetry, result.graph
@@ -149,50 +145,42 @@ def _stated(setup: FlightSetup, result: FlightResult) -> Stated:
     return Stated(telemetry.usual_sigma_m, height_m, source)
 
 
-def _frames(placed: Sequence[PlacedFrame], total: int) -> dict[str, Any]:
+def report_head(setup: FlightSetup, *, is_local: bool) -> dict[str, Any]:
+    """Return what every mission's report begins with."""
     return {
-        "total": total,
-        "selected": len(placed),
-        **{status.value: sum(each.status is status for each in placed) for status in Status},
-        "reasons": dict(Counter(each.reason for each in placed if each.reason).most_common()),
+        "sorvolo": sorvolo.__version__,
+        "flight": setup.source.name,
+        "inputs": list(setup.source.inputs),
+        "georeferenced": not is_local,
     }
 
 
-def _camera(model: CameraModel, found: Camera, graph: GraphReport | None) -> dict[str, Any]:
+def camera_facts(model: CameraModel) -> dict[str, Any]:
+    """Return a report's part on the camera as it was known before the flight."""
     return {
         "origin": model.origin,
         "width_px": model.camera.width_px,
         "height_px": model.camera.height_px,
         "focal_px": model.camera.fx_px,
         "focal_sigma_relative": model.focal_sigma,
-        "focal_found_px": found.fx_px,
-        "focal_found_sigma_relative": graph.focal_scale_sigma if graph else None,
-        "distortion_k1_k2_p1_p2_k3": list(model.camera.distortion),
-        "radial_found": graph.radial if graph else None,
     }
 
 
-def _telemetry(setup: FlightSetup) -> dict[str, Any]:
-    telemetry = setup.source.telemetry
+def telemetry_facts(setup: FlightSetup) -> dict[str, Any]:
+    """Return a report's part on telemetry."""
+    telemetry, track = setup.source.telemetry, setup.track
     return {
         "format": telemetry.format,
         "samples": len(telemetry),
         "tie": setup.clock.tie if setup.clock else "none",
-        "height": setup.track.height_words if setup.track else "none",
-        "attitude": setup.track.attitude if setup.track else "none",
+        "height": track.height_words if track else "none",
+        "attitude": track.attitude if track else "none",
     }
 
 
-def _figures(figures: FlightFigures) -> dict[str, Any]:
-    return {
-        "residual_px": {"median": figures.residual_median_px, "p95": figures.residual_p95_px},
-        "gps_residual_m": {
-            "median": figures.gps_median_m,
-            "rms": figures.gps_rms_m,
-            "vertical_median": figures.gps_vertical_median_m,
-        },
-        "sigma_m": figures.sigma_m,
-    }
+def peak_memory_mb() -> float:
+    """Return the most memory that this process held so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def _effort(log: FlightLog, seconds: float, selected: int) -> dict[str, Any]:
@@ -209,7 +197,7 @@ def _effort(log: FlightLog, seconds: float, selected: int) -> dict[str, Any]:
             **{name: round(value, 3) for name, value in log.cpu_s.items()},
         },
         "registration_cpu_s_per_keyframe": registering_s / selected,
-        "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "peak_memory_mb": peak_memory_mb(),
     }
 
 

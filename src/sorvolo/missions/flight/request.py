@@ -1,6 +1,8 @@
 """What is asked for of a flight, as one number: by it a site knows what it has, and a run what it goes on with."""
 
+import platform
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +13,20 @@ from sorvolo.capture.video import VideoSource
 from sorvolo.missions.flight.control import FlightControl
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.setup import FlightSetup
-from sorvolo.missions.flight.software import software
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.journal import content_sha256
 from sorvolo.survey.area import Area
+
+_LIBRARIES = ("numpy", "scipy", "opencv-contrib-python-headless", "av", "rasterio")
+
+
+def software(*libraries: str) -> dict[str, str]:
+    """Return the versions of Python and of these libraries, by name; without any, of those that compute a map."""
+    return {
+        "python": platform.python_version(),
+        **{name: version(name) for name in libraries or _LIBRARIES},
+    }
+
 
 REQUEST = "request"
 """Of a run's settings in the catalogue: what was asked for."""

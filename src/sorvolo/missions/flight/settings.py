@@ -1,18 +1,54 @@
 """What a person may choose for a mission; each value has its unit and a default that suits most flights."""
 
+import os
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Protocol
 
 from sorvolo.change.compare import PairMethod
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.geodesy import check_map_crs
-from sorvolo.missions.flight.memory import memory_budget_bytes
 
 if TYPE_CHECKING:
     from sorvolo.missions.flight.map_objects import ObjectFinder
     from sorvolo.missions.flight.setup import FlightSetup
-    from sorvolo.missions.map.run import FlightRun
+    from sorvolo.missions.map.planar_run import FlightRun
     from sorvolo.store.site.archive import Archive
+
+_CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
+
+
+MEMORY_SHARE = 0.25  # of the machine's memory, or of the container's limit
+_ENOUGH_MB = 512.0  # more saves no time
+LEAST_MB = 64.0
+"""With less, a picture of 12 megapixels and the tiles below it do not fit."""
+TILES_MB = 24
+"""At most, for tiles: each is painted once."""
+WAITING_MB = 64
+"""For frames that wait for the detector, though one may always."""
+
+
+def memory_budget_bytes(memory_mb: float | None) -> int:
+    """Return the given budget (MB) in bytes; without one 512 MB, or a quarter of the machine's memory where that is less.
+
+    Raises SettingsError when it is too small to work with.
+    """
+    if memory_mb is None:
+        return int(min(1e6 * _ENOUGH_MB, MEMORY_SHARE * available_bytes()))
+    if not memory_mb >= LEAST_MB:
+        raise SettingsError(f"memory_mb must be at least {LEAST_MB:g} MB, got {memory_mb:g}")
+    return int(memory_mb * 1e6)
+
+
+def available_bytes() -> int:
+    """The machine's memory, or the container's limit."""
+    machine = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    try:
+        limit = _CGROUP_LIMIT.read_text().strip()
+    except OSError:
+        return machine
+    return min(machine, int(limit)) if limit.isdigit() else machine
+
 
 _MOST_OFFSET_S = 86_400 * 365  # a year: a clock that was never set
 

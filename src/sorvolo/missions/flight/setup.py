@@ -14,11 +14,12 @@ from sorvolo.capture.flight_telemetry import (
 from sorvolo.capture.source import LiveSource, Source
 from sorvolo.capture.sync import DATED_NS, Clock, Track, site_origin
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.geometry.arrays import PointsM
+from sorvolo.geometry.arrays import PointsM, Vector3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame, utm_epsg
 from sorvolo.geometry.level_ground import footprint, is_on_ground
 from sorvolo.geometry.pose import Pose
+from sorvolo.geometry.sun import sun_direction
 from sorvolo.geometry.track import known_points
 from sorvolo.missions.flight.base_map import FlightBase
 from sorvolo.missions.flight.control import FlightControl
@@ -130,78 +131,37 @@ def prepare(
     """
     if isinstance(source, LiveSource):
         source.wait_for_first_fixes()
-    if finds_itself and site is not None and (site.is_local or not source.telemetry.has_fixes):
-        return _found_by_pictures(source, site)
-    if not source.telemetry.has_fixes:
+    is_video, has_fixes = source.kind == "video", source.telemetry.has_fixes
+    if finds_itself and site is not None and (site.is_local or not has_fixes):
+        lack = (
+            "the site has no geo-reference"
+            if site.is_local
+            else "the flight has no telemetry with fixes"
+        )
+        text = f"{lack}: the frames are matched with the whole map, by their pictures alone"
+        plan = untimed_plan(is_video=is_video, expected=max(2, source.frame_count))
+        return FlightSetup(source, site.frame, plan, site, (Notice("no_telemetry", 1, text),))
+    if not has_fixes:
         return _without_gps(source, settings, site, telemetry_named, known_ground)
-    laid = _laid(site, source, founds_site=founds_site)
-    setup = _with_gps(source, settings, site, laid, telemetry_named, ground_m)
-    return setup if known_ground is None else _with_known_ground(setup, known_ground)
-
-
-def _with_known_ground(setup: FlightSetup, known_ground: KnownGround) -> FlightSetup:
-    """A flight with GPS that is tied to known ground as well."""
-    assert setup.track is not None
+    setup = _with_gps(source, settings, site, telemetry_named, ground_m, founds_site=founds_site)
+    if known_ground is None:
+        return setup
+    track, frame = setup.track, setup.frame
+    assert track is not None
     if isinstance(known_ground, FlightControl):
-        _check_control(setup, known_ground)
-    elif not isinstance(setup.source, LiveSource):
-        known_ground.check_place(known_points(setup.track.east_north_m), setup.frame)
+        known_ground.check_place(
+            lambda control: distance_m(
+                track,
+                frame.ground_from_lonlat(
+                    [(point.longitude_deg, point.latitude_deg) for point in control.points]
+                ),
+            )
+        )
+    elif not isinstance(source, LiveSource):
+        known_ground.check_place(known_points(track.east_north_m), frame)
     return replace(
         setup, known_ground=known_ground, notices=(*setup.notices, *known_ground.notices)
     )
-
-
-def _check_control(setup: FlightSetup, control: FlightControl) -> None:
-    assert setup.track is not None
-    track, frame = setup.track, setup.frame
-    control.check_place(
-        lambda each: distance_m(
-            track,
-            frame.ground_from_lonlat(
-                [(point.longitude_deg, point.latitude_deg) for point in each.points]
-            ),
-        )
-    )
-
-
-def _by_known_ground(
-    source: Source, settings: MapSettings, site: Site | None, known: KnownGround
-) -> FlightSetup:
-    """A first flight that has no GPS and is placed by its control points or its base map."""
-    if site is not None:
-        raise InputError(
-            f"the flight {source.name} has no GPS, and {known.words} alone cannot join it to a map that exists: map it "
-            "into a site folder of its own"
-        )
-    _refuse_offset(settings)
-    notice = Notice(
-        "no_telemetry", 1, f"no GPS: {known.words} alone gives the map its place, scale and north"
-    )
-    return FlightSetup(
-        source, known.frame, _untimed(source), None, (notice, *known.notices), known_ground=known
-    )
-
-
-def _untimed(source: Source) -> FramePlan:
-    is_video = source.kind == "video"
-    expected = max(2, round(duration_s(source))) if is_video else source.frame_count
-    return untimed_plan(is_video=is_video, expected=expected)
-
-
-def _found_by_pictures(source: Source, site: Site) -> FlightSetup:
-    """A flight whose frames are matched with the whole map."""
-    lack = (
-        "the site has no geo-reference"
-        if site.is_local
-        else "the flight has no telemetry with fixes"
-    )
-    notice = Notice(
-        "no_telemetry",
-        1,
-        f"{lack}: the frames are matched with the whole map, by their pictures alone",
-    )
-    plan = untimed_plan(is_video=source.kind == "video", expected=max(2, source.frame_count))
-    return FlightSetup(source, site.frame, plan, site, (notice,))
 
 
 def _without_gps(
@@ -209,17 +169,28 @@ def _without_gps(
     settings: MapSettings,
     site: Site | None,
     telemetry_named: bool,
-    known_ground: KnownGround | None,
+    known: KnownGround | None,
 ) -> FlightSetup:
-    """A first flight in a frame of its own, or in that of known ground."""
-    if known_ground is not None:
-        return _by_known_ground(source, settings, site, known_ground)
-    if site is not None and not site.is_local:
+    """A first flight in a frame of its own, or in that of its control points or its base map."""
+    if known is not None and site is not None:
+        raise InputError(
+            f"the flight {source.name} has no GPS, and {known.words} alone cannot join it to a map that exists: map it "
+            "into a site folder of its own"
+        )
+    if known is None and site is not None and not site.is_local:
         raise InputError(
             f"the site is geo-referenced, but the flight {source.name} has no GPS: give --telemetry, or map it "
             "into a site folder of its own"
         )
-    _refuse_offset(settings)
+    if settings.offset_s is not None:
+        raise SettingsError("--offset was given, but the flight has no telemetry with fixes")
+    is_video = source.kind == "video"
+    expected = max(2, round(duration_s(source))) if is_video else source.frame_count
+    plan = untimed_plan(is_video=is_video, expected=expected)
+    if known is not None:
+        text = f"no GPS: {known.words} alone gives the map its place, scale and north"
+        notices = (Notice("no_telemetry", 1, text), *known.notices)
+        return FlightSetup(source, known.frame, plan, None, notices, known_ground=known)
     if settings.crs is not None:
         raise SettingsError(
             f"--crs {settings.crs} was given, but {source.name} has no GPS, so its map has no place on Earth; give "
@@ -228,88 +199,61 @@ def _without_gps(
     lack = "telemetry without a single fix" if len(source.telemetry) else "no telemetry"
     lack += " in time" if isinstance(source, LiveSource) and telemetry_named else ""
     text = f"{lack}: the map is in a local frame of its own, without metres and north"
-    return FlightSetup(
-        source,
-        LocalFrame(Geodetic(0.0, 0.0)),
-        _untimed(source),
-        site,
-        (Notice("no_telemetry", 1, text),),
-    )
-
-
-def _refuse_offset(settings: MapSettings) -> None:
-    """Raise SettingsError where an offset was given to a flight whose telemetry places nothing."""
-    if settings.offset_s is not None:
-        raise SettingsError("--offset was given, but the flight has no telemetry with fixes")
-
-
-def _laid(site: Site | None, source: Source, *, founds_site: bool) -> Geodetic | None:
-    """The origin of the frame in which a flight with GPS is laid: the site's; None without a site.
-
-    The flight that made the site was laid before the ground's height was known; the metres of a degree depend on it in
-    the fifth digit, which is 0.1 mm between frames. Raises InputError for a site that has no place on Earth.
-    """
-    if site is None:
-        return None
-    if site.is_local:
-        raise InputError(
-            f"the site {site.name} has no geo-reference, but the flight {source.name} has GPS: map it into a new site "
-            "folder"
-        )
-    first = site_origin(source.telemetry) if founds_site else None
-    place = (site.origin.latitude_deg, site.origin.longitude_deg)
-    return (
-        first
-        if first is not None and (first.latitude_deg, first.longitude_deg) == place
-        else site.origin
-    )
+    frame = LocalFrame(Geodetic(0.0, 0.0))
+    return FlightSetup(source, frame, plan, site, (Notice("no_telemetry", 1, text),))
 
 
 def _with_gps(
     source: Source,
     settings: MapSettings,
     site: Site | None,
-    laid: Geodetic | None,
     telemetry_named: bool,
     ground_m: PointsM | None,
+    *,
+    founds_site: bool,
 ) -> FlightSetup:
-    """A flight in the frame around `laid`, the site's; without a site, in one around its first fix."""
+    """A flight in the site's frame; without a site, in one around its first fix.
+
+    The flight that made the site was laid before the ground's height was known; the metres of a degree depend on it in
+    the fifth digit, which is 0.1 mm between frames.
+    """
+    if site is not None and site.is_local:
+        raise InputError(
+            f"the site {site.name} has no geo-reference, but the flight {source.name} has GPS: map it into a new site "
+            "folder"
+        )
     samples = source.telemetry
-    origin = laid or site_origin(samples)
+    origin = site_origin(samples)
     assert origin is not None  # there are fixes
+    if site is not None:
+        place = (site.origin.latitude_deg, site.origin.longitude_deg)
+        if not founds_site or (origin.latitude_deg, origin.longitude_deg) != place:
+            origin = site.origin
     frame = LocalFrame(origin)
     wishes = TelemetryWishes(settings.offset_s, settings.ground_elevation_m, telemetry_named)
     telemetry = FlightTelemetry(source, samples, frame, wishes)
     if site is not None:
-        _check_place(site, telemetry.track, source.name, ground_m)
-    seconds = duration_s(source)
-    is_recorded_video = source.kind == "video" and not isinstance(source, LiveSource)
-    if is_recorded_video and not telemetry.covers(seconds):
+        nearest_m = distance_m(telemetry.track, ground_m)
+        if nearest_m > _ANOTHER_PLACE_M:
+            raise InputError(
+                f"the flight {source.name} is {nearest_m / 1000:.0f} km from the site {site.name} at "
+                f"{site.origin.latitude_deg:.5f}, {site.origin.longitude_deg:.5f}: map it into a site folder of its own"
+            )
+    seconds, is_live = duration_s(source), isinstance(source, LiveSource)
+    if source.kind == "video" and not is_live and not telemetry.covers(seconds):
         raise InputError(
             f"the telemetry ({samples.format}) has no fix during the {seconds:.0f} s of {source.name}; give the "
             "telemetry of this flight, or another --offset"
         )
-    return FlightSetup(
-        source, frame, _planned(source, settings, telemetry), site, telemetry.notices, telemetry
-    )
-
-
-def _planned(source: Source, settings: MapSettings, telemetry: FlightTelemetry) -> FramePlan:
-    if source.kind == "photos":
-        return untimed_plan(is_video=False, expected=source.frame_count)
     camera, by_pictures = source.camera.camera, settings.method is None
-    height_m, speed_m_s = telemetry.height_m, telemetry.speed_m_s
-    if isinstance(source, LiveSource):
-        return live_plan(camera, height_m, speed_m_s, settings.overlap, by_pictures=by_pictures)
-    return video_plan(
-        camera,
-        height_m,
-        speed_m_s,
-        settings.overlap,
-        duration_s(source),
-        source.frame_rate_hz,
-        by_pictures=by_pictures,
-    )
+    moving = camera, telemetry.height_m, telemetry.speed_m_s, settings.overlap
+    if source.kind == "photos":
+        plan = untimed_plan(is_video=False, expected=source.frame_count)
+    elif is_live:
+        plan = live_plan(*moving, by_pictures=by_pictures)
+    else:
+        plan = video_plan(*moving, seconds, source.frame_rate_hz, by_pictures=by_pictures)
+    return FlightSetup(source, frame, plan, site, telemetry.notices, telemetry)
 
 
 def known_flights(site: Path, catalogues: Catalogues | None = None) -> dict[str, str]:
@@ -380,11 +324,9 @@ def known_ground_m(archive: Archive) -> PointsM | None:
     return archive.site_grid().tile_centres_m(tiles)
 
 
-def _check_place(site: Site, track: Track, name: str, ground_m: PointsM | None) -> None:
-    """Raise InputError for a flight far from all ground that the site shows (None: from its origin)."""
-    nearest_m = distance_m(track, ground_m)
-    if nearest_m > _ANOTHER_PLACE_M:
-        raise InputError(
-            f"the flight {name} is {nearest_m / 1000:.0f} km from the site {site.name} at "
-            f"{site.origin.latitude_deg:.5f}, {site.origin.longitude_deg:.5f}: map it into a site folder of its own"
-        )
+def sun_over(site: Site, time_ns: int) -> Vector3 | None:
+    """(3,) the unit vector to the sun, east, north and up, at a UTC time; None where the clock has no date, or the site
+    no place on earth."""
+    if site.is_local or time_ns <= DATED_NS:
+        return None
+    return sun_direction(time_ns, site.origin.latitude_deg, site.origin.longitude_deg)

@@ -13,8 +13,7 @@ from sorvolo.geometry.coordinates import lonlat_from_text
 from sorvolo.heights.field import HeightField, along
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.volumes import Tie, Volume, VolumeSettings, above_rim, between, contours, tie
-from sorvolo.missions.heights.flight_views import run_of
-from sorvolo.missions.heights.run import height_grid, newest_flight
+from sorvolo.missions.heights.run import height_grid, newest_flight, run_of
 from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.store.exports.places import longitude_latitude
 from sorvolo.store.exports.plain import feature_collection, geojson_bytes

@@ -1,13 +1,16 @@
 """Heights of mapped flights: cameras in 3D, a height model, the bare ground and a true orthophoto, as files."""
 
+import json
 import resource
 import time
+from collections import OrderedDict
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from sorvolo.errors import InputError, SettingsError
+from sorvolo.geometry.arrays import ImageGray, ImageRGB
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.heights.cameras import Cameras3D, CameraSettings, solve_cameras
 from sorvolo.heights.figures import (
@@ -23,21 +26,151 @@ from sorvolo.heights.lattice import CellSettings, Lattice
 from sorvolo.heights.orthophoto import OrthophotoSettings, paint_orthophoto
 from sorvolo.heights.surface import Surface, SurfaceSettings, sweep_surface
 from sorvolo.heights.terrain import TerrainSettings, terrain
-from sorvolo.heights.views import View, ground_outlines_m
+from sorvolo.heights.views import View, fix_from_residual, ground_outlines_m, pixels_wide
 from sorvolo.missions.flight.headline import contradicts_itself
-from sorvolo.missions.heights.flight_views import flight_views, run_of
-from sorvolo.missions.heights.pictures import FlightPictures, SmallPictures
+from sorvolo.mosaic.exposure import corrected
+from sorvolo.registration.features import gray_from_rgb
+from sorvolo.registration.lens import Undistorter, at_size, refined_camera
 from sorvolo.store.atomic import atomic_write_bytes, scratch_folder
-from sorvolo.store.exports.plain import json_bytes
+from sorvolo.store.exports.plain import features_name, json_bytes
 from sorvolo.store.freed_memory import give_back
-from sorvolo.store.images import png_from_rgba
+from sorvolo.store.images import ImageCache, png_from_rgba
+from sorvolo.store.nofollow import read_below
 from sorvolo.store.rasters.geotiff import write_cog
 from sorvolo.store.rasters.heights import write_height_cog
 from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.catalogue import StoredKeyframe
 from sorvolo.store.site.catalogue_place import Catalogues
 from sorvolo.store.site.files import HeightFile
 from sorvolo.store.site.tiles import TileFolder
 from sorvolo.survey.flight import Site
+
+_MOST_BYTES = 256_000_000  # of frames.geojson; 10,000 frames have some ten; by choice
+_AXES = ("east", "north", "up")
+
+
+def flight_views(
+    archive: Archive, flight_id: str, keyframes: Sequence[StoredKeyframe]
+) -> list[View]:
+    """The views of a flight. Raises InputError for one that heights cannot be made of."""
+    if not keyframes:
+        known = ", ".join(each.id for each in archive.flights()) or "none"
+        raise InputError(
+            f"{archive.folder} has no cameras in space of a flight {flight_id!r} (its flights: {known}); "
+            "heights need a flight mapped with --method planar"
+        )
+    if archive.site().is_local:
+        raise InputError(
+            f"{archive.folder} has no GPS and so no metres: heights need a flight with GPS positions"
+        )
+    residuals = _residuals_m(archive, flight_id)
+    return [
+        View(
+            each.name,
+            each.camera,
+            each.site_from_camera,
+            fix_from_residual(each.site_from_camera, residuals.get(each.name, (None, None, None))),
+        )
+        for each in keyframes
+        if each.site_from_camera is not None
+    ]
+
+
+def run_of(keyframes: Sequence[StoredKeyframe]) -> str:
+    """Which mapping run the keyframes are of: heights of another run do not fit the map any more."""
+    return keyframes[0].image_path.rsplit("/", 2)[-2]
+
+
+def _residuals_m(archive: Archive, flight_id: str) -> dict[str, tuple[float | None, ...]]:
+    """Camera minus fix of each frame by name, None where there was no fix."""
+    path = archive.flight_folder(flight_id) / features_name("frames", is_local=False)
+    try:
+        features = json.loads(read_below(path.parent, path.name, _MOST_BYTES))["features"]
+        rows = [each["properties"] for each in features]
+        return {
+            str(row["frame"]): tuple(row[f"gps_residual_{axis}_m"] for axis in _AXES)
+            for row in rows
+        }
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(f"{path} is gone or damaged ({error!r}); map the flight again") from error
+
+
+_LARGE_BYTES = 288 << 20  # of pictures as stored, for the orthophoto: ten of 9 megapixels
+_SMALL_BYTES = (
+    128 << 20
+)  # of gray ones, for the sweep: about a hundred of 4000 px at the usual cells
+
+
+class FlightPictures:
+    """Loads and corrects pictures, and keeps those last asked for by `colour`; numbers count the keyframes given."""
+
+    def __init__(
+        self,
+        archive: Archive,
+        keyframes: Sequence[StoredKeyframe],
+        radial: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        self._archive, self._keyframes = archive, keyframes
+        self._lens = (
+            Undistorter(refined_camera(keyframes[0].camera, 1.0, *radial)) if any(radial) else None
+        )
+        self._large = ImageCache(self._load, _LARGE_BYTES)
+
+    def colour(self, number: int) -> ImageRGB:
+        """A picture as it is stored, corrected."""
+        return self._large.get(number)
+
+    def gray(self, number: int) -> ImageGray:
+        """A picture in gray, as it is stored; it is not kept."""
+        return gray_from_rgb(self._load(number))
+
+    def grays(self, number: int, widths: Sequence[int]) -> dict[int, ImageGray]:
+        """A picture in gray, so many pixels wide each; decoded once, and not kept."""
+        image, camera = self._load(number), self._keyframes[number].camera
+        return {
+            width: gray_from_rgb(
+                at_size(image, width, round(width * camera.height_px / camera.width_px))
+            )
+            for width in widths
+        }
+
+    def _load(self, number: int) -> ImageRGB:
+        keyframe = self._keyframes[number]
+        image = corrected(self._archive.image(keyframe), keyframe.gains, keyframe.vignette)
+        return image if self._lens is None else self._lens.undistort(image)
+
+
+class SmallPictures:
+    """The pictures of a flight in gray, their pixels covering about each of `sizes_m` of ground; those used last stay.
+
+    A picture that is coarser than a size comes as it is. All its sizes are made when it is decoded, for a sweep needs
+    one after the other.
+    """
+
+    def __init__(
+        self,
+        pictures: FlightPictures,
+        views: Sequence[View],
+        sizes_m: Sequence[float],
+    ) -> None:
+        self._pictures, self._views, self._sizes_m = pictures, views, sizes_m
+        self._bytes = 0
+        self._kept: OrderedDict[int, dict[int, ImageGray]] = OrderedDict()
+
+    def gray(self, number: int, size_m: float) -> ImageGray:
+        """View `number`'s picture, its pixels covering `size_m`, one of the sizes."""
+        if number not in self._kept:
+            widths = sorted({pixels_wide(self._views[number], each) for each in self._sizes_m})
+            self._kept[number] = self._pictures.grays(number, widths)
+            self._bytes += _bytes(self._kept[number])
+            while self._bytes > _SMALL_BYTES and len(self._kept) > 1:
+                self._bytes -= _bytes(self._kept.popitem(last=False)[1])
+        self._kept.move_to_end(number)
+        return self._kept[number][pixels_wide(self._views[number], size_m)]
+
+
+def _bytes(pictures: dict[int, ImageGray]) -> int:
+    return sum(each.nbytes for each in pictures.values())
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,6 @@ from sorvolo.missions.flight.base_map import open_base
 from sorvolo.missions.flight.control import open_control
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.disk import LiveRoom, check_room
-from sorvolo.missions.flight.frames_ahead import read_ahead
 from sorvolo.missions.flight.map_objects import ObjectFinder, open_detector
 from sorvolo.missions.flight.opened import OpenedFlight, opened_flights
 from sorvolo.missions.flight.request import AlreadyDone
@@ -36,9 +35,9 @@ from sorvolo.missions.flight.setup import (
     prepare,
     repeated,
 )
+from sorvolo.missions.flight.threads import read_ahead
 from sorvolo.missions.map.coverage import FlightCoverage
-from sorvolo.missions.map.planar_run import PlanarRun
-from sorvolo.missions.map.run import FlightRun
+from sorvolo.missions.map.planar_run import FlightRun, PlanarRun
 from sorvolo.mosaic.control import ControlSettings
 from sorvolo.mosaic.selection import (
     Selected,

@@ -1,31 +1,158 @@
 """Flights that earlier searches measured, put together with one that goes on: their frames looked at, not searched."""
 
+import json
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import replace
-from functools import partial
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Self
 
+from sorvolo import __version__
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import PointsM
-from sorvolo.missions.search.frames import flights_to_search, marked_heights, search_frames
+from sorvolo.missions.flight.request import software
 from sorvolo.missions.search.measure import (
-    MeasuredClass,
+    FlightLooks,
     MeasuredFlight,
     SearchedPlants,
     SearchFrame,
-    look_of,
-    measured_class,
-    plants_of,
-    reach_m,
+    planted_classes,
     sun_at,
 )
-from sorvolo.missions.search.measured_before import Basis, read_plants
-from sorvolo.missions.search.prepare import PreparedSearch
-from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
+from sorvolo.missions.search.prepare import (
+    PreparedSearch,
+    flights_to_search,
+    marked_heights,
+    search_frames,
+)
+from sorvolo.missions.search.settings import PLANTS, SearchOutputs, SearchSettings
 from sorvolo.search.cells import Cells, cells_of
-from sorvolo.search.conditions import AboveGround, Gathering
+from sorvolo.search.conditions import AboveGround
+from sorvolo.search.plant_places import PlantPlace
+from sorvolo.store.atomic import atomic_write_bytes
+from sorvolo.store.exports.plain import feature_collection, geojson_bytes
+from sorvolo.store.exports.pod_files import point_features
 from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.journal import content_sha256
 from sorvolo.survey.flight import Site
+from sorvolo.tracking.laying import pose_of
+
+_FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Basis:
+    """By what the plants of a flight were measured.
+
+    `program` (with the libraries that it runs on), `model`, `frames` (their cameras and places), `heights` and `area`
+    are hashes, "" for no heights and no area.
+    """
+
+    program: str
+    model: str
+    frames: str
+    heights: str
+    through_crowns: float
+    sun_deg: tuple[float, float] | None
+    classes: tuple[str, ...]
+    plants: int
+    seed: int
+    area: str
+
+    @classmethod
+    def of(
+        cls,
+        frames: Sequence[SearchFrame],
+        prepared: PreparedSearch,
+        settings: SearchSettings,
+        *,
+        heights: str,
+    ) -> Self:
+        """The basis of a search of these frames."""
+        area = "" if prepared.area is None else content_sha256(prepared.area.polygons_lonlat)
+        places = [(each.placed.camera, pose_of(each.placed)) for each in frames]
+        return cls(
+            content_sha256(__version__, software()),
+            content_sha256(prepared.detector.info),
+            content_sha256(places),
+            heights,
+            settings.through_crowns,
+            settings.sun_deg,
+            planted_classes(prepared.detector, settings),
+            settings.plants,
+            settings.seed,
+            area,
+        )
+
+    @classmethod
+    def from_json(cls, row: Mapping[str, Any]) -> Self:
+        """The basis that `asdict` made plain. Raises KeyError, TypeError or ValueError for anything else."""
+        values = {name: row[name] for name in cls.__dataclass_fields__}
+        sun_deg = (
+            None
+            if values["sun_deg"] is None
+            else (float(values["sun_deg"][0]), float(values["sun_deg"][1]))
+        )
+        return cls(**{**values, "sun_deg": sun_deg, "classes": tuple(values["classes"])})
+
+    def serves(self, other: "Basis") -> bool:
+        """Whether plants on this basis state as much for another search: of the same frames by the same model, under
+        the same assumptions and of all its classes, however many there are and wherever in the frames they stand."""
+        alike = replace(
+            self, classes=other.classes, plants=other.plants, seed=other.seed, area=other.area
+        )
+        return alike == other and set(other.classes) <= set(self.classes)
+
+
+def read_plants(folder: Path) -> dict[str, tuple[Basis, SearchedPlants]]:
+    """What earlier searches into this folder planted, by the flights' names; nothing of a file that cannot be read."""
+    try:
+        content = json.loads((folder / PLANTS).read_bytes())
+        if content["format"] != _FORMAT:
+            return {}
+        planted: dict[str, list[tuple[PlantPlace, bool]]] = {
+            name: [] for name in content["flights"]
+        }
+        for each in content["features"]:
+            row = each["properties"]
+            planted[row["flight"]].append(
+                (PlantPlace.at(row["class"], *row["site_m"]), bool(row["found"]))
+            )
+        return {
+            name: (
+                Basis.from_json(row["basis"]),
+                SearchedPlants(row["looked"], row["rounds"], row["seconds"], tuple(planted[name])),
+            )
+            for name, row in content["flights"].items()
+        }
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return {}
+
+
+def write_plants(
+    folder: Path, site: Site, flights: Mapping[str, tuple[Basis, SearchedPlants]]
+) -> None:
+    """Write what `read_plants` reads: a point for each plant, with its flight, class and whether it was found."""
+    rows = [(name, place, hit) for name, (_, own) in flights.items() for place, hit in own.plants]
+    properties = [
+        {"flight": name, "class": place.label, "found": hit, "site_m": place.place_m.tolist()}
+        for name, place, hit in rows
+    ]
+    features = point_features([place.place_m for _, place, _ in rows], site, properties)
+    collection = feature_collection("plants", features, is_local=False)
+    collection |= {
+        "format": _FORMAT,
+        "flights": {
+            name: {
+                "looked": own.looked,
+                "rounds": own.rounds,
+                "seconds": round(own.seconds, 1),
+                "basis": asdict(basis),
+            }
+            for name, (basis, own) in flights.items()
+        },
+    }
+    atomic_write_bytes(folder / PLANTS, geojson_bytes(collection))
 
 
 class EarlierFlights:
@@ -111,51 +238,25 @@ class _Flight:
         above: AboveGround | None,
         settings: SearchSettings,
     ) -> None:
-        self.name, self.frames, self._settings, self._searched = name, frames, settings, searched
+        self.name, self.frames, self._labels = name, frames, labels
+        self._searched, self._settings = searched, settings
         self.cells = cells_of([each.placed.outline_m for each in frames], site, None)
-        self._sun, self._has_heights = (
-            sun_at(frames[len(frames) // 2], site, settings),
-            above is not None,
-        )
-        on = partial(Gathering, above=above)
-        self._cells = {label: on(self.cells.centres_m, reach_m(label)) for label in labels}
-        self._plants = {
-            label: on(plants_of(label, searched.plants)[0], reach_m(label)) for label in labels
-        }
-        self._looked, self._is_thermal, self._blur_px = 0, False, 0.0
+        self._sun = sun_at(frames[len(frames) // 2], site, settings)
+        self._looks = FlightLooks(above)
 
     @property
     def is_whole(self) -> bool:
         """Whether all frames were looked at."""
-        return self._looked == len(self.frames)
+        return len(self._looks.frames) == len(self.frames)
 
     def look(self) -> None:
-        """Look at the next frame."""
-        light, look = look_of(self.frames[self._looked], self._sun)
-        for each in (*self._cells.values(), *self._plants.values()):
-            each.add(look)
-        self._looked += 1
-        self._is_thermal |= light.is_thermal
-        self._blur_px = max(self._blur_px, light.blur_px)
+        self._looks.add(self.frames[len(self._looks.frames)], self._sun)
 
     def measured(self) -> MeasuredFlight:
-        """What its plants state of its own cells."""
-        return MeasuredFlight(
-            self.name,
-            len(self.frames),
-            self._searched,
-            self._sun is not None,
-            self._has_heights,
-            self._is_thermal,
-            self._blur_px,
-            tuple(map(self._class, self._cells)),
-            is_earlier=True,
-        )
-
-    def _class(self, label: str) -> MeasuredClass:
-        seen, plants_seen = self._cells[label].conditions(), self._plants[label].conditions()
-        return measured_class(
-            label, seen, self._searched.plants, lambda _, __: plants_seen, self._settings
+        """Return what its plants state of its own cells."""
+        seen = self._looks.of_cells(self.cells, self._labels)
+        return self._looks.measured(
+            self.name, seen, self._searched, self._settings, is_earlier=True
         )
 
 

@@ -6,23 +6,24 @@ from typing import Any
 
 from sorvolo.errors import InputError
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
-from sorvolo.missions.search.files import write_search
-from sorvolo.missions.search.frames import flights_to_search, marked_heights, search_frames
+from sorvolo.missions.search.earlier import Basis, read_plants, write_plants
 from sorvolo.missions.search.measure import (
     MeasuredFlight,
     SearchFrame,
     SearchProgress,
     measure_flight,
 )
-from sorvolo.missions.search.measured_before import Basis, read_plants, write_plants
 from sorvolo.missions.search.prepare import (
     PreparedSearch,
     check_area,
+    flights_to_search,
     known_places,
+    marked_heights,
     prepare_search,
+    search_frames,
     site_with_metres,
 )
-from sorvolo.missions.search.report import Searched
+from sorvolo.missions.search.report import Searched, write_search
 from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
 from sorvolo.search.cells import Cells, cells_of
 from sorvolo.store.atomic import writing
@@ -83,16 +84,13 @@ def _measured(
         above, mark = marked_heights(archive, name)
         basis = Basis.of(own, prepared, settings, heights=mark)
         earlier = known[name][1] if name in known and known[name][0] == basis else None
-        for each in measure_flight(
+        flight = yield from measure_flight(
             name, own, cells, site, prepared.detector, settings, known_m, above, earlier
-        ):
-            if isinstance(each, SearchProgress):
-                yield each
-                continue
-            measured.append(each)
-            if earlier is None:
-                known[name] = basis, each.searched
-                with writing(folder):
-                    folder.mkdir(parents=True, exist_ok=True)
-                write_plants(folder, site, known)
+        )
+        measured.append(flight)
+        if earlier is None:
+            known[name] = basis, flight.searched
+            with writing(folder):
+                folder.mkdir(parents=True, exist_ok=True)
+            write_plants(folder, site, known)
     return measured

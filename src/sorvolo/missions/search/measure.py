@@ -1,26 +1,25 @@
 """One flight measured: plants into its own frames, the detector over them, and what a map would have reported."""
 
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import TypeAlias
 
 from sorvolo.detection.fusing import is_from_above
 from sorvolo.errors import SettingsError
-from sorvolo.geometry.arrays import BoxesPx, Floats, ImageRGB, Mask, Vector3
+from sorvolo.geometry.arrays import BoxesPx, Floats, ImageRGB, PointsM, Vector3
 from sorvolo.geometry.sun import direction_from_angles
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.map_objects import check_classes
-from sorvolo.missions.flight.sunlight import sun_over
+from sorvolo.missions.flight.setup import sun_over
 from sorvolo.missions.search.settings import SearchSettings
-from sorvolo.search.cells import Cells
+from sorvolo.search.cells import Cells, cells_of
 from sorvolo.search.conditions import AboveGround, Conditions, FrameLook, gather, look_at
 from sorvolo.search.drawing.frame_light import FrameLight, frame_light
 from sorvolo.search.drawing.objects import Thing
 from sorvolo.search.drawing.planted import new_plant, plant
-from sorvolo.search.outcomes import Outcomes, any_of, every_label, found_rows
-from sorvolo.search.plant_places import PlantPlace, plant_places, seeded
+from sorvolo.search.outcomes import Outcomes, any_of, every_label, found_rows, near_any, rows_of
+from sorvolo.search.plant_places import PlantField, PlantPlace, plant_places, seeded
 from sorvolo.search.recall import Chances, Recall, fit_recall, map_chances
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import PlacedFrame
@@ -28,9 +27,6 @@ from sorvolo.survey.objects import CLASSES, TYPICAL_SIZE_M
 from sorvolo.tracking.laying import LaidSighting, lay_on_ground, pose_of
 from sorvolo.tracking.map_objects import reported_plants
 from sorvolo.tracking.view_evidence import least_seen
-
-ConditionsAt: TypeAlias = Callable[[Sequence[Floats], float], Conditions]
-"""The conditions of places, (2,) each, that reach so far, m."""
 
 Planted: TypeAlias = tuple[PlantPlace, bool]
 """Where one plant stood, and whether a map would report it."""
@@ -94,6 +90,74 @@ class SearchProgress:
     planted: int
 
 
+class FlightLooks:
+    """A flight's frames as they were looked at, and what they show of places. Only `add` changes it.
+
+    `above` has how high things stand, where the flight has heights.
+    """
+
+    def __init__(self, above: AboveGround | None) -> None:
+        self.above = above
+        self.frames: list[SearchFrame] = []
+        self.lights: list[FrameLight] = []
+        self.looks: list[FrameLook] = []
+        self.has_shadows = False
+
+    def add(self, frame: SearchFrame, sun: Vector3 | None) -> ImageRGB:
+        """Look at the next frame; its picture."""
+        image, pose = frame.image(), pose_of(frame.placed)
+        assert pose is not None  # frames without a place are none of these
+        self.frames.append(frame)
+        self.lights.append(frame_light(image))
+        blur_px = self.lights[-1].blur_px
+        self.looks.append(look_at(image, frame.placed.camera, pose, blur_px, sun))
+        self.has_shadows |= sun is not None
+        return image
+
+    def at(self, places_m: PointsM | Sequence[Floats], reach_m: float) -> Conditions:
+        """Return the conditions of places, (2,) each, that reach so far, m."""
+        return gather(self.looks, places_m, reach_m, self.above)
+
+    def of_cells(self, cells: Cells, labels: Sequence[str]) -> dict[str, Conditions]:
+        """Return the conditions of all cells for each class."""
+        return {label: self.at(cells.centres_m, reach_m(label)) for label in labels}
+
+    def measured(
+        self,
+        name: str,
+        seen: Mapping[str, Conditions],
+        searched: "SearchedPlants",
+        settings: SearchSettings,
+        *,
+        is_earlier: bool = False,
+    ) -> "MeasuredFlight":
+        """Return what plants state of all cells, which were `seen` under their conditions for each class."""
+        classes = []
+        for label, conditions in seen.items():
+            own = [(place.place_m, hit) for place, hit in searched.plants if place.label == label]
+            places_m = [place_m for place_m, _ in own]
+            outcomes = found_rows(
+                places_m, self.at(places_m, reach_m(label)), [hit for _, hit in own]
+            )
+            recall = fit_recall(outcomes.columns, outcomes.found) if len(outcomes) else None
+            hidden = conditions.roofs
+            if settings.through_crowns == 0:
+                hidden = hidden | conditions.under_trees
+            chances = map_chances(recall, conditions.columns, hidden)
+            classes.append(MeasuredClass(label, conditions, outcomes, recall, chances))
+        return MeasuredFlight(
+            name,
+            len(self.frames),
+            searched,
+            self.has_shadows,
+            self.above is not None,
+            any(each.is_thermal for each in self.lights),
+            max((each.blur_px for each in self.lights), default=0.0),
+            tuple(classes),
+            is_earlier,
+        )
+
+
 def measure_flight(
     name: str,
     frames: Sequence[SearchFrame],
@@ -104,77 +168,86 @@ def measure_flight(
     keep_off_m: Sequence[Floats],
     above: AboveGround | None = None,
     before: SearchedPlants | None = None,
-) -> Iterator[SearchProgress | MeasuredFlight]:
-    """Measure one flight over a site with metres; yields progress and, at last, what was measured.
+) -> Generator[SearchProgress, None, MeasuredFlight]:
+    """Measure one flight over a site with metres, yielding progress.
 
     `keep_off_m` are places, (2,) each, of what stands on the map already: no plant is put beside it.
     `above` has how high things stand, where the flight has heights. With plants that were searched for `before` nothing
     is planted, only the cells' conditions are looked at. Raises SettingsError as `planted_classes` does.
     """
     wanted = planted_classes(detector, settings)
-    sun = sun_at(frames[len(frames) // 2], site, settings)
-    lights, looks = _looks(frames, sun)
-    conditions_at = partial(gather, looks, above=above)
-    seen = {label: conditions_at(cells.centres_m, reach_m(label)) for label in wanted}
-    if before is None:
-        places = plant_places(
+    sun, looks = sun_at(frames[len(frames) // 2], site, settings), FlightLooks(above)
+    for frame in frames:
+        looks.add(frame, sun)
+    seen = looks.of_cells(cells, wanted)
+    searched = before
+    if searched is None:
+        # under trees plants stand only where some of them would show
+        first = seen[wanted[0]]
+        usable = cells.wanted & first.seen & ~first.roofs
+        if settings.through_crowns == 0:
+            usable &= ~first.beside_trees
+        rounds = plant_places(
             cells,
-            seen[wanted[0]],
+            first,
             wanted,
             settings.plants,
             keep_off_m=keep_off_m,
             free_m=KEEP_OFF_M,
             rng=seeded(settings.seed),
-            usable=_usable(seen[wanted[0]], cells, settings),
+            usable=usable,
         )
-        searched = yield from _searched(
-            name, frames, lights, conditions_at, places, sun, detector, wanted, settings
-        )
-    else:
-        searched = before
-    classes = tuple(
-        measured_class(label, seen[label], searched.plants, conditions_at, settings)
-        for label in wanted
-    )
-    yield MeasuredFlight(
-        name,
-        len(frames),
-        searched,
-        sun is not None,
-        above is not None,
-        any(each.is_thermal for each in lights),
-        max((each.blur_px for each in lights), default=0.0),
-        classes,
-        is_earlier=before is not None,
-    )
+        searched = yield from _searched(name, looks, rounds, sun, detector, wanted, settings)
+    return looks.measured(name, seen, searched, settings, is_earlier=before is not None)
 
 
 def _searched(
     name: str,
-    frames: Sequence[SearchFrame],
-    lights: Sequence[FrameLight],
-    conditions_at: ConditionsAt,
+    flight: FlightLooks,
     rounds: Sequence[Sequence[PlantPlace]],
     sun: Vector3 | None,
     detector: ObjectDetector,
     wanted: Sequence[str],
     settings: SearchSettings,
 ) -> Generator[SearchProgress, None, SearchedPlants]:
-    """Plant one round after the other and search the frames."""
-    started_s = time.monotonic()
+    """Plant one round after the other into all frames that show some of it, and search these."""
+    started_s, frames = time.monotonic(), flight.frames
     gathered: list[Planted] = []
-    number = looked = 0
-    for place_round in rounds:
+    looked = 0
+    for places in rounds:
         things = [
-            new_plant(number + k, each.label, each.place_m, settings.seed)
-            for k, each in enumerate(place_round)
+            new_plant(len(gathered) + k, each.label, each.place_m, settings.seed)
+            for k, each in enumerate(places)
         ]
-        number += len(things)
-        run = _Round(frames, lights, conditions_at, things, sun, settings)
-        yield from run.search(name, detector, wanted, looked, len(rounds) * len(frames), gathered)
-        looked += run.looked
-        reported = run.reported()
-        gathered += [(place, k in reported) for k, place in enumerate(place_round)]
+        under = flight.at([each.place_m(0)[:2] for each in things], 0.5).under_trees
+        shown = [settings.through_crowns if hidden else 1.0 for hidden in under]
+        laid: list[LaidSighting] = []
+        boxes_px: dict[int, BoxesPx] = {}
+        least: dict[str, float] = {}
+        hits, is_again = sum(hit for _, hit in gathered), looked > 0
+        for number, (frame, light) in enumerate(zip(frames, flight.lights)):
+            seen = search_planted(
+                frame,
+                frame.image(),
+                light,
+                things,
+                sun,
+                shown,
+                settings.seed + number,
+                detector,
+                wanted,
+                is_again=is_again,
+            )
+            if seen is not None:
+                least = strictest(least, seen.least)
+                boxes_px[frame.placed.index] = seen.boxes_px
+                laid += seen.laid
+                looked += 1
+            yield SearchProgress(name, looked, len(rounds) * len(frames), hits, len(gathered))
+        labels = [str(each.label) for each in things]
+        placed = [each.placed for each in frames]
+        reported = reported_plants(laid, placed, boxes_px, labels, least)
+        gathered += [(place, k in reported) for k, place in enumerate(places)]
     return SearchedPlants(looked, len(rounds), time.monotonic() - started_s, tuple(gathered))
 
 
@@ -258,95 +331,6 @@ def strictest(one: Mapping[str, float], other: Mapping[str, float]) -> dict[str,
     return {name: max(score, one.get(name, 0.0)) for name, score in other.items()}
 
 
-class _Round:
-    """Plants that stand at once, in all frames that show them."""
-
-    def __init__(
-        self,
-        frames: Sequence[SearchFrame],
-        lights: Sequence[FrameLight],
-        conditions_at: ConditionsAt,
-        things: Sequence[Thing],
-        sun: Vector3 | None,
-        settings: SearchSettings,
-    ) -> None:
-        self._frames, self._lights, self._things, self._sun, self._settings = (
-            frames,
-            lights,
-            things,
-            sun,
-            settings,
-        )
-        under = conditions_at([each.place_m(0)[:2] for each in things], 0.5).under_trees
-        self._shown = [settings.through_crowns if hidden else 1.0 for hidden in under]
-        self._laid: list[LaidSighting] = []
-        self._boxes_px: dict[int, BoxesPx] = {}
-        self._least: dict[str, float] = {}
-        self.looked = 0
-
-    def search(
-        self,
-        name: str,
-        detector: ObjectDetector,
-        wanted: Sequence[str],
-        before: int,
-        total: int,
-        gathered: Sequence[Planted],
-    ) -> Iterator[SearchProgress]:
-        """Plant into one frame after the other and search it; those that show no plant are left out."""
-        for number, (each, light) in enumerate(zip(self._frames, self._lights)):
-            seen = search_planted(
-                each,
-                each.image(),
-                light,
-                self._things,
-                self._sun,
-                self._shown,
-                self._settings.seed + number,
-                detector,
-                wanted,
-                is_again=before > 0,
-            )
-            if seen is not None:
-                self._least = strictest(self._least, seen.least)
-                self._boxes_px[each.placed.index] = seen.boxes_px
-                self._laid += seen.laid
-                self.looked += 1
-            hits = sum(hit for _, hit in gathered)
-            yield SearchProgress(name, before + self.looked, total, hits, len(gathered))
-
-    def reported(self) -> set[int]:
-        """Which of the plants a map of these frames would report."""
-        placed = [each.placed for each in self._frames]
-        labels = [str(each.label) for each in self._things]
-        return reported_plants(self._laid, placed, self._boxes_px, labels, self._least)
-
-
-def _looks(
-    frames: Sequence[SearchFrame], sun: Vector3 | None
-) -> tuple[list[FrameLight], list[FrameLook]]:
-    lights, looks = [], []
-    for each in frames:
-        light, look = look_of(each, sun)
-        lights.append(light)
-        looks.append(look)
-    return lights, looks
-
-
-def look_of(frame: SearchFrame, sun: Vector3 | None) -> tuple[FrameLight, FrameLook]:
-    """A frame's light, and its small maps."""
-    image, pose = frame.image(), pose_of(frame.placed)
-    assert pose is not None  # frames without a place are none of these
-    light = frame_light(image)
-    return light, look_at(image, frame.placed.camera, pose, light.blur_px, sun)
-
-
-def _usable(seen: Conditions, cells: Cells, settings: SearchSettings) -> Mask:
-    """Where plants may stand: wanted ground that was seen, under trees only where some of them would show."""
-    usable = cells.wanted & seen.seen & ~seen.roofs
-    return usable if settings.through_crowns > 0 else usable & ~seen.beside_trees
-
-
 def sun_at(frame: SearchFrame, site: Site, settings: SearchSettings) -> Vector3 | None:
     """The direction to the sun as a frame was taken; None where no clock knows the date."""
     if settings.sun_deg is not None:
@@ -354,25 +338,139 @@ def sun_at(frame: SearchFrame, site: Site, settings: SearchSettings) -> Vector3 
     return sun_over(site, frame.placed.time_ns)
 
 
-def measured_class(
-    label: str,
-    seen: Conditions,
-    planted: Sequence[Planted],
-    conditions_at: ConditionsAt,
-    settings: SearchSettings,
-) -> MeasuredClass:
-    """What plants of a class state of all cells, which were `seen` under their conditions; others are left out.
+_AROUND_M = 6.0  # of a plant: sightings farther away are of other things; more than its own length
+_REACH_M = 5.0  # beside a frame's ground: what stands there leans or throws its shadow in
 
-    `conditions_at` is asked for the places of these plants alone.
+
+class GrowingMeasure:
+    """The measure of a flight that goes on, over a site with metres.
+
+    `add` takes one frame after another, `measured` gives what all of them state together. Plants stand in a field that
+    was sown before anybody saw it (`PlantField`), so that all frames of a place show the same; a frame is planted on
+    the place that it has when it is added, and its sightings are laid by that. What turns out to be under trees or
+    roofs does not count as planted, but where `through_crowns` is given. `keep_off_m` and `above` as `measure_flight`
+    takes them. A flight that climbs shows too many plants at once: a wider field is sown then, and what was measured
+    from below is forgotten.
     """
-    places_m, hits = plants_of(label, planted)
-    outcomes = found_rows(places_m, conditions_at(places_m, reach_m(label)), hits)
-    recall = fit_recall(outcomes.columns, outcomes.found) if len(outcomes) else None
-    hidden = seen.roofs | seen.under_trees if settings.through_crowns == 0 else seen.roofs
-    return MeasuredClass(label, seen, outcomes, recall, map_chances(recall, seen.columns, hidden))
 
+    def __init__(
+        self,
+        name: str,
+        site: Site,
+        detector: ObjectDetector,
+        settings: SearchSettings,
+        *,
+        area_m: Sequence[Sequence[PointsM]] | None,
+        keep_off_m: Sequence[Floats],
+        above: AboveGround | None,
+    ) -> None:
+        self._name, self._site, self._detector, self._settings = name, site, detector, settings
+        self._area_m, self._keep_off_m = area_m, keep_off_m
+        self._wanted = planted_classes(detector, settings)
+        self._field: PlantField | None = None
+        self._things: list[Thing] = []
+        self._looks = FlightLooks(above)
+        self._pictures: dict[int, tuple[PlacedFrame, Sequence[int], SearchedPicture]] = {}
+        self._fresh: set[int] = (
+            set()
+        )  # plants that were shown since it was last asked which are reported
+        self._reported: set[int] = set()
+        self._least: dict[str, float] = {}
+        self._seconds = 0.0
 
-def plants_of(label: str, planted: Sequence[Planted]) -> tuple[list[Floats], list[bool]]:
-    """Where the plants of a class stand, (2,) each, and whether each was found."""
-    own = [(place.place_m, hit) for place, hit in planted if place.label == label]
-    return [place_m for place_m, _ in own], [hit for _, hit in own]
+    @property
+    def frames(self) -> list[SearchFrame]:
+        """The frames that were added."""
+        return self._looks.frames
+
+    def add(self, frame: SearchFrame) -> None:
+        """Plant into a frame and search it."""
+        started_s, outline_m = time.monotonic(), frame.placed.outline_m
+        if self._field is None or not self._field.fits(outline_m):
+            self._forget()
+            self._field = PlantField(
+                self._wanted,
+                outline_m,
+                keep_off_m=self._keep_off_m,
+                free_m=KEEP_OFF_M,
+                seed=self._settings.seed,
+            )
+        sun = sun_at(frame, self._site, self._settings)
+        image = self._looks.add(frame, sun)
+        light, look = self._looks.lights[-1], self._looks.looks[-1]
+        numbers = self._field.near(outline_m, _REACH_M)
+        self._grow(self._field)
+        things = [self._things[each] for each in numbers]
+        under = gather(
+            [look], [each.place_m(0)[:2] for each in things], 0.5, self._looks.above
+        ).under_trees
+        shown = [
+            self._settings.through_crowns if hidden and self._settings.through_crowns else 1.0
+            for hidden in under
+        ]
+        seed = self._settings.seed + frame.placed.index
+        seen = search_planted(
+            frame, image, light, things, sun, shown, seed, self._detector, self._wanted
+        )
+        if seen is not None:
+            self._pictures[frame.placed.index] = frame.placed, numbers, seen
+            self._fresh.update(numbers)
+            self._least = strictest(self._least, seen.least)
+        self._seconds += time.monotonic() - started_s
+
+    def measured(self, beside_m: Sequence[PointsM] = ()) -> tuple[Cells, MeasuredFlight]:
+        """The cells of the ground by now, and what the frames so far state of them. At least one was added.
+
+        The ground of other flights' frames, (4, 2) site metres each, counts as flown as well.
+        """
+        outlines_m = [*beside_m, *(each.placed.outline_m for each in self.frames)]
+        cells = cells_of(outlines_m, self._site, self._area_m)
+        places = [] if self._field is None else self._field.places
+        self._judge_fresh(places)
+        at = self._looks.at([each.place_m for each in places], 0.5)
+        hides = at.roofs if self._settings.through_crowns > 0 else at.roofs | at.beside_trees
+        gathered = [
+            (place, number in self._reported)
+            for number, (place, hidden) in enumerate(zip(places, hides))
+            if not hidden
+        ]
+        searched = SearchedPlants(len(self._pictures), 1, self._seconds, tuple(gathered))
+        seen = self._looks.of_cells(cells, self._wanted)
+        return cells, self._looks.measured(self._name, seen, searched, self._settings)
+
+    def _judge_fresh(self, places: Sequence[PlantPlace]) -> None:
+        """Find out anew which plants are reported, of those that were shown since: what is far from them stays."""
+        if not self._fresh:
+            return
+        fresh_m = [places[each].place_m for each in self._fresh]
+        known = near_any([each.place_m for each in places], fresh_m, 2 * _AROUND_M)
+        wanted = set(known)
+        pictures = [each for each in self._pictures.values() if not wanted.isdisjoint(each[1])]
+        boxes = {
+            placed.index: rows_of(seen.boxes_px, numbers, known)
+            for placed, numbers, seen in pictures
+        }
+        laid = [each for _, _, seen in pictures for each in seen.laid]
+        near = near_any([each.sighting.position_m for each in laid], fresh_m, _AROUND_M)
+        labels = [places[each].label for each in known]
+        frames = [placed for placed, _, _ in pictures]
+        reported = reported_plants(
+            [laid[each] for each in near], frames, boxes, labels, self._least
+        )
+        self._reported -= self._fresh
+        self._reported |= {known[row] for row in reported} & self._fresh
+        self._fresh.clear()
+
+    def _forget(self) -> None:
+        """Begin anew with another field: the flight has climbed, and its first pictures show little."""
+        self._things.clear()
+        self._looks = FlightLooks(self._looks.above)
+        self._pictures.clear()
+        self._fresh.clear()
+        self._reported.clear()
+
+    def _grow(self, field: PlantField) -> None:
+        """Make the things that stand at the field's new places."""
+        for number in range(len(self._things), len(field.places)):
+            place = field.places[number]
+            self._things.append(new_plant(number, place.label, place.place_m, self._settings.seed))

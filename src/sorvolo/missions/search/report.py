@@ -3,18 +3,33 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.tiling import TASK
+from sorvolo.geometry.arrays import Floats, ImageRGBA, PointsM
 from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.geometry.planning import BOTTOM_CRITICAL_M
 from sorvolo.geometry.summary import calibration_bins, median_of_known, wilson
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
+from sorvolo.missions.plan_flight import ReflySettings, fly_again
 from sorvolo.missions.search.measure import MeasuredClass, MeasuredFlight, SearchFrame
-from sorvolo.missions.search.settings import SearchSettings
+from sorvolo.missions.search.settings import FIGURES, SearchOutputs, SearchSettings
 from sorvolo.search.cells import Cells
-from sorvolo.search.holes import HoleReason, Holes, hole_areas_m2, hole_reasons, reasons_together
+from sorvolo.search.holes import (
+    POD_EDGES,
+    REASONS,
+    HoleReason,
+    Holes,
+    flyable,
+    hole_areas_m2,
+    hole_reasons,
+    pod_classes,
+    reasons_together,
+    without_seen,
+)
 from sorvolo.search.recall import (
     Chances,
     figures,
@@ -23,15 +38,25 @@ from sorvolo.search.recall import (
     segment,
     together,
 )
-from sorvolo.store.exports.plain import plain_json
+from sorvolo.store.atomic import atomic_write_bytes, writing
+from sorvolo.store.exports.map_pictures import picture
+from sorvolo.store.exports.plain import feature_collection, geojson_bytes, json_bytes, plain_json
+from sorvolo.store.exports.pod_files import (
+    PICTURE_PX,
+    CellGrid,
+    Region,
+    pod_picture,
+    region_features,
+    regions_of,
+    swollen_polygons,
+    write_pod_tif,
+)
+from sorvolo.store.pages.search import search_page
 from sorvolo.survey.area import Area, inside_any
 from sorvolo.survey.flight import Site
 from sorvolo.survey.objects import TYPICAL_SIZE_M
 from sorvolo.survey.wording import counted
 from sorvolo.tracking.laying import pose_of
-
-if TYPE_CHECKING:
-    from sorvolo.missions.search.refly import Refly
 
 _FEW_PLANTS = 25  # fewer outcomes of a class leave its probability a guess
 _WIDE_CELL_M = 10.0  # of a cell: a path, a hedge, a hole that is worth a flight
@@ -322,3 +347,176 @@ def _warnings(searched: Searched, settings: SearchSettings, *, is_over: bool) ->
 
 def _length_m(label: str) -> float:
     return max(TYPICAL_SIZE_M[label]) if label in TYPICAL_SIZE_M else 1.0
+
+
+@dataclass(frozen=True)
+class Refly:
+    """A second flight: how many holes of which area, how high, how long, and the files."""
+
+    holes: int
+    area_m2: float
+    height_m: float
+    duration_s: float
+    files: tuple[str, ...]
+
+
+def write_refly(
+    again: Sequence[Region],
+    grid: CellGrid,
+    searched: Searched,
+    settings: SearchSettings,
+    info: ModelInfo,
+    files: Sequence[Path],
+    *,
+    dji_drone: str,
+) -> Refly | None:
+    """Plan passes over the holes and write them; None where no hole is worth a flight.
+
+    It is flown as high as the first flights, lower where their pictures were too coarse for the detector.
+    """
+    pace = ReflySettings()
+    large = [each for each in again if each.area_m2 >= pace.least_m2][: pace.most_holes]
+    if not large:
+        return None
+    area = Area(tuple(_rings(large, grid)), "holes of the search")
+    camera, height_m = searched.camera, searched.height_m
+    if is_coarse(searched, settings, info):
+        needed = needed_m_per_px(searched.labels[0], info)
+        height_m = max(pace.lowest_m, min(height_m, 0.9 * needed * camera.fx_px))
+    plan = fly_again(area, camera, height_m, files, dji_drone=dji_drone, settings=pace)
+    return Refly(
+        len(large),
+        sum(each.area_m2 for each in large),
+        plan.height_m,
+        plan.duration_s,
+        tuple(map(str, files)),
+    )
+
+
+def _rings(regions: Sequence[Region], grid: CellGrid) -> list[tuple[Floats, ...]]:
+    return swollen_polygons(regions, grid, grid.cell_m / 2)
+
+
+def write_search(
+    searched: Searched,
+    tiles: Mapping[TileIndex, ImageRGBA],
+    site_grid: SiteGrid,
+    settings: SearchSettings,
+    outputs: SearchOutputs,
+    detector: ObjectDetector,
+    so_far: SoFar | None = None,
+    seen_before_m: Sequence[PointsM] = (),
+) -> dict[str, Any]:
+    """Write all files of a measured search over the map of these `tiles`, and return its report.
+
+    `so_far` is given of a flight that is not mapped whole; what earlier flights' frames of these outlines, (4, 2) site
+    metres each, show need not be flown again by it. Files of waypoints are taken away where nothing has to be flown
+    (which a warning states), or the flight was stopped. Raises StoreError where the disk is full.
+    """
+    site, cells = searched.site, searched.cells
+    grid = CellGrid(cells.outer_corner_m(), cells.cell_m, site.crs, site.origin.longitude_deg)
+    with writing(outputs.folder):
+        outputs.folder.mkdir(parents=True, exist_ok=True)
+    bands, features, pictures = {}, [], {}
+    shown = picture(tiles, PICTURE_PX)
+    for label in searched.labels:
+        total, holes = (
+            total_of(searched, label),
+            hole_numbers(searched, label, settings, detector.info),
+        )
+        classes = cells.as_grid(pod_classes(total, cells.wanted))
+        hole_grid = cells.as_grid(holes)
+        for name, values in (("pod", total.mean), ("low", total.low), ("high", total.high)):
+            bands[f"{label}: {name}"] = cells.as_grid(values)
+        features += _features(label, regions_of(classes, grid), regions_of(hole_grid, grid))
+        pictures[label] = pod_picture(shown, site_grid, classes, hole_grid > 0, grid)
+        if label == searched.labels[0]:
+            again = regions_of(
+                cells.as_grid(flyable(without_seen(holes, cells, seen_before_m))), grid
+            )
+    write_pod_tif(
+        outputs.folder / "pod.tif",
+        bands,
+        grid,
+        {"sorvolo": "probability of detection; docs/search.md"},
+    )
+    collection = feature_collection("pod", features, is_local=False)
+    atomic_write_bytes(outputs.folder / "pod.geojson", geojson_bytes(collection))
+    was_stopped = so_far is not None and so_far.state is State.STOPPED
+    refly = (
+        None
+        if was_stopped
+        else write_refly(
+            again,
+            grid,
+            searched,
+            settings,
+            detector.info,
+            outputs.refly,
+            dji_drone=outputs.dji_drone,
+        )
+    )
+    warnings = (
+        []
+        if refly is not None
+        else _without_waypoints(
+            outputs.refly, was_stopped=was_stopped, leaves_earlier=len(seen_before_m) > 0
+        )
+    )
+    report = build_search_report(searched, settings, detector, refly, so_far, warnings)
+    atomic_write_bytes(outputs.folder / "search.json", json_bytes(report))
+    atomic_write_bytes(outputs.folder / "search.html", search_page(report, pictures).encode())
+    return report
+
+
+def remove_figures(outputs: SearchOutputs) -> list[str]:
+    """Take away the figures and waypoints of an earlier search: a flight begins whose own come in their place.
+
+    Returns the files of waypoints that there were.
+    """
+    _removed([outputs.folder / name for name in FIGURES])
+    return _removed(outputs.refly)
+
+
+def _removed(files: Sequence[Path]) -> list[str]:
+    """Take these files away; those that there were."""
+    there = [str(path) for path in files if path.is_file()]
+    for path in files:
+        path.unlink(missing_ok=True)
+    return there
+
+
+def _without_waypoints(
+    files: Sequence[Path], *, was_stopped: bool, leaves_earlier: bool
+) -> list[str]:
+    """Take away earlier waypoints at these files, and what a person who asked for some has to know; `leaves_earlier`:
+    what earlier flights show was not to be flown."""
+    old = _removed(files)
+    if not files:
+        return []
+    if was_stopped:
+        return (
+            [f"the flight was stopped, and its waypoints were taken away: {', '.join(old)}"]
+            if old
+            else []
+        )
+    removed = f"; earlier ones were taken away: {', '.join(old)}" if old else ""
+    beside = " and that flights before it do not show" if leaves_earlier else ""
+    return [
+        f"no waypoints were written: no hole of {ReflySettings().least_m2:g} m2 or more is left that another flight "
+        f"may see{beside}{removed}"
+    ]
+
+
+def _features(
+    label: str, classes: Sequence[Region], holes: Sequence[Region]
+) -> list[dict[str, Any]]:
+    """Polygons of equal classes of probability, then the holes with their reasons."""
+    ranges = [(POD_EDGES[each.number - 1], POD_EDGES[each.number]) for each in classes]
+    properties = [
+        {"kind": "pod", "class": label, "pod_from": low, "pod_to": high} for low, high in ranges
+    ]
+    reasons = [
+        {"kind": "hole", "class": label, "reason": REASONS[each.number].value} for each in holes
+    ]
+    return region_features(classes, properties) + region_features(holes, reasons)

@@ -12,20 +12,20 @@ from typing import Self
 
 from sorvolo.errors import SorvoloError, SorvoloWarning
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
-from sorvolo.missions.flight.priority import lower_priority
-from sorvolo.missions.map.run import FlightRun
+from sorvolo.missions.flight.threads import lower_priority
+from sorvolo.missions.map.planar_run import FlightRun
 from sorvolo.missions.search.earlier import EarlierFlights
-from sorvolo.missions.search.files import remove_figures, write_search
-from sorvolo.missions.search.frames import heights_for, search_frame
-from sorvolo.missions.search.growing import GrowingMeasure
+from sorvolo.missions.search.measure import GrowingMeasure
 from sorvolo.missions.search.prepare import (
     PreparedSearch,
     check_area,
+    heights_for,
     known_places,
     prepare_search,
+    search_frame,
     site_with_metres,
 )
-from sorvolo.missions.search.report import Searched, SoFar, State
+from sorvolo.missions.search.report import Searched, SoFar, State, remove_figures, write_search
 from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
 from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.pages.search import waiting_page

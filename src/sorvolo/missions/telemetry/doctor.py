@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from math import hypot, isfinite, nan
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from sorvolo.capture.correction import (
@@ -25,7 +26,6 @@ from sorvolo.geometry.pose import Pose, gimbal_angles_from_rotation
 from sorvolo.missions.flight.headline import doubt_about
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup, prepare
-from sorvolo.missions.telemetry.words import fault_sentences
 from sorvolo.missions.watch.cot_sender import CotPlace, CotTls, send_all
 from sorvolo.store.atomic import atomic_path, atomic_write_bytes, writing
 from sorvolo.store.exports.places import longitude_latitude
@@ -39,10 +39,9 @@ from sorvolo.store.exports.telemetry_files import (
     track_gpx,
 )
 from sorvolo.store.site.archive import Archive
-from sorvolo.store.site.catalogue import StoredKeyframe
 from sorvolo.store.site.catalogue_place import is_site
 from sorvolo.survey.control import ControlRole
-from sorvolo.survey.corrected import AS_THE_MAP, Bias, CorrectedFrame, TelemetryFaults
+from sorvolo.survey.corrected import AS_THE_MAP, Bias, CorrectedFrame, PathFit, TelemetryFaults
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import Status
 from sorvolo.survey.wording import counted
@@ -64,9 +63,13 @@ class CotReceiver:
 
 @dataclass(frozen=True, eq=False)
 class _Solved:
-    """A frame that has a camera, when it was taken, seconds into the flight, and how well and by what it is known."""
+    """A camera, when it was there, seconds into the flight, and how well and by what it is known. `name` is its frame's,
+    "" between frames."""
 
-    stored: StoredKeyframe
+    name: str
+    index: int
+    time_ns: int
+    camera: Camera
     pose: Pose
     seconds: float
     sigma_m: float
@@ -233,7 +236,10 @@ def _solved(archive: Archive, name: str, first_ns: int) -> list[_Solved]:
     begin_ns = first_ns or min((each.time_ns for each in stored), default=0)
     solved = [
         _Solved(
-            each,
+            each.name,
+            each.index,
+            each.time_ns,
+            each.camera,
             each.site_from_camera,
             (each.time_ns - begin_ns) / 1e9,
             each.sigma_m,
@@ -253,7 +259,7 @@ def _compared(
     """The cameras in the fixes' own scale and direction, by telemetry where the map is doubtful; and what was wrong
     with the telemetry by the frames that pictures placed."""
     track = setup.telemetry
-    seen = [number for number, each in enumerate(solved) if each.stored.status is Status.VISION]
+    seen = [number for number, each in enumerate(solved) if each.status == Status.VISION]
     if not seen:
         raise InputError(
             "no frame of the flight was placed by its pictures, so that telemetry has nothing to be compared with: "
@@ -281,7 +287,7 @@ def _compared(
     faults = telemetry_faults(
         priors, [poses[k] for k in seen], clock, path, knows_height=track.knows_ground
     )
-    compared = _Compared(setup, track, applied_s, faults, [solved[k].stored.name for k in seen])
+    compared = _Compared(setup, track, applied_s, faults, [solved[k].name for k in seen])
     moved = [replace(each, pose=pose) for each, pose in zip(solved, poses)]
     for row, apart_m in zip(faults.apart, faults.apart_m):
         moved[seen[row]] = replace(
@@ -405,18 +411,20 @@ def _samples(
     headings, deg."""
     times_s = even_times_s([each.seconds for each in solved], _KLV_STEP_S)
     poses = _between(times_s, solved, compared)
-    stored, first_ns = solved[0].stored, _first_ns(compared.setup)
+    first_ns = _first_ns(compared.setup)
     stated_deg = compared.track.body_headings_deg(times_s, compared.applied_s)
     rows = [
-        _row(
-            "",
-            number,
-            first_ns + round(time_s * 1e9),
-            time_s,
-            pose,
-            stored.camera,
-            nan,
-            _INTERPOLATED,
+        _frame(
+            _Solved(
+                "",
+                number,
+                first_ns + round(time_s * 1e9),
+                solved[0].camera,
+                pose,
+                time_s,
+                nan,
+                _INTERPOLATED,
+            ),
             site,
         )
         for number, (time_s, pose) in enumerate(zip(times_s, poses))
@@ -425,40 +433,16 @@ def _samples(
 
 
 def _frame(each: _Solved, site: Site) -> CorrectedFrame:
-    stored = each.stored
-    return _row(
-        stored.name,
-        stored.index,
-        stored.time_ns,
-        each.seconds,
-        each.pose,
-        stored.camera,
-        each.sigma_m,
-        each.status,
-        site,
-    )
-
-
-def _row(
-    name: str,
-    index: int,
-    time_ns: int,
-    seconds: float,
-    pose: Pose,
-    camera: Camera,
-    sigma_m: float,
-    status: str,
-    site: Site,
-) -> CorrectedFrame:
+    pose = each.pose
     longitudes, latitudes = longitude_latitude(pose.translation_m[None], site)
     yaw_deg, pitch_deg, roll_deg = gimbal_angles_from_rotation(pose.rotation)
     up_m = float(pose.translation_m[2])
-    across_deg, along_deg = camera.angle_of_view_deg
+    across_deg, along_deg = each.camera.angle_of_view_deg
     return CorrectedFrame(
-        name,
-        index,
-        time_ns,
-        seconds,
+        each.name,
+        each.index,
+        each.time_ns,
+        each.seconds,
         float(latitudes[0]),
         float(longitudes[0]),
         site.origin.height_m + up_m,
@@ -466,10 +450,10 @@ def _row(
         yaw_deg,
         pitch_deg,
         roll_deg,
-        sigma_m if isfinite(sigma_m) else nan,
+        each.sigma_m if isfinite(each.sigma_m) else nan,
         across_deg,
         along_deg,
-        status,
+        each.status,
     )
 
 
@@ -497,3 +481,154 @@ def _warnings(site: Site, mapped: Mapping[str, Any], frames: Sequence[CorrectedF
             f"OpenDroneMap finds {spaced[0]!r} once the photo is renamed {name_for_odm(spaced[0])!r}"
         )
     return warnings
+
+
+_LEAST = {
+    "clock": 0.04,
+    "heading": 0.5,
+    "tilt": 0.5,
+    "height": 0.3,
+}  # s, deg, deg, m: smaller ones matter to nobody
+_NOT_KNOWN = {"clock": 1.0, "heading": 10.0, "height": 10.0}
+"""s (10 m of flight, or less), deg, m: right within more than this is no knowledge; by choice."""
+_TOO_FEW = "too few frames have a fix"
+_MOST_NAMED = 6  # frames in a sentence
+
+
+def fault_sentences(faults: TelemetryFaults, names: Sequence[str]) -> list[str]:
+    """One sentence for each quantity that telemetry states; `names` are those of the compared frames."""
+    return [
+        *_clock_words(faults.clock_s),
+        *_heading(faults.heading_deg, faults.path),
+        *_outlying(faults, names),
+        *_misplaced(faults, names),
+        *_tilt(faults.tilt_deg),
+        *_height(faults.height_m, faults.path),
+        *_map(faults.path),
+        f"fixes scatter by {faults.position_m.scatter:.2f} m about the path in the pictures (1 sigma per axis)",
+    ]
+
+
+def _clock_words(found: Bias) -> list[str]:
+    if not isfinite(found.value):
+        return ["the clocks cannot be compared: the motion does not show an offset"]
+    if _is_unknown(found, "clock"):
+        return [
+            "whether the clocks agree cannot be known: the flight turns too little to show an offset"
+        ]
+    if abs(found.value) < _LEAST["clock"] or not found.is_significant:
+        return [f"the clocks agree within {_within(found, 0.01):.2f} s"]
+    side = "ahead of" if found.value > 0 else "behind"
+    return [
+        f"the telemetry's clock was {abs(found.value):.2f} s {side} the pictures (1 sigma {found.sigma:.2f} s)"
+    ]
+
+
+def _heading(found: Bias, path: PathFit) -> list[str]:
+    if not isfinite(found.value):
+        return ["telemetry has no heading to compare"]
+    if _is_unknown(found, "heading"):
+        return [f"whether the compass was right cannot be known: {_why_unknown(path)}"]
+    if abs(found.value) < _LEAST["heading"] or not found.is_significant:
+        return [f"the compass was right within {_within(found, 0.1):.1f} deg"]
+    side = "clockwise" if found.value > 0 else "counter-clockwise"
+    return [
+        f"the compass was {abs(found.value):.1f} deg off, too far {side} (1 sigma {found.sigma:.1f} deg; scatter "
+        f"{found.scatter:.1f} deg)"
+    ]
+
+
+def _why_unknown(path: PathFit) -> str:
+    if not isfinite(path.turn_deg.value):
+        return _TOO_FEW
+    if 2 * path.turn_deg.sigma > _NOT_KNOWN["heading"]:
+        return f"the GPS track is too short for its scatter (its direction: 1 sigma {path.turn_deg.sigma:.0f} deg)"
+    return "the frames' angles disagree with each other"
+
+
+def _map(path: PathFit) -> list[str]:
+    """What the corrected files were changed by against the map."""
+    found = []
+    if path.sure_scale != 1:
+        found.append(f"{1 / path.sure_scale:.2f} times as large as its GPS track")
+    if path.sure_turn_deg:
+        side = "clockwise" if path.sure_turn_deg > 0 else "counter-clockwise"
+        found.append(
+            f"turned by {abs(path.sure_turn_deg):.1f} deg {side} against {'it' if found else 'its GPS track'} (1 sigma "
+            f"{path.turn_deg.sigma:.1f} deg)"
+        )
+    return (
+        [f"the map is {' and '.join(found)}: the corrected cameras follow the track"]
+        if found
+        else []
+    )
+
+
+def _outlying(faults: TelemetryFaults, names: Sequence[str]) -> list[str]:
+    if not faults.outlying:
+        return []
+    return [
+        f"the stated angles of {counted(len(faults.outlying), 'frame')} of {len(names)} are far beside the others', by "
+        f"{faults.outlying_deg:.0f} deg in the median, so that places by telemetry alone are wrong there: "
+        f"{_named(faults.outlying, names)}"
+    ]
+
+
+def _misplaced(faults: TelemetryFaults, names: Sequence[str]) -> list[str]:
+    """Where the map itself is doubtful."""
+    found = []
+    if faults.misplaced:
+        found.append(
+            f"the map is doubtful at {counted(len(faults.misplaced), 'frame')} of {len(names)}, where the log "
+            f"contradicts both places (by {median(faults.misplaced_m):.1f} m in the median) and angles; the corrected "
+            f"cameras follow the log there: {_named(faults.misplaced, names)}"
+        )
+    if faults.apart:
+        found.append(
+            f"at {counted(len(faults.apart), 'frame')} of {len(names)} the map or the log is wrong, "
+            f"{median(faults.apart_m):.1f} m apart in the median; the corrected cameras follow the map, with that as "
+            f"their accuracy: {_named(faults.apart, names)}"
+        )
+    return found
+
+
+def _named(rows: Sequence[int], names: Sequence[str]) -> str:
+    """Which frames these are, the first of them by name."""
+    more = f" and {len(rows) - _MOST_NAMED} more" if len(rows) > _MOST_NAMED else ""
+    return f"{', '.join(names[row] for row in rows[:_MOST_NAMED])}{more}"
+
+
+def _tilt(found: Bias) -> list[str]:
+    if not isfinite(found.value) or found.value < _LEAST["tilt"] or not found.is_significant:
+        return []
+    return [
+        f"the camera looked {found.value:.1f} deg beside where telemetry puts it (1 sigma {found.sigma:.1f} deg)"
+    ]
+
+
+def _height(found: Bias, path: PathFit) -> list[str]:
+    if not isfinite(found.value):
+        return ["telemetry has no height above the ground to compare"]
+    if _is_unknown(found, "height"):
+        why = (
+            "the GPS track is too short for its scatter" if isfinite(path.scale.value) else _TOO_FEW
+        )
+        return [f"whether heights above the ground were right cannot be known: {why}"]
+    if abs(found.value) < _LEAST["height"] or not found.is_significant:
+        return [f"heights above the ground were right within {_within(found, 0.1):.1f} m"]
+    side = "too high" if found.value > 0 else "too low"
+    return [
+        f"heights above the ground were {abs(found.value):.1f} m {side} (1 sigma {found.sigma:.1f} m)"
+    ]
+
+
+def _is_unknown(found: Bias, what: str) -> bool:
+    """Whether an error could be so large that "right within" would mislead; one that surely is an error is known."""
+    return not 2 * found.sigma <= _NOT_KNOWN[what] and not (
+        isfinite(found.sigma) and found.is_significant
+    )
+
+
+def _within(found: Bias, least: float) -> float:
+    """What an error that is not significant hardly exceeds (2 sigma)."""
+    return max(abs(found.value) + 2 * found.sigma, least)

@@ -17,14 +17,13 @@ from sorvolo.detection.detector import Detector
 from sorvolo.errors import InputError, SettingsError, SorvoloWarning
 from sorvolo.geometry.arrays import ImageGray
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
-from sorvolo.missions.flight.frames_ahead import read_ahead
 from sorvolo.missions.flight.request import live_request, request_of
 from sorvolo.missions.flight.result_cache import ResultCache, go_on
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup, prepare
+from sorvolo.missions.flight.threads import read_ahead
 from sorvolo.missions.watch.cot_sender import check_host, cot_place
-from sorvolo.missions.watch.ground_height import over_heights
-from sorvolo.missions.watch.places import Places, places_of
+from sorvolo.missions.watch.places import Places, over_heights, places_of
 from sorvolo.missions.watch.run import EarlyFound, WatchRun, WatchUpdate, utc_ns
 from sorvolo.missions.watch.settings import DEFAULT_FRAMES_PER_SECOND, WatchOutputs, WatchSettings
 from sorvolo.mosaic.selection import every

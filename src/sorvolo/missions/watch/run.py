@@ -2,42 +2,132 @@
 
 import itertools
 import json
+import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 from sorvolo.capture.sync import DATED_NS
+from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.scene import SceneMagnifier
 from sorvolo.detection.tiling import whole_m_per_px
 from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.geometry.coordinates import Coordinates, place_text
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
+from sorvolo.missions.flight.report import (
+    camera_facts,
+    peak_memory_mb,
+    report_head,
+    telemetry_facts,
+)
+from sorvolo.missions.flight.request import software
 from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.watch.alerts import interpreted_placeholder, interpreted_words
 from sorvolo.missions.watch.files import SeenFrame, WatchFiles
 from sorvolo.missions.watch.notifier import Notifier
 from sorvolo.missions.watch.places import Places
-from sorvolo.missions.watch.report import (
-    WatchLog,
-    build_watch_report,
-    count_by_class,
-    model_facts,
-    source_notices,
-)
 from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
 from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.store.exports.detection_files import write_detections
-from sorvolo.store.exports.plain import json_bytes
+from sorvolo.store.exports.plain import json_bytes, utc_text
 from sorvolo.store.pages.watch import watch_page
-from sorvolo.survey.flight import Frame, LostFrame, Site
+from sorvolo.survey.flight import Frame, LostFrame, Notice, Site
 from sorvolo.survey.mosaic import FrameView
 from sorvolo.survey.objects import Detections, Sighting, Track
-from sorvolo.survey.wording import counted_list
-from sorvolo.tracking.following import Located, Taken
+from sorvolo.survey.wording import counted, counted_list, most_first
+from sorvolo.tracking.following import Located
+
+# notices of sources about frames that cannot be used: left out where the reasons are reported
+_OF_LOST_FRAMES = (
+    "unreadable_photo",
+    "corrupt_photo",
+    "duplicate_photo",
+    "other_size",
+    "other_shape",
+)
+
+
+@dataclass
+class WatchLog:
+    """Frames, detections and times of one watch as they happen."""
+
+    read: int = 0  # frames that the source went past
+    detected: int = 0  # frames searched
+    with_detections: int = 0
+    lost: Counter[str] = field(default_factory=Counter)  # reasons of frames that cannot be used
+    found: Counter[str] = field(default_factory=Counter)  # detections by class
+    placed: int = 0  # detections with a place on the ground
+    latency_s: list[float] = field(default_factory=list)
+    first_ns: int = -1
+    last_ns: int = -1
+    wall_s: dict[str, float] = field(default_factory=dict)
+    started_s: float = field(default_factory=time.monotonic)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Count the wall seconds of a block."""
+        started_s = time.monotonic()
+        try:
+            yield
+        finally:
+            self.wall_s[name] = self.wall_s.get(name, 0.0) + time.monotonic() - started_s
+
+    def searched(self, time_ns: int, found: Detections, placed: int) -> None:
+        """Count one frame that was searched."""
+        self.detected += 1
+        self.with_detections += len(found) > 0
+        self.found.update(found.names)
+        self.placed += placed
+        self.first_ns = time_ns if self.first_ns < 0 else self.first_ns
+        self.last_ns = time_ns
+
+    @property
+    def seconds(self) -> float:
+        """Since the watch began."""
+        return time.monotonic() - self.started_s
+
+
+def found_words(
+    track: Track, site: Site, form: Coordinates = Coordinates.LATLON
+) -> tuple[str, str]:
+    """A new object's name, and where it is (none of a local site) and how sure that is."""
+    name, seen = (
+        f"{track.label} {track.id}",
+        f"score {track.score:.2f}, {counted(track.views, 'view')}",
+    )
+    if site.is_local:
+        return name, seen
+    latitude, longitude, _ = site.frame.wgs84_from_site(track.position_m[None])
+    place = place_text(float(latitude[0]), float(longitude[0]), form)
+    return name, f"at {place} (accuracy {track.sigma_m:.1f} m), {seen}"
+
+
+def count_by_class(tracks: Sequence[Track]) -> dict[str, int]:
+    """How many confirmed tracks of each class, most first, equals by name."""
+    return most_first(each.label for each in tracks if each.confirmed)
+
+
+def model_facts(model: ModelInfo) -> dict[str, Any]:
+    """What the report states of a model that looked at pictures."""
+    return {
+        "name": model.name,
+        "version": model.version,
+        "preset": model.preset,
+        "precision": model.precision,
+        "classes": list(model.classes),
+        "thresholds": dict(model.thresholds),
+        "calibrated": list(model.calibration),
+        "licence": model.licence,
+        "trained_on": model.trained_on,
+        "created": model.created,
+    }
+
 
 _LAST_ALERTS_S, _LAST_EVENTS_S = 35.0, 5.0  # how long the end waits for what is still on its way
 
@@ -93,21 +183,6 @@ def utc_ns(setup: FlightSetup, frame_ns: int) -> int:
     """A frame's UTC by telemetry's clock; by its own where telemetry's was never set."""
     time_ns = setup.utc_ns(frame_ns)
     return time_ns if time_ns >= DATED_NS else frame_ns
-
-
-@dataclass(frozen=True, eq=False)
-class _Tracks:
-    """All tracks after a frame, the confirmed ones, those of them that it shows, and those that it confirmed."""
-
-    known: Sequence[Track]
-    confirmed: Sequence[Track]
-    seen: Sequence[Track]
-    new: Sequence[Track]
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """How many there are of each class."""
-        return count_by_class(self.confirmed)
 
 
 class WatchRun:
@@ -242,22 +317,34 @@ class WatchRun:
                 memo.keep(frame, "located", taken.located)
             memo.end_frame(frame, keeps_picture=False)
         sighted = [each for each in taken.sightings if each is not None]
-        tracks = self._tracks_after(taken)
+        known = self._places.follower.tracks()
+        confirmed = [track for track in known if track.confirmed]
+        seen_ids = set(taken.track_ids)
+        seen = [track for track in confirmed if track.id in seen_ids]
+        new = [track for track in confirmed if track.id in taken.new_ids]
+        counts = count_by_class(confirmed)
         log.searched(time_ns, found, 0 if self._places.site.is_local else len(sighted))
         with log.stage("hand over"):
-            self._files.add(
+            files, notifier = self._files, self._notifier
+            files.add(
                 SeenFrame(
                     frame,
                     time_ns,
                     found,
                     taken.sightings,
                     taken.track_ids,
-                    frozenset(each.id for each in tracks.confirmed),
-                    f"frame {frame.name}, counted so far: {counted_list(tracks.counts)}",
+                    frozenset(each.id for each in confirmed),
+                    f"frame {frame.name}, counted so far: {counted_list(counts)}",
                     taken.segment,
                 )
             )
-            self._hand_over(taken, tracks)
+            for track in (*seen, *new):
+                files.crop_of(track)
+            files.forget(taken.merged)
+            files.keep_crops_of(known)
+            notifier.report(new, seen, files.crop_names, files.segments)
+            notifier.withdraw(taken.merged)
+            files.show(confirmed)
         latency_s = time.monotonic() - arrived_s
         if not is_resumed:
             log.latency_s.append(latency_s)
@@ -266,9 +353,9 @@ class WatchRun:
             time_ns,
             found,
             sighted,
-            tracks.new,
-            tracks.seen,
-            tracks.counts,
+            new,
+            seen,
+            counts,
             latency_s,
             log.read,
             log.detected,
@@ -283,34 +370,11 @@ class WatchRun:
             is_resumed,
         )
 
-    def _tracks_after(self, taken: Taken) -> "_Tracks":
-        known = self._places.tracks()
-        confirmed = [track for track in known if track.confirmed]
-        seen = [track for track in confirmed if track.id in set(taken.track_ids)]
-        return _Tracks(
-            known, confirmed, seen, [each for each in confirmed if each.id in taken.new_ids]
-        )
-
-    def _hand_over(self, taken: Taken, tracks: "_Tracks") -> None:
-        """Crops, reports and withdrawals of one frame, and the files that show all tracks so far."""
-        for track in (*tracks.seen, *tracks.new):
-            self._files.crop_of(track)
-        self._files.forget(taken.merged)
-        self._files.keep_crops_of(tracks.known)
-        self._notifier.report(
-            tracks.new,
-            tracks.seen,
-            self._files.crop_names,
-            self._files.segments,
-        )
-        self._notifier.withdraw(taken.merged)
-        self._files.show(tracks.confirmed)
-
     def finish(self, *, ended: str, skipped: int) -> None:
         """The last word on every track, the files for other programs, and the report."""
         with self.log.stage("finish"):
-            known = {track.id for track in self._places.tracks() if track.confirmed}
-            tracks = [track for track in self._places.finish() if track.confirmed]
+            known = {track.id for track in self._places.follower.tracks() if track.confirmed}
+            tracks = [track for track in self._places.follower.finish() if track.confirmed]
             for track in tracks:
                 self._files.crop_of(track)
             self._files.close()
@@ -322,56 +386,101 @@ class WatchRun:
             site, crop_names = self._places.site, self._files.crop_names
             write_detections(self._folder, site)
             rows = self._files.write_tracks(tracks)
-        notices = (
-            *self._places.notices(),
-            *self._detector.notices,
-            *source_notices(self._setup.source, self.log),
-            *self._notifier.notices(),
-        )
         self.log.wall_s["write, beside the rest"] = self._files.seconds
-        report = build_watch_report(
-            self._setup,
-            self._settings,
-            self._outputs,
-            self._detector,
-            self.log,
-            tracks,
-            notices,
-            self._warnings(tracks),
-            looked_for=self._classes,
-            others=list(self._others.values()),
-            ended=ended,
-            skipped=skipped,
-            set_aside=self._places.set_aside,
-            on_ground=not site.is_local,
-        )
+        report = self._report(tracks, ended, skipped)
         crops = {
             track_id: (self._folder / name).read_bytes() for track_id, name in crop_names.items()
         }
         atomic_write_bytes(self._folder / "report.json", json_bytes(report))
-        page = watch_page(report, rows, crops, self._places.path_m())
+        page = watch_page(report, rows, crops, self._places.follower.path_m())
         atomic_write_bytes(self._folder / "report.html", page.encode())
         self._memo.end(None)
 
-    def _warnings(self, tracks: Sequence[Track]) -> list[str]:
-        warnings = []
+    def _report(self, tracks: Sequence[Track], ended: str, skipped: int) -> dict[str, Any]:
+        """Return report.json; its keys are specified in docs/formats.md. Numbers that are not known are None."""
+        setup, log, detector, outputs = self._setup, self.log, self._detector, self._outputs
+        total, seconds, is_local = sum(log.found.values()), log.seconds, self._places.site.is_local
+        set_aside = self._places.follower.impossible_size
+        telemetry = telemetry_facts(setup)
+        if is_local:  # how a map finds the ground's height is of no use then
+            telemetry["height"] = telemetry["height"].split(",")[0]
+        lost = sum(log.lost.values())
+        notices = [
+            *self._places.notices(),
+            *detector.notices,
+            *setup.source.telemetry.notices,
+            *(
+                each
+                for each in setup.source.notices()
+                if not (lost and each.code in _OF_LOST_FRAMES)
+            ),
+        ]
+        if lost:
+            reasons = "; ".join(f"{count} x {reason}" for reason, count in log.lost.most_common(5))
+            text = f"{counted(lost, 'frame')} could not be used: {reasons}"
+            notices.append(Notice("lost_frames", lost, text))
+        notices += self._notifier.notices()
+        return {
+            **report_head(setup, is_local=is_local),
+            "first_frame": utc_text(log.first_ns) if log.first_ns >= 0 else None,
+            "last_frame": utc_text(log.last_ns) if log.last_ns >= 0 else None,
+            "ended": ended,
+            "looked_for": list(self._classes),
+            "objects": {"total": len(tracks), "by_class": count_by_class(tracks)},
+            "frames": {
+                "read": log.read,
+                "detected": log.detected,
+                "with_detections": log.with_detections,
+                "skipped": skipped,
+                "lost": lost,
+                "reasons": dict(log.lost.most_common()),
+            },
+            "detections": {
+                "total": total,
+                "placed": log.placed,
+                "not_placed": total - log.placed - set_aside,
+                "set_aside": set_aside,
+                "by_class": dict(log.found.most_common()),
+            },
+            "model": {**model_facts(detector.info), "runs_on": detector.provider},
+            "other_models": list(self._others.values()),
+            "camera": camera_facts(setup.source.camera),
+            "telemetry": telemetry,
+            "latency_s": {
+                "median": statistics.median(log.latency_s) if log.latency_s else None,
+                "max": max(log.latency_s, default=None),
+            },
+            "frames_per_second": log.detected / seconds if seconds > 0 else None,
+            "seconds": {
+                "total": round(seconds, 3),
+                **{name: round(value, 3) for name, value in log.wall_s.items()},
+            },
+            "peak_memory_mb": peak_memory_mb(),
+            "notices": [asdict(each) for each in notices],
+            "warnings": self._warnings(tracks, total - set_aside),
+            "settings": {
+                **asdict(self._settings),
+                "save": outputs.save,
+                "labels": list(outputs.labels),
+                "cot": outputs.cot,
+            },
+            "versions": software("numpy", "opencv-contrib-python-headless", "av", "onnxruntime"),
+        }
+
+    def _warnings(self, tracks: Sequence[Track], found: int) -> list[str]:
+        """Return what makes places on the ground few or inaccurate, and alerts dangerous."""
+        warnings, camera = [], self._setup.source.camera
         if name := interpreted_placeholder(self._outputs.alert_command):
             warnings.append(interpreted_words(name))
-        return warnings if self._places.site.is_local else warnings + self._place_warnings(tracks)
-
-    def _place_warnings(self, tracks: Sequence[Track]) -> list[str]:
-        """What makes places on the ground few or inaccurate."""
-        warnings = []
-        total = sum(self.log.found.values()) - self._places.set_aside
-        if total and self.log.placed < 0.5 * total:
+        if self._places.site.is_local:
+            return warnings
+        if found and self.log.placed < 0.5 * found:
             warnings.append(
-                f"{total - self.log.placed} of {total} detections have no place on the ground and are in no track; "
+                f"{found - self.log.placed} of {found} detections have no place on the ground and are in no track; "
                 "the notices state why"
             )
-        if self._setup.source.camera.focal_sigma > 0.1:
-            warnings.append(
-                f"camera: {self._setup.source.camera.origin}; until then places are some percent off"
-            )
+        if camera.focal_sigma > 0.1:
+            warnings.append(f"camera: {camera.origin}; until then places are some percent off")
         far = [track for track in tracks if track.sigma_m > 10]
         if far:
             warnings.append(

@@ -1,11 +1,32 @@
 """A source's frames read beside the work on those before them."""
 
+import os
 import queue
+import sys
 import threading
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from typing import TypeVar
 
 from sorvolo.survey.flight import Frame, LostFrame
+
+T = TypeVar("T")
+
+_NICE = 10  # a tenth of the share that a thread of usual priority has, where both want a core
+
+
+def lower_priority() -> None:
+    """Have this thread, and those that it starts, run after the others; on Linux, where a thread has its own."""
+    if sys.platform == "linux":
+        own = threading.get_native_id()
+        os.setpriority(os.PRIO_PROCESS, own, max(_NICE, os.getpriority(os.PRIO_PROCESS, own)))
+
+
+def made_at_low_priority(make: Callable[[], T]) -> T:
+    """What `make` makes in a thread of low priority: threads that it starts, a network's for example, keep it."""
+    with ThreadPoolExecutor(1, initializer=lower_priority) as thread:
+        return thread.submit(make).result()
 
 
 def read_ahead(frames: Iterator[Frame | LostFrame], most: int) -> Generator[Frame | LostFrame]:
