@@ -80,7 +80,7 @@ CASES = {
     "thermal": ["watch {data}/flights/thermal_field --out {out}/watch --model thermal"],
 }
 _VARIES = re.compile(
-    r"second|duration|_mb$|memory|version|commit|written|created|started|machine|processor|cpu|date_time_run|path|folder|time_s$|per_s$"
+    r"second|duration|_mb$|memory|version|commit|written|created|started|machine|processor|cpu|date_time_run|path|folder|time_s$|per_s$|settings"
 )
 _LEFT_OUT = re.compile(r"site\.(db|lock)|\.html$|journal|\.lock$|live\.")
 
