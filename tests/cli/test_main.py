@@ -195,7 +195,6 @@ def test_settings_out_of_range_are_errors(
         "map x.mp4 --site SITE",
         "compare x.mp4 --site SITE",
         "search x.mp4 --site SITE",
-        "batch x.mp4 --root SITE --mission watch",
         "train x --out SITE",
         "evaluate detector default x",
     ],

@@ -494,7 +494,7 @@ def _command(photos: Path, camera: Path, site: Path) -> list[str]:
 
 def test_a_disk_that_fills_up(photos: Path, photographed: Path, tmp_path: Path) -> None:
     def no_large_files() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (120_000, 120_000))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, 400_000))
 
     site, camera = tmp_path / "site", photographed / "camera.xml"
     result = subprocess.run(

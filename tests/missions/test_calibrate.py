@@ -185,4 +185,4 @@ def test_a_board_of_another_size_is_not_taken_for_this_one(rays):
 @pytest.mark.parametrize("text", ["9", "x6", "9x", "9*6", "ninexsix", "1x1", "9x6x2", ""])
 def test_a_board_that_is_none_is_refused(text):
     with pytest.raises(SettingsError):
-        parse_board(text, 25.0)
+        parse_board(text)

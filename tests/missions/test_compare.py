@@ -29,7 +29,7 @@ from sorvolo.lab.thesis.changes import ThesisComparison, ThesisSettings
 from sorvolo.missions.compare.flights import _begun, compare_flights
 from sorvolo.missions.flight.known_camera import known_camera
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
-from sorvolo.missions.flight.setup import _check_place, prepare
+from sorvolo.missions.flight.setup import check_place, prepare
 from sorvolo.missions.heights.run import run_of
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.map.painting import KnownKeyframes
@@ -532,10 +532,10 @@ def test_a_place_is_another_one_far_from_the_ground_that_is_shown_not_from_where
     )
     shown_m = np.array([[0.0, 0.0], [shown_east_m, 0.0]])
     if is_there:
-        _check_place(known, track, "next", shown_m)
+        check_place(known, track, "next", shown_m)
     else:
         with pytest.raises(InputError, match="is 3 km from the site"):
-            _check_place(known, track, "next", shown_m)
+            check_place(known, track, "next", shown_m)
 
 
 def test_a_flight_that_only_extends_the_map_is_warned_of(site, tmp_path):

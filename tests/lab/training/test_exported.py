@@ -139,10 +139,10 @@ def test_another_proposal_network_is_reported(exported: bytes) -> None:
     for rpn in ("standard", "extended"):
         torch.manual_seed(6)
         with pytest.raises(
-            InputError, match=r"does not fit the network: .*proposals.stems.*same preset, --rpn"
+            InputError, match=r"does not fit the network: .*proposals.stems.*same preset, rpn"
         ):
             load_exported(fast(_CLASSES, rpn), exported, _batch())
-    with pytest.raises(InputError, match=r"does not fit the network: .*same preset, --rpn"):
+    with pytest.raises(InputError, match=r"does not fit the network: .*same preset, rpn"):
         load_exported(fast(_CLASSES), _export(_model("standard")), _batch())
 
 

@@ -370,7 +370,9 @@ def test_bad_input_is_reported(
         devices.append(("cuda", "sees no GPU; use the device cpu"))
     for device, refused in devices:
         with pytest.raises(SettingsError, match=refused):
-            list(train_detector([data], tmp_path / "new", _settings(), device=device))
+            list(
+                train_detector([data], tmp_path / "new", _settings(), DataOptions(), device=device)
+            )
 
 
 def test_pictures_without_any_object_teach_nothing(tmp_path: Path) -> None:

@@ -233,12 +233,7 @@ def _with_gps(
     wishes = TelemetryWishes(settings.offset_s, settings.ground_elevation_m, telemetry_named)
     telemetry = FlightTelemetry(source, samples, frame, wishes)
     if site is not None:
-        nearest_m = distance_m(telemetry.track, ground_m)
-        if nearest_m > _ANOTHER_PLACE_M:
-            raise InputError(
-                f"the flight {source.name} is {nearest_m / 1000:.0f} km from the site {site.name} at "
-                f"{site.origin.latitude_deg:.5f}, {site.origin.longitude_deg:.5f}: map it into a site folder of its own"
-            )
+        check_place(site, telemetry.track, source.name, ground_m)
     seconds, is_live = duration_s(source), isinstance(source, LiveSource)
     if source.kind == "video" and not is_live and not telemetry.covers(seconds):
         raise InputError(
@@ -330,3 +325,13 @@ def sun_over(site: Site, time_ns: int) -> Vector3 | None:
     if site.is_local or time_ns <= DATED_NS:
         return None
     return sun_direction(time_ns, site.origin.latitude_deg, site.origin.longitude_deg)
+
+
+def check_place(site: Site, track: Track, name: str, ground_m: PointsM | None) -> None:
+    """Raise InputError for a flight far from all ground that the site shows (None: its origin)."""
+    nearest_m = distance_m(track, ground_m)
+    if nearest_m > _ANOTHER_PLACE_M:
+        raise InputError(
+            f"the flight {name} is {nearest_m / 1000:.0f} km from the site {site.name} at "
+            f"{site.origin.latitude_deg:.5f}, {site.origin.longitude_deg:.5f}: map it into a site folder of its own"
+        )
