@@ -44,9 +44,6 @@ ImageBGR: TypeAlias = NDArray[np.uint8]
 ImageGray: TypeAlias = NDArray[np.uint8]
 """(height, width) uint8."""
 
-Encoded: TypeAlias = NDArray[np.uint8]
-"""(N,): the bytes of an encoded picture."""
-
 Mask: TypeAlias = NDArray[np.bool_]
 """(height, width) bool."""
 

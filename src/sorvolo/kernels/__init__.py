@@ -1,6 +1,6 @@
 """The few loops that must be fast, compiled; numbers in, numbers out. This module is the only door.
 
-It checks shapes and ranges, since the compiled code in `_native` reads memory as it is told to. Each kernel has a plain
+It checks shapes and ranges, since the compiled code in `_native` checks neither. Each kernel has a plain
 twin in `tests/kernels/numpy_*.py`: the specification, where its docstring states what it computes.
 """
 
