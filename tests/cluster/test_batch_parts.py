@@ -1,6 +1,9 @@
 """What a batch is made of: flights found, sites chosen, the table, costs, bad input."""
 
 import json
+import os
+import signal
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,9 +11,10 @@ import pytest
 
 from sorvolo.cli.main import main
 from sorvolo.cluster.batch import TABLE, BatchRow, BatchTable
-from sorvolo.cluster.executors import TryEnding
+from sorvolo.cluster.executors import LocalExecutor, TryEnding, run_order
 from sorvolo.cluster.flights import Scouted, find_flights, sites_of
 from sorvolo.errors import InputError, StoreError
+from sorvolo.missions.worker import Order
 from sorvolo.store.exports.detection_files import claimed_folder
 
 
@@ -221,3 +225,26 @@ def test_a_batch_of_broken_flights_ends_with_code_1_and_names_them(
     output = json.loads(capsys.readouterr().out)
     assert output["counts"] == {"failed": 1}
     assert output["flights"][0]["words"].startswith("1.mp4 cannot be read as a video")
+
+
+def test_a_process_that_died_before_it_read_its_order_is_a_crash() -> None:
+    def strike(process: "subprocess.Popen[bytes]") -> None:
+        os.kill(process.pid, signal.SIGSEGV)
+        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+
+    ending = run_order(Order("inspect", "", "nowhere"), started=strike)
+    assert (ending.outcome, ending.words) == ("crashed", "its process ended by signal 11")
+
+
+def test_a_batch_does_not_wait_for_a_process_that_could_not_be_started(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def no_process(*_: object, **__: object) -> None:
+        raise OSError("no process can be started")
+
+    monkeypatch.setattr(subprocess, "Popen", no_process)
+    with LocalExecutor(1, 0) as executor:
+        executor.start("a", Order("inspect", "", "nowhere"))
+        key, ending = executor.next_ended()
+    assert (key, ending.outcome) == ("a", "crashed")
+    assert "no process can be started" in ending.words

@@ -5,6 +5,7 @@ import json
 import os
 import queue
 import select
+import signal
 import socket
 import subprocess
 import sys
@@ -66,6 +67,7 @@ def run_order(
     with tempfile.TemporaryFile() as log:
         process = subprocess.Popen(
             python_command("sorvolo.missions.worker"),
+            bufsize=0,  # a process that died with its order unread leaves nothing to flush
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=log,
@@ -76,7 +78,6 @@ def run_order(
         assert process.stdin is not None and process.stdout is not None
         with suppress(BrokenPipeError):  # it is gone already; its exit code states how
             process.stdin.write(order.line())
-            process.stdin.flush()
         why = ""
         for line in _lines(process, stall_s):
             if line is None:
@@ -124,9 +125,11 @@ def _lines(process: "subprocess.Popen[bytes]", stall_s: float) -> Iterator[dict[
         if cpu_s - used_s > _LIVELY * stall_s:
             alive_s, used_s = time.monotonic(), cpu_s
         if time.monotonic() - alive_s > stall_s:
-            process.kill()
+            os.kill(
+                process.pid, signal.SIGKILL
+            )  # `process.kill()` may reap it, and `run_order` does
             yield None
-            alive_s = float("inf")
+            return
 
 
 def _outcome(last: Mapping[str, Any], code: int, why: str, log: Any) -> tuple[str, str]:
@@ -158,7 +161,8 @@ class LocalExecutor:
 
     def __exit__(self, *_: object) -> None:
         for key, thread in self._threads.items():
-            self.processes[key].kill()
+            if key in self.processes:
+                self.processes[key].kill()
             thread.join()
 
     def start(self, key: str, order: Order) -> None:
@@ -170,7 +174,12 @@ class LocalExecutor:
             has_begun.set()
 
         def run() -> None:
-            self._ended.put((key, run_order(order, self._stall_s, self._lock, begun)))
+            try:
+                ending = run_order(order, self._stall_s, self._lock, begun)
+            except Exception as error:  # else the batch would wait for it without end
+                ending = TryEnding("crashed", f"{type(error).__name__}: {error}")
+            has_begun.set()
+            self._ended.put((key, ending))
 
         # the process ends with this thread, its parent
         self._threads[key] = threading.Thread(target=run, daemon=True)
@@ -180,7 +189,8 @@ class LocalExecutor:
     def next_ended(self) -> tuple[str, TryEnding]:
         """Wait for a mission to end."""
         key, ending = self._ended.get()
-        del self._threads[key], self.processes[key]
+        del self._threads[key]
+        self.processes.pop(key, None)
         return key, ending
 
 
