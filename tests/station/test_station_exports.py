@@ -1,9 +1,12 @@
 """Files that a browser may take away: those of the site, by id; a GeoPackage; heights along a line."""
 
 import sqlite3
+import struct
 from pathlib import Path
 from xml.etree.ElementTree import fromstring
 
+import shapely
+from pyproj import CRS
 from starlette.testclient import TestClient
 
 from sorvolo.store.exports.geopackage import write_geopackage
@@ -72,8 +75,20 @@ def test_geopackage_mixes_polygons_and_odd_names(tmp_path: Path) -> None:
     with sqlite3.connect(tmp_path / "x.gpkg") as file:
         rows = file.execute('SELECT "a""b", list, yes FROM some').fetchall()
         kind = file.execute("SELECT geometry_type_name FROM gpkg_geometry_columns").fetchall()
+        (blob,) = file.execute("SELECT geom FROM some").fetchone()
+        contents = file.execute("SELECT srs_id, min_x, min_y, max_x, max_y FROM gpkg_contents")
+        place = contents.fetchone()
+        (definition,) = file.execute(
+            "SELECT definition FROM gpkg_spatial_ref_sys WHERE srs_id = ?", place[:1]
+        ).fetchone()
     assert rows == [(1.0, "[1]", None), (2.5, None, 1)]
     assert kind == [("MULTIPOLYGON",)]
+    # the table, each geometry's header (OGC 12-128r19, 2.1.3) and the definition name one CRS
+    assert place == (4326, 0.0, 0.0, 1.0, 1.0)
+    assert blob[:2] == b"GP" and struct.unpack_from("<i", blob, 4) == (4326,)
+    assert CRS.from_wkt(definition).to_epsg() == 4326
+    envelope_bytes = {0: 0, 1: 32}[(blob[3] >> 1) & 7]
+    assert shapely.from_wkb(blob[8 + envelope_bytes :]).bounds == place[1:]
 
 
 def test_profile_of_a_site_without_heights(client: TestClient) -> None:
