@@ -75,7 +75,7 @@ def test_newer_files_than_the_runtime(tmp_path: Path) -> None:
 
 def test_a_foreign_model(tmp_path: Path) -> None:
     text = "other (float[1, 3, H, W] images) => (float[1, 3, H, W] output0) { output0 = Relu (images) }"
-    with pytest.raises(InputError, match="none of Sorvolo's"):
+    with pytest.raises(InputError, match="sorvolo models import"):
         Session(_identity(tmp_path / "yolo.onnx", text, None), "cpu")
     with pytest.raises(InputError, match="takes images tensor\\(float\\)"):
         Session(_identity(tmp_path / "named.onnx", text), "cpu")
@@ -115,7 +115,7 @@ def test_missing_outputs_and_answers_that_break_the_contract(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"format": 3}, "update sorvolo"),
+        ({"format": 4}, "update sorvolo"),
         ({"classes": []}, "classes"),
         ({"classes": ["person", "person"]}, "classes"),
         ({"thresholds": {"person": 0.5}}, "it lacks 'car'"),

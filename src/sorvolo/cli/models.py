@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -28,7 +29,7 @@ that is not this one."""
 
 @models_app.callback()
 def models() -> None:
-    """List, show and verify detection models."""
+    """List, show, verify and import detection models."""
 
 
 @models_app.command("list")
@@ -180,6 +181,43 @@ def verify(
         _show_hidden()
     if not all_good:
         raise typer.Exit(FAILED)
+
+
+@models_app.command("import")
+def import_file(
+    file: Annotated[Path, typer.Argument(help="An .onnx file of another maker.")],
+    name: Annotated[
+        str, typer.Option(help="Its name for --model.", show_default="the file's")
+    ] = "",
+    layout: Annotated[
+        str,
+        typer.Option(
+            help="yolov8 (also YOLO11), yolov5, yolox, yolov10 (NMS inside), rtdetr, dfine, rfdetr or nanodet."
+        ),
+    ] = "auto",
+    classes: Annotated[
+        str,
+        typer.Option(help="Its classes in its order.", show_default="as in the file, or COCO's"),
+    ] = "",
+) -> None:
+    """Install a YOLO, RT-DETR, NanoDet or similar ONNX file as a model of your own.
+
+    It runs in a process of its own with limited memory. `sorvolo evaluate detector` shows how well it finds.
+
+    Example: sorvolo models import yolo11n.onnx --name yolo
+
+    Example of a file that names no classes: sorvolo models import net.onnx --classes person,car
+    """
+    from sorvolo.detection.models import import_model
+    from sorvolo.detection.session import read_info
+
+    named = [each.strip() for each in classes.split(",") if each.strip()] or None
+    known = import_model(file, name, layout, named)
+    info = read_info(known.path)
+    asked = f"; with --classes also: {', '.join(info.on_request)}" if info.on_request else ""
+    typer.echo(
+        f"{known.name}: {info.layout}, finds {', '.join(info.usual_classes)}{asked}. Use it: --model {known.name}"
+    )
 
 
 def _in_words(value: Any) -> str:

@@ -12,13 +12,23 @@ from sorvolo.errors import InputError
 METADATA_KEY = "sorvolo"
 """The key among an ONNX file's `metadata_props` under which the JSON lies."""
 
-FORMAT = 2
-"""The newest contract that this version reads; docs/model-file.md lists its fields. 2 brought `calibration`."""
+FORMAT = 3
+"""The newest contract that this version reads; docs/model-file.md lists its fields. 2 brought `calibration`, 3 brought
+`layout`."""
 
 # px: what a picture's sides are multiples of, in a model whose file does not state it
 _FALLBACK_STRIDE = 32
 _NEEDED = ("name", "classes", "thresholds", "best_px")
-_TEXTS = ("thermal_by", "preset", "version", "precision", "licence", "trained_on", "created")
+_TEXTS = (
+    "thermal_by",
+    "preset",
+    "version",
+    "precision",
+    "licence",
+    "trained_on",
+    "created",
+    "layout",
+)
 
 MOST_LARGER = 3.0
 """Largest upscaling factor of a picture; beyond it only blur is added."""
@@ -95,7 +105,8 @@ class ModelInfo:
     person asks for them. `turned`: pictures from straight above are looked at twice, once turned by a quarter, and each
     class is reported from this mean score on; empty: once. `second_look`: classes whose reports are looked at again.
     `pyramid`: classes that are looked for in several sizes where a picture's scale is not known. `second_only`: it only
-    looks again at what other models report, and whole pictures mean nothing to it.
+    looks again at what other models report, and whole pictures mean nothing to it. `layout`: whose convention a foreign
+    network follows (`layouts`), "" for ours; `columns`: the class of each of its scores, "" for none.
     """
 
     name: str
@@ -118,6 +129,8 @@ class ModelInfo:
     pyramid: Mapping[str, Pyramid] = field(default_factory=dict)
     calibration: Mapping[str, Calibration] = field(default_factory=dict)
     second_only: bool = False
+    layout: str = ""
+    columns: tuple[str, ...] = ()
 
     @property
     def usual_classes(self) -> tuple[str, ...]:
@@ -133,8 +146,8 @@ def info_from_metadata(metadata: Mapping[str, str], where: str) -> ModelInfo:
     text = metadata.get(METADATA_KEY)
     if text is None:
         raise InputError(
-            f"{where} is an ONNX model, but none of Sorvolo's: it has no '{METADATA_KEY}' metadata that names its "
-            "classes; train and export one with `sorvolo train`, or add the metadata as docs/model-file.md shows"
+            f"{where} is an ONNX model of another maker: import it first (sorvolo models import {where}), and give "
+            "--model the name that it has then"
         )
     try:
         fields = json.loads(text)
@@ -163,6 +176,9 @@ def _info(fields: Mapping[str, Any]) -> ModelInfo:
     on_request = tuple(str(each) for each in fields.get("on_request", ()))
     if not set(on_request) < set(classes):
         raise ValueError(f"its on_request must be some of its classes, not {list(on_request)}")
+    columns = tuple(str(each) for each in fields.get("columns", ()))
+    if bool(columns) != bool(fields.get("layout")) or set(columns) - {"", *classes}:
+        raise ValueError(f"its columns must name its classes, and its layout, not {list(columns)}")
     texts = {each: _words(fields[each]) for each in _TEXTS if each in fields}
     return ModelInfo(
         str(fields["name"]),
@@ -178,6 +194,7 @@ def _info(fields: Mapping[str, Any]) -> ModelInfo:
         pyramid=MappingProxyType(_pyramid(fields, classes)),
         calibration=MappingProxyType(_calibration(fields, classes)),
         second_only=bool(fields.get("second_only", False)),
+        columns=columns,
         **texts,
     )
 

@@ -22,10 +22,11 @@ from sorvolo.detection.fusing import (
     turned,
     turned_back,
 )
+from sorvolo.detection.layouts import AUTO
 from sorvolo.detection.light import Picture, is_thermal, rgb_from_picture
 from sorvolo.detection.models import demand_searching, find_model, thermal_model
 from sorvolo.detection.second_look import rescore
-from sorvolo.detection.session import Seen, Session
+from sorvolo.detection.session import Seen, Session, adopted
 from sorvolo.detection.tiling import (
     COARSEST_M,
     Tiles,
@@ -172,6 +173,27 @@ class Detector:
         session = Session(find_model(name_or_path), provider, threads)
         demand_searching(session.info)
         return cls(session, provider=provider, threads=threads, stand_in=stand_in)
+
+    @classmethod
+    def from_onnx(
+        cls,
+        path: str | Path,
+        layout: str = AUTO,
+        classes: Sequence[str] | None = None,
+        *,
+        provider: Provider = "auto",
+        threads: int | None = None,
+    ) -> "Detector":
+        """Open another maker's ONNX file: YOLO, RT-DETR, NanoDet and others (`layouts.LAYOUTS`).
+
+        `layout` "auto" is told by the network's outputs. `classes` names its classes in its order, where its file does
+        not: COCO's are known. `sorvolo models import` keeps it under a name instead. Raises InputError for what cannot
+        be recognised or run.
+        """
+        model = adopted(Path(path), layout, classes)
+        return cls(
+            Session(Path(path), provider, threads, model), provider=provider, threads=threads
+        )
 
     @property
     def classes(self) -> tuple[str, ...]:

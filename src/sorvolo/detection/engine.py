@@ -1,6 +1,7 @@
 """An ONNX model made ready to run, here and now, by ONNX Runtime or OpenVINO; the only place that knows them."""
 
-from collections.abc import Callable, Sequence
+import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
@@ -8,6 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sorvolo.detection.contract import METADATA_KEY, ModelInfo, info_from_metadata
+from sorvolo.detection.layouts import (
+    LAYOUTS,
+    WISH_KEY,
+    Port,
+    picture_input,
+    resolved,
+    runner,
+)
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import Numbers
 
@@ -63,7 +72,7 @@ def open_engine(model: bytes, where: str, provider: Provider, threads: int) -> E
         # before OpenVINO sees it: that crashes on some models that break the contract
         described = describe(model, where)
         try:
-            run = _openvino_runner(model, threads, output_names(takes_many=described.takes_many))
+            run = _openvino_runner(model, threads, described, where)
         except ImportError as error:
             if provider == "openvino":
                 raise SettingsError(
@@ -106,8 +115,22 @@ def _cuda_engine(model: bytes, where: str, threads: int) -> Engine | None:
 
 
 def _engine(provider: str, session: Any, where: str) -> Engine:
-    metadata = session.get_modelmeta().custom_metadata_map
+    metadata = dict(session.get_modelmeta().custom_metadata_map)
+    inputs = _ports(session.get_inputs())
+
+    def call(feeds: Mapping[str, Any]) -> dict[str, Numbers]:
+        names = [each.name for each in session.get_outputs()]
+        return dict(zip(names, session.run(names, feeds)))
+
+    if WISH_KEY in metadata:
+        wish = json.loads(metadata[WISH_KEY])
+        metadata[METADATA_KEY] = json.dumps(resolved(wish, metadata, inputs, call, where))
     info = info_from_metadata(metadata, where)
+    if info.layout:
+        fixed_px = picture_input(inputs, where)[1]
+        return Engine(
+            _foreign(info, inputs, call, where), provider, metadata[METADATA_KEY], info, fixed_px
+        )
     fixed_px = _input_size(session, where, info.stride)
     takes_many = PICTURES in {each.name for each in session.get_outputs()}
     run = _runner(session, output_names(takes_many=takes_many))
@@ -121,6 +144,24 @@ def _engine(provider: str, session: Any, where: str) -> Engine:
         takes_many,
         lambda: _shrink(session, side_px),
     )
+
+
+def _ports(found: Sequence[Any]) -> list[Port]:
+    kinds = (each.type.removeprefix("tensor(").removesuffix(")") for each in found)
+    return [Port(each.name, kind, tuple(each.shape)) for each, kind in zip(found, kinds)]
+
+
+def _foreign(
+    info: ModelInfo,
+    inputs: Sequence[Port],
+    call: Callable[[Mapping[str, Any]], Mapping[str, Numbers]],
+    where: str,
+) -> Run:
+    if info.layout not in LAYOUTS:
+        raise InputError(
+            f"{where} has the layout {info.layout!r}; this version knows {', '.join(LAYOUTS)}"
+        )
+    return runner(info.layout, info.columns, info.classes, inputs, call, where)
 
 
 def _shrink(session: Any, side_px: tuple[int, int]) -> None:
@@ -182,7 +223,7 @@ def _runner(session: Any, names: Sequence[str]) -> Run:
     return run
 
 
-def _openvino_runner(model: bytes, threads: int, names: Sequence[str]) -> Run:
+def _openvino_runner(model: bytes, threads: int, described: Engine, where: str) -> Run:
     import openvino
 
     core = openvino.Core()
@@ -193,11 +234,21 @@ def _openvino_runner(model: bytes, threads: int, names: Sequence[str]) -> Run:
     }
     compiled = core.compile_model(core.read_model(model=model), "CPU", wishes)
     request = compiled.create_infer_request()
+    names = output_names(takes_many=described.takes_many)
 
     def run(batch: Planes) -> tuple[Numbers, ...]:
         request.infer({INPUT: batch}, share_inputs=True)
         return tuple(request.get_tensor(name).data.copy() for name in names)
 
+    def call(feeds: Mapping[str, Any]) -> dict[str, Numbers]:
+        found = request.infer(dict(feeds))
+        return {port.any_name: array.copy() for port, array in found.items()}
+
+    if described.info.layout:
+        ports = _ports(
+            _onnx_session(model, where, 1, ["CPUExecutionProvider"], optimise=False).get_inputs()
+        )
+        return _foreign(described.info, ports, call, where)
     return run
 
 

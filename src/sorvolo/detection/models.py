@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -11,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from sorvolo.detection.contract import ModelInfo
-from sorvolo.detection.session import read_info, read_model
+from sorvolo.detection.layouts import AUTO
+from sorvolo.detection.session import adopted, read_info, read_model
 from sorvolo.errors import InputError
 
 FOLDER_VARIABLE = "SORVOLO_MODELS"
@@ -117,6 +119,34 @@ def thermal_model(classes: Sequence[str], name: str = "") -> Path | None:
         if info.thermal and not info.second_only and set(info.classes) & set(classes):
             found.append((each.is_packaged, info.daylight, each.path))
     return min(found, key=lambda row: row[:2])[2] if found else None
+
+
+def import_model(
+    path: Path, name: str = "", layout: str = AUTO, classes: Sequence[str] | None = None
+) -> InstalledModel:
+    """Install another maker's ONNX file (`session.adopted`) under a name, with a card that records its hash.
+
+    Raises InputError for what cannot be recognised or run, and for a name that is taken.
+    """
+    name = name or path.stem
+    if not re.fullmatch(r"[\w.-]{1,64}", name):
+        raise InputError(
+            f"a model's name is 1 to 64 letters, digits, '.', '_' or '-', not {name!r}"
+        )
+    target = models_folder() / f"{name}.onnx"
+    if target.exists() or any(known.name == name for known in installed_models()):
+        raise InputError(f"a model named {name!r} is installed already; choose another --name")
+    model = adopted(path, layout, classes, name)
+    card = {HASH_KEY: hashlib.sha256(model).hexdigest(), "imported_from": path.name}
+    target.parent.mkdir(parents=True, exist_ok=True)
+    for place, data in (
+        (target.with_suffix(".json"), json.dumps(card, indent=1).encode()),
+        (target, model),
+    ):
+        part = place.with_name(f".{place.name}.part")
+        part.write_bytes(data)
+        part.replace(place)
+    return InstalledModel(name, target, False)
 
 
 def read_card(model: InstalledModel) -> dict[str, Any]:

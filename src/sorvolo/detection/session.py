@@ -1,8 +1,10 @@
 """One model file, opened where it runs fastest: a picture in, boxes out."""
 
+import json
 import math
 import os
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
@@ -13,6 +15,7 @@ import numpy as np
 from sorvolo.detection.confined import confined_engine, described_confined
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.engine import Engine, Planes, Provider, describe, open_engine
+from sorvolo.detection.layouts import AUTO, WISH_KEY, with_metadata
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import BoxesPx, Floats, ImageRGB, Labels, Numbers
 
@@ -39,8 +42,14 @@ class Session:
     letterboxed. Pictures given from several threads are seen one after another.
     """
 
-    def __init__(self, path: Path, provider: Provider = "auto", threads: int | None = None) -> None:
-        """Open a model file on `threads` cores, None for as many as this process may use.
+    def __init__(
+        self,
+        path: Path,
+        provider: Provider = "auto",
+        threads: int | None = None,
+        model: bytes | None = None,
+    ) -> None:
+        """Open a model file on `threads` cores, None for as many as this process may use; `model` in place of its bytes.
 
         Raises InputError for a file that is missing, damaged or none of ours, SettingsError for a provider
         that is not installed.
@@ -51,7 +60,7 @@ class Session:
             )
         if threads is not None and threads < 1:
             raise SettingsError(f"a model needs at least one thread, not {threads}")
-        engine = opened_engine(path, provider, threads)
+        engine = opened_engine(path, provider, threads, model)
         self._run, self.provider, self.info, self.fixed_px = (
             engine.run,
             engine.provider,
@@ -162,13 +171,41 @@ def read_model(path: Path) -> bytes:
         ) from error
 
 
-def opened_engine(path: Path, provider: Provider = "auto", threads: int | None = None) -> Engine:
+def opened_engine(
+    path: Path,
+    provider: Provider = "auto",
+    threads: int | None = None,
+    model: bytes | None = None,
+) -> Engine:
     """A packaged model runs in this process, any other beside it, where it cannot take all memory.
 
     Raises as `Session` does.
     """
     opens = open_engine if _is_packaged(path) else confined_engine
-    return opens(read_model(path), str(path), provider, threads or usable_cores())
+    return opens(model or read_model(path), str(path), provider, threads or usable_cores())
+
+
+def adopted(
+    path: Path, layout: str = AUTO, classes: Sequence[str] | None = None, name: str = ""
+) -> bytes:
+    """The bytes of a foreign network with the metadata of one of ours.
+
+    `layout` is one of `layouts.LAYOUTS`, or "auto"; `classes` names the network's classes in its order, where its file
+    does not. Three pictures are shown to it first. Raises InputError for what cannot be read, recognised or run.
+    """
+    if isinstance(classes, str):
+        classes = (classes,)
+    model, where = read_model(path), str(path)
+    wish = {"layout": layout, "classes": classes, "name": name or path.stem}
+    engine = confined_engine(with_metadata(model, wish, WISH_KEY), where, "cpu", usable_cores())
+    whole = with_metadata(model, json.loads(engine.metadata))
+    session = Session(path, "cpu", model=whole)
+    height, width = session.fixed_px or (480, 640)
+    noise = np.random.default_rng(0).integers(0, 256, (height, width, 3), np.uint8)
+    ramp = np.linspace(0, 255, width).astype(np.uint8)
+    for picture in (np.zeros_like(noise), noise, np.tile(ramp[:, None], (height, 1, 3))):
+        session.see(picture)
+    return whole
 
 
 def _is_packaged(path: Path) -> bool:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -62,6 +62,38 @@ class Detections:
         return Detections(
             self.boxes_px[index], self.scores[index], self.labels[index], self.classes
         )
+
+    def to_supervision(self) -> Any:
+        """The same as `supervision.Detections` (pip install supervision)."""
+        import supervision
+
+        return supervision.Detections(
+            xyxy=np.array(self.boxes_px),
+            confidence=np.array(self.scores, np.float32),
+            class_id=np.array(self.labels),
+            data={"class_name": np.array(self.names, str)},
+        )
+
+    @classmethod
+    def from_supervision(cls, found: Any, classes: Sequence[str] | None = None) -> "Detections":
+        """Of `supervision.Detections`, best first. Its own class names are used where `classes` gives none.
+
+        Raises GeometryError where neither names the classes.
+        """
+        named = found.data.get("class_name")
+        if classes is None and named is None and len(found):
+            raise GeometryError(
+                "these detections name no classes: give `classes`, in the order of their ids"
+            )
+        scores = np.ones(len(found)) if found.confidence is None else np.asarray(found.confidence)
+        order = np.argsort(-scores, kind="stable")
+        if classes is None:
+            names = [str(name) for name in (() if named is None else named)]
+            classes = tuple(dict.fromkeys(names))
+            labels = np.array([classes.index(name) for name in names], np.int64)
+        else:
+            labels = np.asarray(found.class_id, np.int64)
+        return cls(found.xyxy[order], scores[order], labels[order], tuple(classes))
 
     def surest(self, most: int) -> "Detections":
         """At most this many rows, those of the highest scores first."""

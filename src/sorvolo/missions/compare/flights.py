@@ -18,7 +18,7 @@ from sorvolo.change.alignment import Caution, FlightPlace
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.compare.run import Again, CompareRun, Pending
 from sorvolo.missions.compare.whole_flight import MANY, OVERLAP
-from sorvolo.missions.flight.detector_protocol import ObjectDetector
+from sorvolo.missions.flight.detector_protocol import FindsObjects, ObjectDetector, as_detector
 from sorvolo.missions.flight.disk import check_room
 from sorvolo.missions.flight.headline import contradicts_itself
 from sorvolo.missions.flight.known_camera import known_camera
@@ -57,7 +57,7 @@ def compare_flights(
     camera: Path | str | None = None,
     area: Path | None = None,
     steps: Path | None = None,
-    detector: ObjectDetector | None = None,
+    detector: FindsObjects | None = None,
     live: LiveSettings = LiveSettings(keeps_all=True),
     until: threading.Event | None = None,
     again: bool = False,
@@ -79,7 +79,11 @@ def compare_flights(
     with Archive.open(site, write=False) as archive:
         _check_map(archive, site, settings)
     is_live = any(is_live_address(str(each)) for each in inputs)
-    looks = open_detector(settings.model, is_live=is_live) if detector is None else detector
+    looks = (
+        open_detector(settings.model, is_live=is_live)
+        if detector is None
+        else as_detector(detector)
+    )
     check_classes(looks, settings.classes)
     opened = opened_sources(
         inputs,

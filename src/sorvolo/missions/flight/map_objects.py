@@ -9,13 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sorvolo.detection.detector import Detector
 from sorvolo.detection.fusing import is_from_above
 from sorvolo.detection.models import installed_models
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.camera import Camera
-from sorvolo.missions.flight.detector_protocol import ObjectDetector
+from sorvolo.missions.flight.detector_protocol import ObjectDetector, load_detector
 from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.flight.settings import WAITING_MB
 from sorvolo.missions.flight.threads import lower_priority, made_at_low_priority
@@ -54,8 +53,8 @@ def open_detector(model: str, *, is_live: bool = False) -> ObjectDetector | None
     if model == DEFAULT_MODEL and all(each.name != DEFAULT_MODEL for each in installed_models()):
         return None
     if is_live:
-        return made_at_low_priority(lambda: Detector.load(model))
-    return Detector.load(model)
+        return made_at_low_priority(lambda: load_detector(model))
+    return load_detector(model)
 
 
 def check_classes(detector: ObjectDetector | None, classes: Sequence[str]) -> None:

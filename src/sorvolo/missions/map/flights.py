@@ -18,7 +18,7 @@ from sorvolo.capture.video_spans import SparseReading
 from sorvolo.errors import SettingsError
 from sorvolo.missions.flight.base_map import open_base
 from sorvolo.missions.flight.control import open_control
-from sorvolo.missions.flight.detector_protocol import ObjectDetector
+from sorvolo.missions.flight.detector_protocol import FindsObjects, ObjectDetector, as_detector
 from sorvolo.missions.flight.disk import LiveRoom, check_room
 from sorvolo.missions.flight.map_objects import ObjectFinder, open_detector
 from sorvolo.missions.flight.opened import OpenedFlight, opened_flights
@@ -68,7 +68,7 @@ def map_flights(
     telemetry: Path | str | None = None,
     camera: Path | str | None = None,
     area: Path | None = None,
-    detector: ObjectDetector | None = None,
+    detector: FindsObjects | None = None,
     live: LiveSettings = LiveSettings(keeps_all=True),
     until: threading.Event | None = None,
     control: Path | None = None,
@@ -98,7 +98,11 @@ def map_flights(
     check_waypoint_files(refly, site)
     wanted = None if area is None else read_area(area)
     is_live = any(is_live_address(str(each)) for each in inputs)
-    looks = open_detector(settings.model, is_live=is_live) if detector is None else detector
+    looks = (
+        open_detector(settings.model, is_live=is_live)
+        if detector is None
+        else as_detector(detector)
+    )
     asked = replace(settings, live_s=0.0, memory_mb=None), wanted, looks
     opened = opened_sources(
         inputs, telemetry, camera, known_flights(site, catalogues), live=live, until=until

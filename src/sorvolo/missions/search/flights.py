@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from sorvolo.errors import InputError
-from sorvolo.missions.flight.detector_protocol import ObjectDetector
+from sorvolo.missions.flight.detector_protocol import FindsObjects
 from sorvolo.missions.search.earlier import Basis, read_plants, write_plants
 from sorvolo.missions.search.measure import (
     MeasuredFlight,
@@ -34,7 +34,7 @@ def search_site(
     site_folder: Path,
     settings: SearchSettings,
     outputs: SearchOutputs,
-    detector: ObjectDetector | None = None,
+    detector: FindsObjects | None = None,
 ) -> Generator[SearchProgress | dict[str, Any]]:
     """Measure the flights of a site, yielding progress and, at last, the report; files appear in `outputs.folder`.
 

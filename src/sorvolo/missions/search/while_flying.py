@@ -11,7 +11,7 @@ from types import TracebackType
 from typing import Self
 
 from sorvolo.errors import SorvoloError, SorvoloWarning
-from sorvolo.missions.flight.detector_protocol import ObjectDetector
+from sorvolo.missions.flight.detector_protocol import FindsObjects
 from sorvolo.missions.flight.threads import lower_priority
 from sorvolo.missions.map.planar_run import FlightRun
 from sorvolo.missions.search.earlier import EarlierFlights
@@ -64,7 +64,7 @@ class SearchWhileFlying:
         self,
         settings: SearchSettings,
         outputs: SearchOutputs,
-        detector: ObjectDetector | None = None,
+        detector: FindsObjects | None = None,
         pace: Pace = Pace(),
     ) -> None:
         self._prepared: PreparedSearch = prepare_search(settings, outputs, detector, is_live=True)

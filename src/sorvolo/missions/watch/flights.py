@@ -13,10 +13,14 @@ import sorvolo
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.stream import LiveStream
 from sorvolo.capture.source import LiveSource, Source, open_sources
-from sorvolo.detection.detector import Detector
 from sorvolo.errors import InputError, SettingsError, SorvoloWarning
 from sorvolo.geometry.arrays import ImageGray
-from sorvolo.missions.flight.detector_protocol import ObjectDetector
+from sorvolo.missions.flight.detector_protocol import (
+    FindsObjects,
+    ObjectDetector,
+    as_detector,
+    load_detector,
+)
 from sorvolo.missions.flight.request import live_request, request_of
 from sorvolo.missions.flight.result_cache import ResultCache, go_on
 from sorvolo.missions.flight.settings import MapSettings
@@ -43,7 +47,7 @@ def watch(
     *,
     telemetry: Path | str | None = None,
     camera: Path | str | None = None,
-    detector: ObjectDetector | None = None,
+    detector: FindsObjects | None = None,
     live: LiveSettings = LiveSettings(),
     until: threading.Event | None = None,
     moved: Callable[[PictureStep], None] | None = None,
@@ -144,13 +148,13 @@ def _free_folder(folder: Path) -> Path:
 
 
 def _checked_detector(
-    detector: ObjectDetector | None, settings: WatchSettings, outputs: WatchOutputs
+    detector: FindsObjects | None, settings: WatchSettings, outputs: WatchOutputs
 ) -> ObjectDetector:
     """The detector of a watch. Raises InputError or SettingsError where it, or where its finds go, cannot be used."""
     if outputs.cot:
         check_host(cot_place(outputs.cot))
         outputs.cot_tls.context()
-    finder = Detector.load(settings.model) if detector is None else detector
+    finder = load_detector(settings.model) if detector is None else as_detector(detector)
     if unknown := sorted(set(settings.classes) - set(finder.classes)):
         raise SettingsError(
             f"the model knows no {unknown[0]!r}; it knows {', '.join(finder.classes)}"
