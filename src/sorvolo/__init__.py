@@ -7,6 +7,8 @@ it is first used, so that `import sorvolo` alone is quick.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from sorvolo.build import VERSION
+
 if TYPE_CHECKING:
     from sorvolo.capture.areas import read_area
     from sorvolo.change.compare import Comparison, compare_images
@@ -65,7 +67,7 @@ if TYPE_CHECKING:
     from sorvolo.survey.findings import Verdict
     from sorvolo.survey.objects import Detections
 
-__version__ = "0.1.0"
+__version__ = VERSION
 
 __all__ = [
     "Archive",

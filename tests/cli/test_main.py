@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import sorvolo
+from sorvolo.build import build
 from sorvolo.cli import main as cli
 from sorvolo.errors import InputError
 from sorvolo.missions.map.flights import map_flights
@@ -19,13 +20,13 @@ _COMMANDS = ("inspect", "plan", "map", "simulate", "evaluate", "calibrate", "dem
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["--version"]) == 0
-    assert capsys.readouterr().out == f"sorvolo {sorvolo.__version__}\n"
+    assert capsys.readouterr().out == f"sorvolo {build()}\n"
 
 
 def test_module_is_the_command() -> None:
     command = [sys.executable, "-m", "sorvolo", "--version"]
     run = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert (run.returncode, run.stdout, run.stderr) == (0, f"sorvolo {sorvolo.__version__}\n", "")
+    assert (run.returncode, run.stdout, run.stderr) == (0, f"sorvolo {build()}\n", "")
 
 
 @pytest.mark.parametrize(("wished", "threads"), [(None, "1"), ("3", "3")])

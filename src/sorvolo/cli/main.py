@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, TextIO
 
 import typer
 
-from sorvolo import __version__
+from sorvolo.build import build
 from sorvolo.cli.archive import archive_app, site_app
 from sorvolo.cli.batch import batch
 from sorvolo.cli.calibrate import calibrate
@@ -158,7 +158,7 @@ def _warnings_in_one_line() -> Iterator[None]:
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"sorvolo {__version__}")
+        typer.echo(f"sorvolo {build()}")
         raise typer.Exit
 
 
@@ -196,7 +196,7 @@ def _words_of(error: Exception) -> str:
     if isinstance(error, MemoryError):
         return "out of memory; close other programs, or make a coarser map with --gsd"
     return (
-        f"this is a bug in sorvolo {__version__}: {type(error).__name__}: {error}. Please report it with the "
+        f"this is a bug in sorvolo {build()}: {type(error).__name__}: {error}. Please report it with the "
         "command and what `sorvolo --debug ...` prints (see CONTRIBUTING.md)"
     )
 

@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, Self
 
-import sorvolo
+from sorvolo.build import build
 from sorvolo.cluster.executors import LOCK, Executor, TryEnding
 from sorvolo.cluster.flights import (
     FlightFiles,
@@ -433,7 +433,7 @@ def _new_row(
     if settings.camera and camera.is_file():
         facts = camera.stat().st_size, camera.stat().st_mtime_ns
     wish = replace(settings, by_place=False, retries=False)
-    text = repr((sorvolo.__version__, software(), found.stamp, wish, facts))
+    text = repr((build(), software(), found.stamp, wish, facts))
     request = hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:32]
     row = BatchRow(str(found.path), settings.mission, found.stamp, request, None)
     if found.why_not:

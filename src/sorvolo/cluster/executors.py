@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, Self
 
-import sorvolo
+from sorvolo.build import build
 from sorvolo.child_process import python_command
 from sorvolo.errors import SettingsError, StoreError
 from sorvolo.missions.worker import FINISHED, TO_CHECK, Order
@@ -211,7 +211,7 @@ class RayExecutor:
             task = self._ray.remote(_run_there).options(
                 num_cpus=1, max_retries=0, scheduling_strategy="SPREAD"
             )
-            self._running[key] = task.remote(order, self._root, sorvolo.__version__)
+            self._running[key] = task.remote(order, self._root, build())
 
     def next_ended(self) -> tuple[str, TryEnding]:
         """Wait for a mission to end. Raises SettingsError where the cluster is gone."""
@@ -308,9 +308,9 @@ def _run_there(order: Order, root: str, version: str) -> TryEnding:
     Raises StoreError on a machine with another Sorvolo, or without the batch's disk.
     """
     host = socket.gethostname()
-    if sorvolo.__version__ != version:
+    if build() != version:
         raise StoreError(
-            f"the machine {host} has Sorvolo {sorvolo.__version__}, the batch {version}; install "
+            f"the machine {host} has Sorvolo {build()}, the batch {version}; install "
             "the same one on all machines"
         )
     if not (Path(root) / LOCK).exists() or not Path(order.source).exists():

@@ -8,7 +8,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from sorvolo import __version__
+from sorvolo.build import build
 from sorvolo.errors import GeometryError, InputError, StoreError
 from sorvolo.lab.thesis import comparisons, detectors, mosaics
 from sorvolo.lab.thesis.npu_folder import ENVIRONMENT, read_npu_folder
@@ -240,7 +240,7 @@ class _Work:
                 self._settings.seed,
             ),
         }
-        return content_sha256(__version__, task.id, files, of_kind.get(task.kind, ()))
+        return content_sha256(build(), task.id, files, of_kind.get(task.kind, ()))
 
     def _name(self, path: Path) -> str:
         """A file's place within the dataset, which may be moved as a whole."""

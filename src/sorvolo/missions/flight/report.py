@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-import sorvolo
+from sorvolo.build import build
 from sorvolo.capture.clock_offset import OffsetEstimate
 from sorvolo.capture.video import VideoSource
 from sorvolo.geometry.camera import Camera
@@ -148,7 +148,7 @@ def _stated(setup: FlightSetup, result: FlightResult) -> Stated:
 def report_head(setup: FlightSetup, *, is_local: bool) -> dict[str, Any]:
     """Return what every mission's report begins with."""
     return {
-        "sorvolo": sorvolo.__version__,
+        "sorvolo": build(),
         "flight": setup.source.name,
         "inputs": list(setup.source.inputs),
         "georeferenced": not is_local,

@@ -6,7 +6,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import sorvolo
+from sorvolo.build import build
 from sorvolo.capture.photos import PhotoSource
 from sorvolo.capture.source import LiveSource
 from sorvolo.capture.video import VideoSource
@@ -47,7 +47,7 @@ def request_of(
     detector: ObjectDetector | None,
     *more: Any,
 ) -> str:
-    """What is asked for: the same command over the same files by the same version of the program gives the same.
+    """What is asked for: the same command over the same files by the same build of the program gives the same.
 
     `settings` is the mission's record, `more` what else the result depends on: records, arrays and plain values. Of a
     live flight: the same command, see `live_request`.
@@ -56,7 +56,7 @@ def request_of(
         return live_request(setup.source, settings, area, detector, *more)
     files = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in _files(setup)]
     return content_sha256(
-        sorvolo.__version__,
+        build(),
         software(),
         setup.source.fingerprint,
         files,
@@ -78,7 +78,7 @@ def live_request(
 ) -> str:
     """What is asked for of a live flight, which is known before the flight is: the same for the same address."""
     return content_sha256(
-        sorvolo.__version__,
+        build(),
         software(),
         source.inputs,
         source.kind,

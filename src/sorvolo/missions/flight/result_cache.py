@@ -11,7 +11,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
-import sorvolo
+from sorvolo.build import build
 from sorvolo.capture.live.segments import FlightSoFar, joined_samples
 from sorvolo.capture.source import LiveSource, Source
 from sorvolo.errors import SorvoloError, SorvoloWarning
@@ -275,7 +275,7 @@ def cache_of_run(
             (each.id, each.run_id, each.flight_id) for each in archive.versions() if each.complete
         ]
         key = content_sha256(request, setup.plan, setup.frame.origin, site, versions)
-    journal = archive.journal(setup.source.name, key, sorvolo.__version__, anew=anew)
+    journal = archive.journal(setup.source.name, key, build(), anew=anew)
     return ResultCache(journal, setup.source)
 
 
@@ -284,7 +284,7 @@ def go_on_live(source: Source, archive: Archive, asked: tuple[Any, ...], most_ga
     source in `live_request`)."""
     if isinstance(source, LiveSource):
         key = _live_key(archive, live_request(source, *asked))
-        journal = archive.stopped_run(key, sorvolo.__version__)
+        journal = archive.stopped_run(key, build())
         if journal is not None:
             go_on(source, journal, most_gap_s)
 

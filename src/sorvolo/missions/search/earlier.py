@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
-from sorvolo import __version__
+from sorvolo.build import build
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import PointsM
 from sorvolo.missions.flight.request import software
@@ -72,7 +72,7 @@ class Basis:
         area = "" if prepared.area is None else content_sha256(prepared.area.polygons_lonlat)
         places = [(each.placed.camera, pose_of(each.placed)) for each in frames]
         return cls(
-            content_sha256(__version__, software()),
+            content_sha256(build(), software()),
             content_sha256(prepared.detector.info),
             content_sha256(places),
             heights,

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import sorvolo
+from sorvolo.build import build
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.stream import LiveStream
 from sorvolo.capture.source import LiveSource, Source, open_sources
@@ -128,7 +128,7 @@ def _asked(settings: WatchSettings, outputs: WatchOutputs) -> tuple[Any, ...]:
 
 
 def _journal(folder: Path, request: str) -> RunJournal:
-    return RunJournal(folder / JOURNAL, content_sha256(request), 0, sorvolo.__version__)
+    return RunJournal(folder / JOURNAL, content_sha256(request), 0, build())
 
 
 def _folder_of(source: Source, outputs: WatchOutputs, *, is_only: bool) -> Path:
