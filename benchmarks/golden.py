@@ -88,7 +88,7 @@ _LEFT_OUT = re.compile(r"site\.(db|lock)|\.html$|journal|\.lock$|live\.")
 def _without_times(value: object) -> object:
     if isinstance(value, dict):
         return {
-            key: _without_times(part)
+            key: str(part).partition("+")[0] if key == "sorvolo" else _without_times(part)
             for key, part in value.items()
             if not _VARIES.search(key.lower())
         }
