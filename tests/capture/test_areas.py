@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pyproj import Transformer
 
 from sorvolo.capture.areas import CORRIDOR_M, read_area
 from sorvolo.errors import GeometryError, InputError
@@ -93,6 +94,68 @@ def test_kmz(tmp_path):
         archive.writestr("files/note.txt", "x")
         archive.writestr("doc.kml", kml(FIELD, POND))
     assert read_area(path).contains(np.array([INSIDE, IN_POND])).tolist() == [True, False]
+
+
+def test_the_main_document_of_a_kmz_is_read(tmp_path):
+    path = tmp_path / "field.kmz"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("files/links.kml", "<kml><Document/></kml>")
+        archive.writestr("doc.kml", kml(FIELD, POND))
+    assert read_area(path).contains(np.array([INSIDE, OUTSIDE])).tolist() == [True, False]
+
+
+@pytest.mark.parametrize("encoding", ["UTF-16", "ISO-8859-1", "windows-1252"])
+def test_kml_is_decoded_as_it_states(tmp_path, encoding):
+    text = kml(FIELD, POND).replace("UTF-8", encoding).replace(">field<", ">Würmsee<")
+    (tmp_path / "field.kml").write_bytes(text.encode(encoding))
+    area = read_area(tmp_path / "field.kml")
+    assert area.contains(np.array([INSIDE, IN_POND])).tolist() == [True, False]
+
+
+@pytest.mark.parametrize(
+    "old, new, is_clear",
+    [(",", ", ", True), (",", " , ", True), (" ", ", ", False), (",120.5", ", ", False)],
+)
+def test_blanks_beside_the_commas_of_kml(read, old, new, is_clear):
+    """Where each position still ends in a blank, they are read; else the reason is named."""
+    text = kml(FIELD, POND)
+    start, end = text.index("<coordinates>"), text.rindex("</coordinates>")
+    changed = text[:start] + text[start:end].replace(old, new) + text[end:]
+    if is_clear:
+        assert read(changed).contains(np.array([INSIDE, IN_POND])).tolist() == [True, False]
+    else:
+        with pytest.raises(InputError, match="blanks after commas are not valid KML"):
+            read(changed)
+
+
+def test_the_survey_of_a_qgroundcontrol_plan(read):
+    survey = {
+        "type": "ComplexItem",
+        "complexItemType": "survey",
+        "polygon": [[latitude, longitude] for longitude, latitude in FIELD[:-1]],
+    }
+    takeoff = {"type": "SimpleItem", "command": 22, "params": [0, 0, 0, None, 45.0, 12.0, 50]}
+    plan = {"fileType": "Plan", "version": 1, "mission": {"items": [takeoff, survey]}}
+    assert read(plan, "a.plan").contains(np.array([INSIDE, OUTSIDE])).tolist() == [True, False]
+    plan["mission"]["items"].pop()
+    with pytest.raises(InputError, match="QGroundControl plan without a survey's polygon"):
+        read(plan, "a.plan")
+
+
+def test_geojson_of_another_crs_is_taken_to_wgs84(read):
+    """QGIS writes the member `crs`: degrees of another datum are 50 m and more off, and metres are no degrees."""
+    for code in (3004, 4265, 32633):
+        there = Transformer.from_crs(4326, code, always_xy=True)
+        crs = {"type": "name", "properties": {"name": f"urn:ogc:def:crs:EPSG::{code}"}}
+        outline = [list(there.transform(*point)) for point in FIELD]
+        area = read(polygon(outline) | {"crs": crs})
+        np.testing.assert_allclose(
+            sorted(area.polygons_lonlat[0][0].tolist()), sorted(FIELD[:-1]), atol=1e-7
+        )
+    stated = {"crs": {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}}
+    assert read(polygon(FIELD) | stated).contains(np.array([INSIDE])).all()
+    with pytest.raises(InputError, match=r"an ellipsoid .Bessel 1841. but no datum"):
+        read(polygon(FIELD) | {"crs": {"properties": {"name": "EPSG:4004"}}})
 
 
 def test_overlapping_polygons_are_a_union(read):

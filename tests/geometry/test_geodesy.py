@@ -7,10 +7,12 @@ from hypothesis import strategies as st
 from pyproj import Transformer
 
 from sorvolo.errors import GeometryError, SettingsError
+from sorvolo.geometry.crs import crs_from_words, transformer, vertical_name
 from sorvolo.geometry.geodesy import (
     Geodetic,
     LocalFrame,
     Projection,
+    check_map_crs,
     ecef_from_wgs84,
     utm_epsg,
     wgs84_from_ecef,
@@ -137,3 +139,57 @@ def test_a_crs_that_is_not_projected_is_refused(crs):
 def test_places_off_the_earth_are_refused(place):
     with pytest.raises(GeometryError):
         Geodetic(*place)
+
+
+@pytest.mark.parametrize(
+    "words, code, heights",
+    [
+        ("WGS84 UTM 33T", 32633, ""),
+        ("WGS 84 / UTM zone 33N", 32633, ""),
+        ("WGS84 UTM 33S", 32733, ""),
+        ("wgs84 utm 33h", 32733, ""),
+        ("WGS84", 4326, ""),
+        ("EPSG:32633+5773", 32633, "EGM96 height"),
+        ("EPSG:4979", 4979, "ellipsoid"),
+        ("+proj=utm +zone=33 +datum=WGS84", 32633, ""),
+    ],
+)
+def test_words_of_a_crs(words, code, heights):
+    crs = crs_from_words(words)
+    horizontal = crs.sub_crs_list[0] if crs.is_compound else crs
+    assert (horizontal.to_epsg(), vertical_name(crs)) == (code, heights)
+
+
+@pytest.mark.parametrize(
+    "words, found",
+    [
+        (
+            "+proj=tmerc +lon_0=15 +k=0.9996 +x_0=2520000 +ellps=intl",
+            "International 1924.*no datum",
+        ),
+        ("+proj=merc +a=6378137 +b=6378137", "no datum"),
+        ("EPSG:4004", "Bessel 1841.*no datum"),
+        ("EPSG:3785", "Popular Visualisation Datum"),
+        ("EPSG:5773", "no CRS of a map"),
+        ("WGS84 UTM 33O", "is no CRS"),
+        ("WGS84 UTM 61N", "is no CRS"),
+        ("+proj=utm +zone=33 +nadgrids=x", "nadgrids"),
+    ],
+)
+def test_a_crs_of_no_known_place_is_refused(words, found):
+    with pytest.raises(GeometryError, match=found):
+        crs_from_words(words)
+
+
+def test_a_map_and_a_projection_want_a_known_datum():
+    with pytest.raises(SettingsError, match="Popular Visualisation Datum"):
+        check_map_crs("EPSG:3785")
+    with pytest.raises(GeometryError, match="no datum"):
+        Projection("+proj=utm +zone=33 +ellps=intl").projected_from_wgs84(np.zeros(1), np.zeros(1))
+    # the Italian grid with its datum: 73 m from where an ellipsoid alone would put it
+    there = transformer("EPSG:3004").transform(2_320_000, 4_642_000)
+    named = "+proj=tmerc +lat_0=0 +lon_0=15 +k=0.9996 +x_0=2520000 +y_0=0 +ellps=intl +units=m"
+    shift = " +towgs84=-104.1,-49.1,-9.9,0.971,-2.917,0.714,-11.68"
+    np.testing.assert_allclose(
+        transformer(named + shift).transform(2_320_000, 4_642_000), there, atol=1e-6
+    )

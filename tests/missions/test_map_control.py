@@ -13,6 +13,7 @@ from PIL import Image
 from pyproj import Transformer
 
 from sorvolo.capture.calibration import camera_from_option
+from sorvolo.capture.control_points import read_control_points
 from sorvolo.cli import main as cli
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
@@ -270,6 +271,18 @@ def exchanged(text: str, first: int, second: int) -> str:
     return "\n".join([head, *(" ".join(row) for row in cells)])
 
 
+@pytest.mark.parametrize("words", ["WGS84 UTM 33T", "EPSG:32633+5773"])
+def test_other_names_of_a_crs_place_the_points_alike(
+    surveyed: Surveyed, tmp_path: Path, words: str
+) -> None:
+    gcp = surveyed.write(tmp_path / "gcp_list.txt")
+    expected = read_control_points(gcp).control
+    gcp.write_text(gcp.read_text().replace(_UTM, words))
+    control = read_control_points(gcp).control
+    assert control.points == expected.points
+    assert control.crs.endswith("+ EGM96 height)" if "+" in words else "/ UTM zone 33N)")
+
+
 @pytest.mark.parametrize("has_gps", [True, False], ids=["GPS", "no GPS"])
 @pytest.mark.parametrize(
     "crs, change, words",
@@ -288,6 +301,11 @@ def exchanged(text: str, first: int, second: int) -> str:
             _UTM,
             lambda text: text.replace(_UTM, "+proj=pipeline +nadgrids=@/etc/passwd"),
             "nadgrids",
+        ),
+        (
+            _UTM,
+            lambda text: text.replace(_UTM, "+proj=tmerc +lon_0=15 +k=0.9996 +ellps=intl"),
+            "no datum",
         ),
         (_UTM, lambda text: text.replace(" G0", " G0\nhalf a line"), "columns"),
         (_UTM, lambda text: exchanged(text, 3, 4), "px and py"),

@@ -333,6 +333,11 @@ def test_a_height_model_places_what_its_heights_alone_cannot(
     assert any("the height model's ground" in each["text"] for each in notices)
     with pytest.raises(SettingsError, match="not both"):
         replace(few, height_model=str(model), ground_elevation_m=3.0)
+    # one that counts from the ellipsoid would put the ground tens of metres off
+    with rasterio.open(model, "r+") as stored:
+        stored.crs = "EPSG:4979"
+    with pytest.raises(InputError, match="from ellipsoid, and the telemetry's are orthometric"):
+        list(watch(_video(flown), settings, outputs, telemetry=log, camera=flown / "camera.xml"))
 
 
 def test_those_who_want_it_are_alerted(

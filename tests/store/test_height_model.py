@@ -165,6 +165,46 @@ def test_what_is_no_model_of_this_ground(make: Any, words: str, tmp_path: Path) 
         read_height_model(make(tmp_path / "model.tif"), _BOUNDS_DEG)
 
 
+NO_DATUM = "+proj=tmerc +lat_0=0 +lon_0=15 +k=0.9996 +x_0=2520000 +y_0=0 +ellps=intl +units=m"
+
+
+@pytest.mark.parametrize(
+    "crs, words",
+    [
+        (NO_DATUM, "International 1924.* but no datum: .*EPSG code"),
+        ("EPSG:4004", "Bessel 1841.* but no datum"),
+    ],
+)
+def test_a_raster_of_no_known_datum_is_refused(crs: str, words: str, tmp_path: Path) -> None:
+    path = written(
+        tmp_path / "model.tif",
+        crs,
+        Affine(10, 0, 2_320_000, 0, -10, 4_642_000),
+        np.ones((9, 9), np.uint8),
+    )
+    for read in (lambda path: read_height_model(path, _BOUNDS_DEG), BaseMap.open):
+        with pytest.raises(InputError, match=words):
+            read(path)
+
+
+def test_a_named_datum_and_that_of_the_heights_are_kept(tmp_path: Path) -> None:
+    """The same slope in the Italian grid, 73 m off if its datum were taken as WGS84, with heights above the sea."""
+    model = read_height_model(slope(tmp_path / "utm.tif"), _BOUNDS_DEG)
+    assert model.datum == ""
+    east_m, north_m = Transformer.from_crs(32633, 3004, always_xy=True).transform(
+        *np.meshgrid(np.linspace(299_500, 302_500, 3), np.linspace(4_639_500, 4_642_500, 3))
+    )
+    columns = np.arange(east_m.min(), east_m.max(), 10.0) + 5
+    rows = np.arange(north_m.max(), north_m.min(), -10.0) - 5
+    back = Transformer.from_crs(3004, 32633, always_xy=True)
+    heights_m = plane_m(*back.transform(*np.meshgrid(columns, rows)))
+    transform = Affine(10, 0, columns[0] - 5, 0, -10, rows[0] + 5)
+    path = written(tmp_path / "italian.tif", "EPSG:3004+5773", transform, heights_m)
+    model = read_height_model(path, _BOUNDS_DEG)
+    assert model.datum == "EGM96 height"
+    assert np.abs(model.at(_LONGITUDES, _LATITUDES) - truth_m()).max() < 0.2
+
+
 def test_a_file_without_a_place_is_refused_in_one_line(tmp_path: Path) -> None:
     with rasterio.open(
         tmp_path / "plain.tif", "w", driver="GTiff", width=9, height=9, count=1, dtype="uint8"

@@ -1,4 +1,4 @@
-"""Area files: GeoJSON, KML and KMZ polygons, and the thesis's list of coordinates (UAV_path, eq. 3.1).
+"""Area files: GeoJSON, KML, KMZ and QGroundControl polygons, and the thesis's list of coordinates (eq. 3.1).
 
 A list that closes into a polygon (its last point repeats the first, or three or more points whose outline
 does not cross itself) is that polygon. Any other list, and a line in GeoJSON or KML, is a path that was or
@@ -11,7 +11,7 @@ import re
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 from xml.etree.ElementTree import Element
@@ -24,6 +24,7 @@ from pyproj import Proj
 from sorvolo.capture.small_files import read_small_file, text_of
 from sorvolo.errors import GeometryError, InputError
 from sorvolo.geometry.arrays import Floats
+from sorvolo.geometry.crs import crs_from_words, transformer
 from sorvolo.geometry.polygons import widened_line
 from sorvolo.survey.area import Area
 
@@ -46,6 +47,7 @@ _BROKEN_ZIP = (
     struct.error,
 )
 _SEPARATOR = re.compile(r"[,;\s]+")
+_LONGITUDE_FIRST = "GeoJSON and KML put longitude first"
 _LATITUDE_NAMES = ("latitude", "lat", "latitude_deg")
 _LONGITUDE_NAMES = ("longitude", "lon", "lng", "long", "longitude_deg")
 
@@ -56,13 +58,16 @@ def read_area(path: Path) -> Area:
     """The area of interest in a file, recognised by its content.
 
     Raises InputError for a file that is missing, empty, of another kind, without polygon or path, or whose
-    coordinates are off the Earth, cross themselves or are not WGS84 longitude and latitude.
+    coordinates are off the Earth, cross themselves or are not WGS84 longitude and latitude (GeoJSON may name another
+    CRS, in its member `crs`).
     """
     raw = read_small_file(path, "area file", _MOST_BYTES)
     if raw[:2] == b"PK":
         raw = _kml_in_kmz(path, raw)
-    text = text_of(path, raw, "area file", "GeoJSON, KML, KMZ or a list of coordinates")
     try:
+        if _is_xml_of_another_encoding(raw):
+            return Area(tuple(_from_kml(path, raw.strip())), path.stem)
+        text = text_of(path, raw, "area file", "GeoJSON, KML, KMZ, .plan or a list of coordinates")
         if text.startswith("{"):
             polygons = _from_geojson(path, text)
         elif text.startswith("<"):
@@ -78,6 +83,15 @@ def read_area(path: Path) -> Area:
         raise InputError(f"{path}: {error}") from error
 
 
+def _is_xml_of_another_encoding(raw: bytes) -> bool:
+    """Whether the bytes are XML that only an XML parser can decode, by the encoding that it states."""
+    try:
+        raw.decode()
+    except UnicodeDecodeError:
+        return raw.lstrip()[:5] == b"<?xml"
+    return False
+
+
 def read_segments(path: Path) -> list[tuple[str, Area, float]]:
     """The segments of a search in a GeoJSON file: name, area, and the probability that the missing is in it (POA).
 
@@ -91,8 +105,12 @@ def read_segments(path: Path) -> list[tuple[str, Area, float]]:
         "GeoJSON polygons",
     )
     try:
-        features = json.loads(text)["features"]
-        segments = [_segment(path, number, each) for number, each in enumerate(features, start=1)]
+        tree = json.loads(text)
+        to_wgs84 = _wgs84_from_stated(path, tree)
+        segments = [
+            _segment(path, number, each, to_wgs84)
+            for number, each in enumerate(tree["features"], start=1)
+        ]
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: broken GeoJSON: {error}") from error
     except (KeyError, TypeError, AttributeError) as error:
@@ -108,7 +126,9 @@ def read_segments(path: Path) -> list[tuple[str, Area, float]]:
     return segments
 
 
-def _segment(path: Path, number: int, feature: Any) -> tuple[str, Area, float]:
+def _segment(
+    path: Path, number: int, feature: Any, to_wgs84: Callable[[Floats], Floats]
+) -> tuple[str, Area, float]:
     properties = feature["properties"] or {}
     name = str(properties.get("name") or f"segment {number}")
     shares = {"poa": 1.0, "POA": 1.0, "poa_percent": 0.01}
@@ -121,18 +141,20 @@ def _segment(path: Path, number: int, feature: Any) -> tuple[str, Area, float]:
         raise InputError(
             f"{path}: {name} needs the property poa, the probability (0 to 1) that the missing is there"
         )
-    polygons = _geojson_polygons(path, feature)
+    polygons = _geojson_polygons(path, feature, to_wgs84)
     return name, Area(tuple(polygons), name), stated[0]
 
 
-def _geojson_polygons(path: Path, feature: Any) -> list[Rings]:
+def _geojson_polygons(
+    path: Path, feature: Any, to_wgs84: Callable[[Floats], Floats]
+) -> list[Rings]:
     polygons: list[Rings] = []
     for geometry in _geometries(feature):
         if geometry["type"] == "Polygon":
             polygons.append(_geojson_rings(path, geometry["coordinates"]))
         elif geometry["type"] == "MultiPolygon":
             polygons += [_geojson_rings(path, each) for each in geometry["coordinates"]]
-    return polygons
+    return [tuple(map(to_wgs84, rings)) for rings in polygons]
 
 
 def _kml_in_kmz(path: Path, raw: bytes) -> bytes:
@@ -141,7 +163,9 @@ def _kml_in_kmz(path: Path, raw: bytes) -> bytes:
             names = [name for name in archive.namelist() if name.lower().endswith(".kml")]
             if not names:
                 raise InputError(f"{path}: the KMZ holds no .kml file")
-            with archive.open(names[0]) as file:
+            # programs take doc.kml, else the first at the archive's root; what is in folders is linked from there
+            main = min(names, key=lambda name: (name.lower() != "doc.kml", name.count("/") > 0))
+            with archive.open(main) as file:
                 kml = file.read(_MOST_BYTES + 1)
     except _BROKEN_ZIP as error:
         raise InputError(f"{path}: broken KMZ: {error}; export it again") from error
@@ -153,6 +177,8 @@ def _kml_in_kmz(path: Path, raw: bytes) -> bytes:
 def _from_geojson(path: Path, text: str) -> list[Rings]:
     try:
         tree = json.loads(text)
+        if tree.get("fileType") == "Plan":
+            return _from_plan(path, tree)
         polygons, lines = [], []
         for geometry in _geometries(tree):
             kind, coordinates = geometry["type"], geometry["coordinates"]
@@ -161,9 +187,9 @@ def _from_geojson(path: Path, text: str) -> list[Rings]:
             elif kind == "MultiPolygon":
                 polygons += [_geojson_rings(path, each) for each in coordinates]
             elif kind == "LineString":
-                lines.append(_lonlat(path, coordinates))
+                lines.append(_positions(path, coordinates))
             elif kind == "MultiLineString":
-                lines += [_lonlat(path, each) for each in coordinates]
+                lines += [_positions(path, each) for each in coordinates]
     except (
         ValueError,
         RecursionError,
@@ -171,7 +197,46 @@ def _from_geojson(path: Path, text: str) -> list[Rings]:
         raise InputError(f"{path}: broken GeoJSON: {error}") from error
     except (KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: GeoJSON without the expected member: {error}") from error
-    return _polygons_or_corridors(path, polygons, lines)
+    to_wgs84 = _wgs84_from_stated(path, tree)
+    return _polygons_or_corridors(
+        path,
+        [tuple(map(to_wgs84, rings)) for rings in polygons],
+        list(map(to_wgs84, lines)),
+    )
+
+
+def _wgs84_from_stated(path: Path, tree: Any) -> Callable[[Floats], Floats]:
+    """From the positions, (N, 2), of a GeoJSON file to WGS84, by its member `crs`, which files before 2016 have."""
+    stated = tree.get("crs")
+    if stated is None:
+        return lambda lonlat: _checked(path, lonlat, _LONGITUDE_FIRST)
+    properties = stated.get("properties") if isinstance(stated, dict) else None
+    name = str(properties.get("name", "") if isinstance(properties, dict) else "")
+    if re.search(r"CRS84h?$", name):
+        return lambda lonlat: _checked(path, lonlat, _LONGITUDE_FIRST)
+    code = re.fullmatch(r"(?:urn:ogc:def:crs:)?EPSG:(?:[\d.]*:)?(\d+)", name)
+    try:
+        to_wgs84 = transformer(crs_from_words(f"EPSG:{code[1]}" if code else name).to_wkt())
+    except GeometryError as error:
+        raise InputError(f"{path}: its crs: {error}") from error
+    return lambda places: _checked(
+        path, np.column_stack(to_wgs84.transform(places[:, 0], places[:, 1])), f"its crs is {name}"
+    )
+
+
+def _from_plan(path: Path, tree: Any) -> list[Rings]:
+    """The surveys' polygons of a QGroundControl plan; their corners are latitude first."""
+    items = tree["mission"]["items"]
+    corners = [
+        each["polygon"] for each in items if each.get("type") == "ComplexItem" and "polygon" in each
+    ]
+    if not corners:
+        raise InputError(
+            f"{path}: a QGroundControl plan without a survey's polygon; draw the area as a survey in it, or give it as "
+            "GeoJSON or KML"
+        )
+    order = "a plan puts latitude first"
+    return [(_checked(path, _positions(path, each)[:, ::-1], order),) for each in corners]
 
 
 def _geometries(tree: Any) -> Iterator[Any]:
@@ -190,16 +255,16 @@ def _geometries(tree: Any) -> Iterator[Any]:
 
 
 def _geojson_rings(path: Path, coordinates: Sequence[Any]) -> Rings:
-    return tuple(_lonlat(path, ring) for ring in coordinates)
+    return tuple(_positions(path, ring) for ring in coordinates)
 
 
-def _lonlat(path: Path, positions: Sequence[Any]) -> Floats:
-    """Positions with or without a height, longitude first, as (N, 2)."""
+def _positions(path: Path, positions: Sequence[Any]) -> Floats:
+    """Positions with or without a height as (N, 2)."""
     try:
-        lonlat = np.array([[float(position[0]), float(position[1])] for position in positions])
+        pairs = np.array([[float(position[0]), float(position[1])] for position in positions])
     except (TypeError, ValueError, IndexError, OverflowError) as error:
         raise InputError(f"{path}: a position is not a pair of numbers: {error}") from error
-    return _checked(path, lonlat.reshape(-1, 2), "GeoJSON and KML put longitude first")
+    return pairs.reshape(-1, 2)
 
 
 def _checked(path: Path, lonlat: Floats, order: str) -> Floats:
@@ -221,10 +286,10 @@ def _checked(path: Path, lonlat: Floats, order: str) -> Floats:
     )
 
 
-def _from_kml(path: Path, text: str) -> list[Rings]:
+def _from_kml(path: Path, text: str | bytes) -> list[Rings]:
     try:
         root = ElementTree.fromstring(text)
-    except (ElementTree.ParseError, DefusedXmlException, ValueError) as error:
+    except (ElementTree.ParseError, DefusedXmlException, ValueError, LookupError) as error:
         raise InputError(f"{path}: broken KML: {error}") from error
     polygons, lines = [], []
     for element in root.iter():
@@ -244,7 +309,15 @@ def _from_kml(path: Path, text: str) -> list[Rings]:
 def _kml_coordinates(path: Path, element: Element) -> Floats:
     """The (N, 2) points of the coordinates under an element: "lon,lat[,height]" separated by blanks."""
     texts = [each.text or "" for each in element.iter() if _tag(each) == "coordinates"]
-    return _lonlat(path, [each.split(",") for each in " ".join(texts).split()])
+    # blanks beside commas are not valid KML, but say the same where each position still ends in a blank
+    joined = re.sub(r"\s*,\s*", ",", " ".join(texts))
+    positions = [each.strip(",").split(",") for each in joined.split()]
+    if wrong := next((each for each in positions if len(each) > 3), None):
+        raise InputError(
+            f"{path}: where a position of the KML ends is not clear in {','.join(wrong)[:60]!r}; blanks after commas are "
+            "not valid KML: write longitude,latitude,height without blanks, and a blank between positions"
+        )
+    return _checked(path, _positions(path, positions), _LONGITUDE_FIRST)
 
 
 def _tag(element: Element) -> str:

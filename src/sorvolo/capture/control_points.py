@@ -6,15 +6,15 @@ from dataclasses import dataclass, replace
 from math import isfinite, nan
 from pathlib import Path
 
-from pyproj import CRS, Transformer
-from pyproj.exceptions import CRSError
+from pyproj import CRS
 
 from sorvolo.capture.photos import PhotoSource
 from sorvolo.capture.small_files import read_small_file, text_of
 from sorvolo.capture.source import Source
 from sorvolo.capture.telemetry.cleaning import notice
-from sorvolo.errors import InputError
+from sorvolo.errors import GeometryError, InputError
 from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.crs import crs_from_words, transformer
 from sorvolo.geometry.units import FOOT_M
 from sorvolo.survey.control import ControlMark, ControlPoint, GroundControl
 from sorvolo.survey.flight import Notice
@@ -24,37 +24,6 @@ LEAST_POINTS = 3
 
 _KIND, _NEEDED = "control point file", "a CRS in the first line, then x y z px py image a line"
 _MOST_BYTES = 10_000_000  # some hundred thousand lines; by choice
-_PROJ_KEYS = frozenset(
-    {
-        "proj",
-        "zone",
-        "south",
-        "ellps",
-        "datum",
-        "units",
-        "to_meter",
-        "no_defs",
-        "type",
-        "lat_0",
-        "lon_0",
-        "lat_1",
-        "lat_2",
-        "lat_ts",
-        "k",
-        "k_0",
-        "x_0",
-        "y_0",
-        "a",
-        "b",
-        "rf",
-        "towgs84",
-        "axis",
-        "gamma",
-        "alpha",
-        "lonc",
-    }
-)
-"""Of a proj string: those of map projections. Grids and pipelines would read files."""
 
 
 @dataclass(frozen=True)
@@ -139,13 +108,13 @@ class ControlFile:
         crs_words = reading.crs_words
         crs = _parsed_crs(crs_words, self.path)
         to_m = _height_unit_m(crs)
-        transformer = Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
+        wgs84_from_crs = transformer(crs.to_wkt())
         points: dict[str, ControlPoint] = {}
         marks = []
         for line in self.lines:
             x, y = (line.y, line.x) if reading.swaps_xy else (line.x, line.y)
             if line.label not in points:
-                longitude_deg, latitude_deg = transformer.transform(
+                longitude_deg, latitude_deg = wgs84_from_crs.transform(
                     x * reading.units, y * reading.units
                 )
                 if not (abs(latitude_deg) <= 90 and abs(longitude_deg) <= 360):
@@ -163,8 +132,7 @@ class ControlFile:
 
 
 def read_control_points(path: Path) -> ControlFile:
-    """Read a gcp_list.txt: the first line a CRS (EPSG:code, "WGS84 UTM 32N", WGS84, or a proj string), the others are
-    `x y z px py image [label]`; further columns, blank lines and those that begin with # are left out.
+    """Read a gcp_list.txt: the first line a CRS (see `crs_from_words`), the others are `x y z px py image [label]`; further columns, blank lines and those that begin with # are left out.
 
     Lines without a label belong together where their coordinates are the same. Raises InputError for what cannot be
     read, naming the line.
@@ -306,38 +274,11 @@ def _check_labels(path: Path, lines: Sequence[_Line]) -> None:
 
 
 def _parsed_crs(words: str, path: Path) -> CRS:
-    """The CRS of the first line. Raises InputError for all but the forms that need no file and no network."""
-    words = _as_epsg(words)
-    if words.startswith("+"):
-        keys = {part.lstrip("+").partition("=")[0] for part in words.split()}
-        if strange := keys - _PROJ_KEYS:
-            raise InputError(
-                f"{path}: +{sorted(strange)[0]} in its first line is not read; give the CRS as EPSG:code"
-            )
-    elif not re.fullmatch(r"EPSG:[1-9][0-9]{0,8}", words, re.IGNORECASE):
-        raise InputError(
-            f"{path}: {words[:60]!r} in its first line is no CRS; give EPSG:32632, WGS84 UTM 32N, WGS84, or a proj "
-            "string"
-        )
+    """The CRS of the first line; raises InputError."""
     try:
-        crs = CRS.from_user_input(words)
-    except CRSError as error:
-        raise InputError(
-            f"{path}: unknown CRS {words[:60]!r} in its first line; give one as EPSG:32632"
-        ) from error
-    if not (crs.is_projected or crs.is_geographic):
-        raise InputError(
-            f"{path}: {words} ({crs.name}) is no CRS of a map; give a projected one as EPSG:32632"
-        )
-    return crs
-
-
-def _as_epsg(words: str) -> str:
-    """ "WGS84 UTM 32N" and "WGS84" as EPSG codes; other words as they are."""
-    utm = re.fullmatch(r"WGS ?84[ ,/]+UTM(?: zone)? ?(\d{1,2}) ?([NS])", words, re.IGNORECASE)
-    if utm and 1 <= int(utm[1]) <= 60:
-        return f"EPSG:{(32600 if utm[2].upper() == 'N' else 32700) + int(utm[1])}"
-    return "EPSG:4326" if re.fullmatch(r"WGS ?84", words, re.IGNORECASE) else words
+        return crs_from_words(words)
+    except GeometryError as error:
+        raise InputError(f"{path}: its first line: {error}") from error
 
 
 def _utm_zone(crs: CRS) -> tuple[int, str] | None:
@@ -346,12 +287,10 @@ def _utm_zone(crs: CRS) -> tuple[int, str] | None:
 
 
 def _height_unit_m(crs: CRS) -> float:
-    """Metres in a unit of the points' heights: that of their other coordinates, where those are lengths."""
-    return (
-        float(crs.axis_info[0].unit_conversion_factor)
-        if crs.is_projected and crs.axis_info
-        else 1.0
-    )
+    """Metres in a unit of the points' heights: their own, else that of their other coordinates, where lengths."""
+    if crs.is_compound or crs.is_projected:
+        return float(crs.axis_info[-1].unit_conversion_factor)
+    return 1.0
 
 
 def _no_place(crs: CRS) -> str:

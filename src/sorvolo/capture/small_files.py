@@ -21,12 +21,13 @@ def read_small_file(path: Path, kind: str, most_bytes: int) -> bytes:
 
 
 def text_of(path: Path, raw: bytes, kind: str, needed: str) -> str:
-    """Their UTF-8 text without blanks around it.
+    """Their text, UTF-8 or by its byte order mark UTF-16, without blanks around it.
 
     Raises InputError for bytes that are no text, and for none at all, naming what is `needed`.
     """
     try:
-        text = raw.decode("utf-8-sig").strip()
+        is_utf16 = raw[:2] in (b"\xff\xfe", b"\xfe\xff")
+        text = raw.decode("utf-16" if is_utf16 else "utf-8-sig").strip()
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not text, so no {kind}; {needed} is needed") from error
     if not text:

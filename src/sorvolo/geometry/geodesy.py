@@ -1,15 +1,16 @@
 """Places on the Earth: WGS84 to a site's east-north-up metres and back, and the site's UTM zone."""
 
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any
 
 import numpy as np
-from pyproj import CRS, Transformer
+from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from sorvolo.errors import GeometryError, SettingsError
 from sorvolo.geometry.arrays import Floats, PointsM
+from sorvolo.geometry.crs import WGS84, transformer
 
 _SEMI_MAJOR_M = 6378137.0  # WGS84's defining figures, this and the next
 _FLATTENING = 1 / 298.257223563
@@ -142,6 +143,10 @@ def check_map_crs(crs: str) -> None:
         raise SettingsError(
             f"{crs} ({parsed.name}) is no CRS of a map; choose a projected one as EPSG:32633"
         )
+    try:
+        transformer(crs)
+    except GeometryError as error:
+        raise SettingsError(str(error)) from error
 
 
 @dataclass(frozen=True)
@@ -162,24 +167,19 @@ class Projection:
                 f"{self.crs} is not a projected CRS; a map needs one in metres, such as EPSG:32633"
             )
 
-    @property
-    def _from_wgs84(self) -> Transformer:
-        return _transformer(self.crs)
-
     def projected_from_wgs84(self, latitude_deg: Floats, longitude_deg: Floats) -> PointsM:
         """(N, 2) easting, northing."""
         return np.stack(
-            self._from_wgs84.transform(np.asarray(longitude_deg), np.asarray(latitude_deg)), axis=-1
+            transformer(WGS84, self.crs).transform(
+                np.asarray(longitude_deg), np.asarray(latitude_deg)
+            ),
+            axis=-1,
         )
 
     def wgs84_from_projected(self, points_m: PointsM) -> tuple[Floats, Floats]:
         """Latitude and longitude (deg), each (N,), of easting, northing, shape (N, 2)."""
         points = np.asarray(points_m, dtype=np.float64)
-        lon, lat = self._from_wgs84.transform(points[:, 0], points[:, 1], direction="INVERSE")
+        lon, lat = transformer(WGS84, self.crs).transform(
+            points[:, 0], points[:, 1], direction="INVERSE"
+        )
         return lat, lon
-
-
-@cache
-def _transformer(crs: str) -> Transformer:
-    # building one costs milliseconds, using one microseconds
-    return Transformer.from_crs("EPSG:4326", crs, always_xy=True)

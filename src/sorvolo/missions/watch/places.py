@@ -8,6 +8,7 @@ from pathlib import Path
 from statistics import median
 
 from sorvolo.capture.source import LiveSource
+from sorvolo.capture.sync import HeightKind
 from sorvolo.detection.fusing import is_from_above
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, PointsM
@@ -40,8 +41,8 @@ def over_heights(
     """The flight with its heights counted from the ground below its first fix, and the ground's from there.
 
     Heights above take-off are taken to begin there already; others are held against the model's, which must be in the
-    same reference. Raises InputError for a model that cannot be read or does not show that ground, and for a flight
-    without fixes.
+    same reference. Raises InputError for a model that cannot be read, does not show that ground, or states another
+    reference, and for a flight without fixes.
     """
     setup = prepare(mapping)
     if setup.track is None:
@@ -61,6 +62,12 @@ def over_heights(
             "without a hole there, or --ground-elevation"
         )
     if not setup.track.counts_from_takeoff:
+        is_ellipsoidal = setup.track.height_kind is HeightKind.ELLIPSOIDAL
+        if heights.datum and ("ellips" in heights.datum.lower()) is not is_ellipsoidal:
+            raise InputError(
+                f"{model} counts its heights from {heights.datum}, and the telemetry's are {setup.track.height_kind}: "
+                "the two differ by up to 100 m; give a model in the telemetry's reference, or --ground-elevation"
+            )
         setup = prepare(replace(mapping, ground_elevation_m=zero_m))
 
     def ground_m(places_m: PointsM) -> Floats:

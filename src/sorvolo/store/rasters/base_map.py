@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import rasterio
-from pyproj import Transformer
 from rasterio.crs import CRS
 from rasterio.enums import Resampling
 from rasterio.errors import CRSError, RasterioError
@@ -15,6 +14,7 @@ from rasterio.windows import Window, from_bounds
 
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import ImageRGBA, PointsM
+from sorvolo.geometry.crs import transformer
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.store.rasters.gdal import crs_of_epsg, open_raster, transform_on_grid, why_no_place
@@ -41,14 +41,15 @@ class BaseMap:
             with open_raster(path, "a GeoTIFF, or a site folder with a map,") as source:
                 if why := why_no_place(source.crs):
                     raise InputError(
-                        f"{path} has no place on Earth ({why}); give a map with one as --base"
+                        f"{path}: its places are not known: {why}; give it one as EPSG:code"
                     )
                 if source.count == 2 or set(source.dtypes) != {"uint8"}:
                     raise InputError(
                         f"{path} has {source.count} bands of {'/'.join(sorted(set(source.dtypes)))}; a base map has "
                         "grey, RGB or RGBA of 8 bits: convert it with gdal_translate -ot Byte -scale"
                     )
-                west, south, east, north = transform_bounds(source.crs, _WGS84, *source.bounds)
+                to_wgs84 = transformer(source.crs.to_wkt())
+                west, south, east, north = to_wgs84.transform_bounds(*source.bounds)
                 middle = Geodetic(round((south + north) / 2, 7), round((west + east) / 2, 7))
                 return cls(
                     path, middle, _metres_a_pixel(source, middle), (west, south, east, north)
@@ -170,12 +171,13 @@ def _read(
 
 def _metres_a_pixel(source: rasterio.DatasetReader, middle: Geodetic) -> float:
     """On the ground, at its middle."""
-    transformer = Transformer.from_crs(source.crs.to_wkt(), "EPSG:4326", always_xy=True)
     column, row = source.width / 2, source.height / 2
     x, y = zip(
         *(source.transform * each for each in ((column, row), (column + 1, row), (column, row + 1)))
     )
-    longitude, latitude = (np.radians(each) for each in transformer.transform(x, y))
+    longitude, latitude = (
+        np.radians(each) for each in transformer(source.crs.to_wkt()).transform(x, y)
+    )
     east = (longitude - longitude[0]) * np.cos(np.radians(middle.latitude_deg)) * 6378137.0
     north = (latitude - latitude[0]) * 6371000.0
     return float(np.sqrt(abs(east[1] * north[2] - east[2] * north[1])))

@@ -12,7 +12,8 @@ from rasterio.crs import CRS
 from rasterio.errors import CRSError, NotGeoreferencedWarning, RasterioIOError
 from rasterio.transform import Affine
 
-from sorvolo.errors import InputError, SettingsError
+from sorvolo.errors import GeometryError, InputError, SettingsError
+from sorvolo.geometry.crs import transformer
 from sorvolo.geometry.grid import Grid
 
 # a small cache keeps memory flat; no directory listing keeps GDAL from opening neighbours of a user's file; a curl name
@@ -79,15 +80,17 @@ def _opened(path: Path, drivers: Sequence[str]) -> rasterio.DatasetReader:
 
 
 def why_no_place(crs: CRS | None) -> str:
-    """Why coordinates are no places on Earth, in words: there is no CRS, or a local one, as of a building site's plan;
-    "" where they are."""
+    """Why coordinates are no places on Earth, in words: there is no CRS, a local one, as of a building site's plan, or
+    one without a known datum; "" where they are."""
     if crs is None:
         return "no coordinate reference system"
-    return (
-        ""
-        if crs.is_geographic or crs.is_projected
-        else "a local coordinate reference system, of no known place"
-    )
+    if not (crs.is_geographic or crs.is_projected):
+        return "a local coordinate reference system, of no known place"
+    try:
+        transformer(crs.to_wkt())
+    except GeometryError as error:
+        return str(error)
+    return ""
 
 
 def crs_of_epsg(code: str) -> CRS:

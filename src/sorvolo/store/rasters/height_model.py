@@ -2,25 +2,23 @@
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import rasterio
-from pyproj import CRS, Transformer
+from pyproj import CRS
 from rasterio.enums import Resampling
 from rasterio.errors import CRSError, RasterioError
 from rasterio.transform import Affine
-from rasterio.warp import transform_bounds
 from rasterio.windows import Window
 from scipy.ndimage import map_coordinates
 
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats
+from sorvolo.geometry.crs import WGS84, transformer, vertical_name
 from sorvolo.geometry.units import FOOT_M, SURVEY_FOOT_M
 from sorvolo.store.rasters.gdal import open_raster, why_no_place
 
-_WGS84 = "EPSG:4326"
 _LOWEST_M, _HIGHEST_M = (
     -1_000.0,
     10_000.0,
@@ -35,15 +33,19 @@ _MOST_PX = 4096  # a side that is kept: finer models are averaged
 
 @dataclass(frozen=True, eq=False)
 class HeightModel:
-    """Heights (H, W), m, NaN where unknown, each that of its pixel's middle; `crs_from_pixels` starts at corners."""
+    """Heights (H, W), m, NaN where unknown, each that of its pixel's middle; `crs_from_pixels` starts at corners.
+
+    `datum` is what the heights count from, as "EGM96 height" or "ellipsoid"; "" where the file does not say.
+    """
 
     heights_m: Floats
     crs_from_pixels: Affine
     crs: str
+    datum: str = ""
 
     def at(self, longitudes_deg: Floats, latitudes_deg: Floats) -> Floats:
         """(N,) heights at places of WGS84, between the four pixels around; NaN outside and beside unknown ones."""
-        x, y = self._crs_from_wgs84.transform(longitudes_deg, latitudes_deg)
+        x, y = transformer(WGS84, self.crs).transform(longitudes_deg, latitudes_deg)
         back = ~self.crs_from_pixels
         columns, rows = (
             a * np.asarray(x) + b * np.asarray(y) + c for a, b, c in (back[:3], back[3:6])
@@ -53,10 +55,6 @@ class HeightModel:
         places = np.array([rows[known], columns[known]]) - 0.5
         heights_m[known] = map_coordinates(self.heights_m, places, order=1, cval=np.nan)
         return heights_m
-
-    @cached_property
-    def _crs_from_wgs84(self) -> Transformer:
-        return Transformer.from_crs(_WGS84, self.crs, always_xy=True)
 
 
 def read_height_model(path: Path, bounds_deg: tuple[float, float, float, float]) -> HeightModel:
@@ -68,7 +66,9 @@ def read_height_model(path: Path, bounds_deg: tuple[float, float, float, float])
     try:
         with open_raster(path, "a GeoTIFF of heights") as source:
             if why := why_no_place(source.crs):
-                raise InputError(f"{path} has {why}; export it with one that has a place on Earth")
+                raise InputError(
+                    f"{path}: its places are not known: {why}; give it one as EPSG:code"
+                )
             if source.count != 1:
                 raise InputError(
                     f"{path} has {source.count} bands; a height model has one, of heights (of `sorvolo heights`: "
@@ -77,7 +77,8 @@ def read_height_model(path: Path, bounds_deg: tuple[float, float, float, float])
             to_m = _metres_in_unit(source, path)
             window = _window(source, bounds_deg)
             if window is None:
-                west, south, east, north = transform_bounds(source.crs, _WGS84, *source.bounds)
+                to_wgs84 = transformer(source.crs.to_wkt())
+                west, south, east, north = to_wgs84.transform_bounds(*source.bounds)
                 raise InputError(
                     f"{path} holds ground from {south:.4f}, {west:.4f} to {north:.4f}, {east:.4f}, and the flight is "
                     f"at {bounds_deg[1]:.4f}, {bounds_deg[0]:.4f}: give the height model of its ground"
@@ -102,7 +103,9 @@ def read_height_model(path: Path, bounds_deg: tuple[float, float, float, float])
                 transform.e * high,
                 transform.f,
             )
-            return HeightModel(heights_m, crs_from_pixels, source.crs.to_wkt())
+            crs = source.crs.to_wkt()
+            datum = vertical_name(CRS.from_user_input(crs))
+            return HeightModel(heights_m, crs_from_pixels, crs, datum)
     except (RasterioError, CRSError) as error:
         raise InputError(
             f"{path} is no readable GeoTIFF ({error}); export it as GeoTIFF again"
@@ -126,7 +129,8 @@ def _window(
     source: rasterio.DatasetReader, bounds_deg: tuple[float, float, float, float]
 ) -> Window | None:
     """The whole pixels that the bounds touch; None where there are none."""
-    left, bottom, right, top = transform_bounds(_WGS84, source.crs, *bounds_deg)
+    crs_from_wgs84 = transformer(WGS84, source.crs.to_wkt())
+    left, bottom, right, top = crs_from_wgs84.transform_bounds(*bounds_deg)
     back = ~source.transform
     x, y = np.array([left, left, right, right]), np.array([bottom, top, bottom, top])
     columns, rows = (a * x + b * y + c for a, b, c in (back[:3], back[3:6]))
