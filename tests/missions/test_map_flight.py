@@ -420,9 +420,10 @@ def test_the_thesis_method(
     photos = _some_photos(photographed, tmp_path / "few", 0, 7)
     site = tmp_path / "site"
     stitching = RoiStitchingSettings(transform=transform, max_features=3000)
-    settings = MapSettings(ThesisMapping(stitching), model="none")
-    list(map_flights([photos], site, settings, camera=photographed / "camera.xml"))
+    settings = MapSettings(ThesisMapping(stitching), model="none", live_s=0)
+    updates = list(map_flights([photos], site, settings, camera=photographed / "camera.xml"))
     report = report_of(site, "few")
+    assert sum(each.tiles_touched for each in updates)  # while the flight goes on
     assert (
         report["method"] == "thesis"
         and report["settings"]["method"]["stitching"]["transform"] == transform

@@ -111,9 +111,15 @@ def test_corrected_undoes_what_the_lens_did():
     flat = corrected(seen, np.array([1.0, 1.0, 0.5]), np.array([-0.5, 0.1]))
     assert np.abs(flat.astype(int) - [150, 150, 75]).max() <= 2
     assert corrected(seen, np.ones(3), np.zeros(2)) is seen
-    assert (
-        np.abs(corrected(seen, np.full(3, 2.0), np.zeros(2))[48, 70].astype(int) - 255).max() == 0
-    )
+
+
+@pytest.mark.parametrize("gain", [0.5, 1.02, 1.25, 2.0])
+def test_a_gain_burns_nothing_that_is_not_white_already(gain: float):
+    levels = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)
+    bright = corrected(levels, np.full(3, gain), np.zeros(2))[0, :, 0]
+    assert (bright[:255] < 255).all()
+    assert (np.diff(bright.astype(int)) >= 0).all()
+    assert bright[90] == pytest.approx(90 * gain, abs=0.51)
 
 
 def test_bad_settings_and_shapes_are_refused():

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csc_array, diags_array
 from scipy.sparse.linalg import splu
 
@@ -30,6 +31,7 @@ _SHRINK = 4  # times smaller pictures: colours are means of so many pixels a sid
 _ITERATIONS = 8  # rounds of the robust solve; by choice
 _LINKS_AT_ONCE = 512  # bounds the memory
 _FIELD_PX = 1 << 17  # of a picture, corrected at a time
+_SHOULDER = 200.0  # level from which on brightening is compressed; by choice
 _SIGMA_FROM_MEDIAN = 1.126  # of the root mean square of three normal numbers
 
 
@@ -162,7 +164,8 @@ def corrected(
     if not vignette.any():
         if (gains == 1).all():
             return image
-        table = np.clip(np.arange(256)[:, None] * gains + 0.5, 0, 255).astype(np.uint8)
+        levels = np.arange(256.0)
+        table = np.stack([_brightened(levels, gain) for gain in gains.tolist()], axis=1)
         return cv2.LUT(image, table[None])  # type: ignore[return-value]
     height, width = image.shape[:2]
     x0, y0, whole_width, whole_height = place or (0, 0, width, height)
@@ -186,6 +189,14 @@ def corrected(
             result[some],
         )
     return result
+
+
+def _brightened(levels: Floats, gain: float) -> NDArray[np.uint8]:
+    """Gray levels times a gain; beyond the shoulder ever less, so that only what is white in the picture is white."""
+    if gain <= 1:
+        return (levels * gain + 0.5).astype(np.uint8)
+    brightened = np.interp(levels, [0, _SHOULDER / gain, 255], [0, _SHOULDER, 255])
+    return np.where(levels < 255, np.minimum(brightened + 0.5, 254), 255).astype(np.uint8)
 
 
 @dataclass(frozen=True)

@@ -459,6 +459,11 @@ class PlanarMapper:
         centres[~tied] = np.nan
         return centres
 
+    def site_from_image(self, keyframe_id: int, camera: Camera) -> Matrix3:
+        """(3, 3) of an undistorted image of the size that `camera` has: the stored one's or the frame's own."""
+        refined = camera.with_focal_px(camera.fx_px * self.focal_scale)
+        return site_from_image_homography(refined, self.pose(keyframe_id))
+
     def exposure(self) -> Exposure:
         """Gains and vignette from the colours that linked keyframes share."""
         return solve_exposure(self._colours, settings=self._settings.exposure)

@@ -1,34 +1,37 @@
-"""Section 3.1.1 as a map: the frames stitched, the mosaic anchored to GPS fixes and cut into the site's tiles."""
+"""Section 3.1.1 as a map: the frames stitched, the mosaic anchored to GPS fixes and painted into the site's tiles."""
 
 import time
-from collections.abc import MutableMapping, Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, field
+from functools import partial
 from typing import ClassVar
 
-import cv2
 import numpy as np
 
+from sorvolo.capture.source import LiveSource
+from sorvolo.change.alignment import Aligned, Aligner
+from sorvolo.change.reference import ReferenceMap
 from sorvolo.errors import GeometryError, InputError
-from sorvolo.geometry.arrays import Floats, ImageRGB, ImageRGBA, Matrix3, PointsM, PointsPx
+from sorvolo.geometry.arrays import Floats, ImageRGB, Matrix3
 from sorvolo.geometry.camera import Camera
-from sorvolo.geometry.grid import SiteGrid, TileIndex
-from sorvolo.geometry.homography import apply_homography
+from sorvolo.geometry.homography import apply_homography, resized
 from sorvolo.lab.thesis.stitching import RoiStitcher, RoiStitchingSettings, Stitched, georeference
-from sorvolo.missions.flight.log import Stage, nothing_placed
+from sorvolo.missions.flight.log import Ending, Stage, nothing_placed
 from sorvolo.missions.flight.map_objects import ObjectFinder, crops_of
 from sorvolo.missions.flight.report import FlightResult, build_report
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup
+from sorvolo.missions.map.painting import FlightPainter, KnownKeyframes
 from sorvolo.missions.map.planar_run import FlightRun
+from sorvolo.mosaic.exposure import Exposure
 from sorvolo.registration.lens import Undistorter, at_size
 from sorvolo.store.exports.map_pictures import picture
 from sorvolo.store.pages.flight import report_page
 from sorvolo.store.site.archive import Archive
-from sorvolo.survey.flight import Notice, PosedFrame
+from sorvolo.survey.flight import CameraPrior, Notice, PosedFrame
 from sorvolo.survey.mosaic import PlacedFrame, Status
 
-MIRROR_Y: Matrix3 = np.diag([1.0, -1.0, 1.0])
-"""site_from_mosaic of a mosaic without fixes: mirrored pixels."""
+_DRIFT = 1.25  # the largest gain over the smallest that needs no notice
 
 
 @dataclass(frozen=True)
@@ -51,8 +54,131 @@ class ThesisMapping:
         return ThesisRun(self.stitching, setup, archive, settings, finder, request)
 
 
+class StitchedFlight:
+    """Where a flight's stitched frames lie on the site: the mosaic, anchored as a whole to the frames' fixes.
+
+    `full` is the frames' camera, `small` the undistorted one at the size at which they are stitched. Keyframes have ids
+    from `first_id` on. Only `add` and `anchor` change it.
+    """
+
+    radial = 0.0
+
+    def __init__(
+        self, stitcher: RoiStitcher, full: Camera, small: Camera, first_id: int = 0
+    ) -> None:
+        self._stitcher, self._camera, self._small, self._first_id = stitcher, full, small, first_id
+        self._corners = (
+            full.undistort_points(full.corners_px) if full.is_distorted else full.corners_px
+        )
+        self._middle: Floats = np.array([[(small.width_px - 1) / 2, (small.height_px - 1) / 2]])
+        self.stitched: dict[int, Stitched] = {}
+        self.site_from_mosaic: Matrix3 = np.diag([1.0, -1.0, 1.0])  # mirrored pixels: no fixes
+        self._fixes_m: dict[int, Floats] = {}
+        self._map_fixes_m: dict[int, Floats] = {}
+
+    def add(
+        self, stitched: Stitched, fix_m: Floats | None, site_from_image: Matrix3 | None
+    ) -> None:
+        """Take a frame, its fix (2,) where it has one, and (3, 3) of it where the site's map shows its ground."""
+        self.stitched[stitched.frame_id] = stitched
+        if fix_m is not None:
+            self._fixes_m[stitched.frame_id] = fix_m
+        if site_from_image is not None:
+            self._map_fixes_m[stitched.frame_id] = apply_homography(site_from_image, self._middle)[
+                0
+            ]
+
+    def anchor(self) -> None:
+        """Lay the mosaic on its fixes. Raises GeometryError for fewer than two different ones.
+
+        Frames that the map shows are anchored to it; the others to GPS, moved by how GPS and map differ.
+        """
+        differ_m = [
+            self._map_fixes_m[each] - self._fixes_m[each]
+            for each in self._fixes_m.keys() & self._map_fixes_m.keys()
+        ]
+        offset_m = np.mean(differ_m, axis=0) if differ_m else np.zeros(2)
+        fixes_m = {
+            each: fix_m + offset_m for each, fix_m in self._fixes_m.items()
+        } | self._map_fixes_m
+        barycentres = np.array([self.stitched[each].barycentre_px for each in fixes_m]).reshape(
+            -1, 2
+        )
+        self.site_from_mosaic = georeference(
+            barycentres, np.array(list(fixes_m.values())).reshape(-1, 2)
+        )
+
+    @property
+    def fixed(self) -> Set[int]:
+        """The frames that have a fix."""
+        return self._fixes_m.keys() | self._map_fixes_m.keys()
+
+    @property
+    def m_per_px(self) -> float:
+        """The ground sampling distance of the mosaic, to three digits."""
+        return float(f"{float(np.sqrt(abs(np.linalg.det(self.site_from_mosaic[:2, :2])))):.3g}")
+
+    def site_from_image(self, keyframe_id: int, camera: Camera) -> Matrix3:
+        """(3, 3) of an undistorted image of the size that `camera` has."""
+        small_from_image = resized(
+            self._small.width_px / camera.width_px, self._small.height_px / camera.height_px
+        )
+        stitched = self.stitched[keyframe_id - self._first_id]
+        return self.site_from_mosaic @ stitched.mosaic_from_image @ small_from_image
+
+    def exposure(self) -> Exposure:
+        """The gain of each frame; no vignette."""
+        gains = self._stitcher.gains().items()
+        return Exposure({self._first_id + each: np.full(3, gain) for each, gain in gains}, {}, 0.0)
+
+    recent_exposure = exposure
+
+    def release(self) -> None:
+        """Keep all: it is small."""
+
+    def place(
+        self,
+        ending: Ending,
+        time_ns: int,
+        prior: CameraPrior,
+        gains: Floats,
+        *,
+        has_fixes: bool = True,
+    ) -> PlacedFrame:
+        """The record of a frame. One that was not stitched lies as the last one before it, moved to its own fix.
+
+        Without `has_fixes` the first frame's place is the site's own origin, which no frame departs from.
+        """
+        stitched = self.stitched.get(ending.index)
+        nearest = max(each for each in self.stitched if each <= ending.index)
+        site_from_image = self.site_from_image(self._first_id + nearest, self._camera)
+        middle = np.array([[(self._camera.width_px - 1) / 2, (self._camera.height_px - 1) / 2]])
+        if stitched is None:
+            shift = np.eye(3)
+            shift[:2, 2] = prior.position_m[:2] - apply_homography(site_from_image, middle)[0]
+            site_from_image = shift @ site_from_image
+        gps = np.full(3, np.nan)
+        if has_fixes and prior.knows_place:
+            gps[:2] = apply_homography(site_from_image, middle)[0] - prior.position_m[:2]
+        return PlacedFrame(
+            ending.name,
+            ending.index,
+            time_ns,
+            ending.status,
+            ending.reason,
+            self._camera,
+            None,
+            site_from_image,
+            apply_homography(site_from_image, self._corners),
+            stitched.residual_px if stitched else float("nan"),
+            float("nan") if stitched else float(np.hypot(*prior.position_sigma_m[:2])),
+            gains,
+            gps_residual_m=gps,
+        )
+
+
 class ThesisRun(FlightRun):
-    """A flight mapped as the thesis does: all of it stitched first, then anchored to its fixes."""
+    """A flight mapped as the thesis does: stitched frame by frame, anchored to the fixes so far, and painted."""
 
     def __init__(
         self,
@@ -64,56 +190,59 @@ class ThesisRun(FlightRun):
         request: str,
     ) -> None:
         super().__init__(setup, archive, settings, finder=finder, request=request)
-        self._lens = Undistorter(setup.source.camera.camera)
-        full = self._lens.camera
+        full = setup.source.camera.camera
         scale = min(1.0, stitching.side_px / max(full.width_px, full.height_px))
-        self._camera: Camera = full.resized(
-            round(full.width_px * scale), round(full.height_px * scale)
-        )
+        small = full.resized(round(full.width_px * scale), round(full.height_px * scale))
+        self._lens, self._small_lens = Undistorter(full), Undistorter(small)
+        self._camera = self._small_lens.camera
+        self._known = KnownKeyframes(archive, setup.source.name)
         self._stitcher = RoiStitcher(stitching)
-        self._frames: dict[int, PosedFrame] = {}
-        self._stitched: dict[int, Stitched] = {}
-        self._pictures: dict[int, ImageRGB] = {}
+        self._flight = StitchedFlight(self._stitcher, full, self._camera, len(self._known))
+        self._aligner: Aligner | None = None
+        if archive.has_site and setup.track is not None:
+            site_grid = archive.site_grid()
+            self._aligner = Aligner(ReferenceMap(archive.tiles(), site_grid.grid), site_grid)
+        self._priors: dict[int, CameraPrior] = {}
+        self._held: dict[int, ImageRGB] = {}  # until it is known where and how large they are
+        self._painter: FlightPainter | None = None
 
     def add(self, posed: PosedFrame) -> tuple[Status, str, int]:
-        """Stitch one frame; what became of it. The site's tiles are painted at the end, when GPS anchors the mosaic."""
+        """Stitch one frame and paint it; what became of it, and how many tiles were painted."""
         frame = posed.frame
         with self._log.stage(Stage.UNDISTORT):
             image = self._lens.undistort(frame.image)
             image = at_size(image, self._camera.width_px, self._camera.height_px)
         with self._log.stage(Stage.REGISTER):
             found = self._stitcher.add(frame.index, image)
+        status, reason = Status.VISION, ""
         if isinstance(found, Stitched):
-            self._stitched[frame.index] = found
-            status, reason = Status.VISION, ""
+            with self._log.stage(Stage.REGISTER):
+                self._flight.add(
+                    found,
+                    posed.prior.position_m[:2] if posed.prior.knows_place else None,
+                    self._found_on_map(posed, image),
+                )
         elif posed.prior.knows_place:
             status, reason = Status.GPS_ONLY, found.reason
         else:
             return self.lose(frame, found.reason)
         self._log.end(frame.index, frame.name, frame.time_ns, status, reason)
-        self._frames[frame.index] = posed
-        self._pictures[frame.index] = image
-        return status, reason, 0
+        self._priors[frame.index] = posed.prior
+        self._held[frame.index] = image
+        if self._painter is None and not self._is_firm():
+            return status, reason, 0
+        painter = self._paint()
+        return status, reason, painter.show(max(self._flight.stitched) + len(self._known))
 
     def finish(self, notices: Sequence[Notice], started_s: float) -> None:
-        """Anchor the mosaic to its fixes, cut it into tiles, and make the flight part of the site.
-
-        `started_s` is when the flight's mapping began, by the monotonic clock.
-        """
-        if not self._stitched:
+        """See `FlightRun.finish`."""
+        if not self._flight.stitched:
             raise nothing_placed(self._setup.source.name, self._log)
-        anchored = self._georeference()
-        self._make_site(self._settings.m_per_px or mosaic_m_per_px(anchored), 0.0)
+        painter = self._paint()
+        painter.finish()
         site, writer = self._archive.site(), self._begin_flight()
-        with self._log.stage(Stage.STORE):
-            paths = {
-                index: writer.save_image(index, image) for index, image in self._pictures.items()
-            }
-        with self._log.stage(Stage.PAINT):
-            rgba, corner_px = self._stitcher.mosaic()
-            paint_mosaic(rgba, corner_px, anchored, self._archive.site_grid(), writer.tiles)
         with self._log.stage(Stage.REPORT):
-            placed = self._placed(anchored)
+            placed = self._placed(painter.exposure)
             shown = picture(writer.tiles, 1600)
         search = self._search(placed)
         report = build_report(
@@ -123,162 +252,89 @@ class ThesisRun(FlightRun):
             FlightResult(placed, self._setup.source.camera.camera),
             site,
             shown,
-            [*notices, *self._detector_notices],
+            [*notices, *self._detector_notices, *_drift(painter.exposure)],
             time.monotonic() - started_s,
         )
         report["objects"] = self._search_summary(search)
-        page = report_page(report, shown.rgba, crops_of(search), self._archive.site())
-        writer.commit(placed, paths, report, page, crs=self._settings.crs, search=search)
+        page = report_page(report, shown.rgba, crops_of(search), site)
+        writer.commit(placed, painter.images, report, page, crs=self._settings.crs, search=search)
 
     # ---- inside -----------------------------------------------------------------------------------------------
 
-    def _georeference(self) -> Matrix3:
-        """site_from_mosaic: each fix anchored to its frame's barycentre; mirrored pixels where there are no fixes."""
-        if self._setup.track is None:
-            return MIRROR_Y
-        anchored = [
-            (stitched, self._frames[each])
-            for each, stitched in self._stitched.items()
-            if self._frames[each].prior.knows_place
-        ]
-        try:
-            return site_from_mosaic(anchored)
-        except GeometryError as error:
-            raise InputError(
-                f"{len(anchored)} stitched frames of {self._setup.source.name} have a GPS fix, which is too few to "
-                "place the mosaic; --method planar places each frame by its own fix"
-            ) from error
+    def _found_on_map(self, posed: PosedFrame, image: ImageRGB) -> Matrix3 | None:
+        """(3, 3) of a small undistorted picture where the site's map shows its ground."""
+        if self._aligner is None:
+            return None
+        found = self._aligner.align(image, self._camera, posed.prior, posed.frame.time_ns)
+        return found.site_from_image if isinstance(found, Aligned) else None
 
-    def _placed(self, anchored: Matrix3) -> list[PlacedFrame]:
-        camera = self._setup.source.camera.camera
-        places = StitchedPlaces(
-            camera, self._camera, anchored, has_fixes=self._setup.track is not None
-        )
+    def _is_firm(self) -> bool:
+        """Whether the fixes so far lie far enough apart to show the mosaic's scale and direction."""
+        flight = self._flight
+        fixed = flight.stitched.keys() if self._setup.track is None else flight.fixed
+        centres = np.array([flight.stitched[each].barycentre_px for each in fixed]).reshape(-1, 2)
+        spread = np.linalg.norm(np.ptp(centres, axis=0)) if len(centres) else 0.0
+        return bool(spread >= self._camera.width_px / 2)
+
+    def _paint(self) -> FlightPainter:
+        """Anchor the mosaic to the fixes so far and hand what came since to the painter, begun where there is none."""
+        flight = self._flight
+        if self._setup.track is not None:
+            try:
+                flight.anchor()
+            except GeometryError as error:
+                raise InputError(
+                    f"{len(flight.fixed)} stitched frames of {self._setup.source.name} have a GPS fix, which is too few to "
+                    "place the mosaic; --method planar places each frame by its own fix"
+                ) from error
+        if self._painter is None:
+            self._make_site(self._settings.m_per_px or flight.m_per_px, 0.0)
+            self._painter = FlightPainter(
+                self._begin_flight(),
+                self._archive,
+                flight,
+                self._small_lens,
+                self._known,
+                flight.m_per_px,
+                self._log,
+                self._settings.live_s,
+                self._memo,
+                is_live=isinstance(self._setup.source, LiveSource),
+            )
+        with self._log.stage(Stage.STORE):
+            for index, image in self._held.items():
+                self._painter.save(
+                    self._log.endings[index],
+                    partial(at_size, image, self._camera.width_px, self._camera.height_px),
+                )
+        self._held.clear()
+        self._painter.mark([len(self._known) + each for each in flight.stitched])
+        return self._painter
+
+    def _placed(self, exposure: Exposure) -> list[PlacedFrame]:
         result = []
         for ending in self._log.endings.values():
             time_ns = self._setup.utc_ns(ending.time_ns)
-            if ending.index in self._frames:
-                posed, stitched = self._frames[ending.index], self._stitched.get(ending.index)
-                result.append(places.place(posed, stitched, time_ns, ending.status, ending.reason))
-            else:
+            if ending.index not in self._priors:
+                camera = self._setup.source.camera.camera
                 result.append(
                     PlacedFrame.rejected(ending.index, ending.name, time_ns, ending.reason, camera)
                 )
+                continue
+            gains = exposure.gains_of(len(self._known) + ending.index)
+            has_fixes = self._setup.track is not None
+            prior = self._priors[ending.index]
+            result.append(self._flight.place(ending, time_ns, prior, gains, has_fixes=has_fixes))
         return result
 
 
-def site_from_mosaic(anchored: Sequence[tuple[Stitched, PosedFrame]]) -> Matrix3:
-    """(3, 3) with each fix anchored to its frame's barycentre. Raises GeometryError for too few of them."""
-    barycentres = np.array([each.barycentre_px for each, _ in anchored]).reshape(-1, 2)
-    fixes_m = np.array([posed.prior.position_m[:2] for _, posed in anchored]).reshape(-1, 2)
-    return georeference(barycentres, fixes_m)
-
-
-def mosaic_m_per_px(site_from_mosaic: Matrix3) -> float:
-    """The ground sampling distance of the mosaic, to three digits: a new map's."""
-    return float(f"{float(np.sqrt(abs(np.linalg.det(site_from_mosaic[:2, :2])))):.3g}")
-
-
-def paint_mosaic(
-    rgba: ImageRGBA,
-    corner_px: tuple[int, int],
-    site_from_mosaic: Matrix3,
-    site_grid: SiteGrid,
-    tiles: MutableMapping[TileIndex, ImageRGBA],
-) -> None:
-    """Cut the mosaic, whose first pixel is `corner_px` in mosaic coordinates, into tiles; known ground stays."""
-    height, width = rgba.shape[:2]
-    x, y = corner_px
-    corner = np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
-    site_from_rgba = site_from_mosaic @ corner
-    middle_m = apply_homography(site_from_rgba, np.array([[width / 2, height / 2]]))[0]
-    reach_m = float(
-        np.linalg.norm(apply_homography(site_from_rgba, np.zeros((1, 2)))[0] - middle_m)
+def _drift(exposure: Exposure) -> list[Notice]:
+    """The notice that the flight's brightness changes much; none where it does not."""
+    gains = [float(each[0]) for each in exposure.gains.values()]
+    if max(gains) < _DRIFT * min(gains):
+        return []
+    text = (
+        f"the brightness of the pictures changes along the flight: they were multiplied by {min(gains):.2f} to "
+        f"{max(gains):.2f} to make neighbours alike"
     )
-    grid_from_rgba = site_grid.grid_from_site_affine(middle_m, reach_m) @ site_from_rgba
-    outline = apply_homography(
-        grid_from_rgba, np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
-    )
-    side = site_grid.grid.tile_px
-    for tile in sorted(site_grid.grid.tiles_touched(outline)):
-        x0, y0, _, _ = site_grid.grid.tile_window(tile)
-        shift = np.array([[1.0, 0.0, -x0], [0.0, 1.0, -y0], [0.0, 0.0, 1.0]])
-        painted: ImageRGBA = cv2.warpPerspective(
-            rgba, shift @ grid_from_rgba, (side, side), flags=cv2.INTER_LINEAR
-        )  # type: ignore[assignment]
-        seen = painted[..., 3] == 255
-        known = tiles.get(tile)
-        result = np.zeros((side, side, 4), np.uint8) if known is None else known.copy()
-        seen &= result[..., 3] == 0  # ground that the map knows stays
-        if seen.any():
-            result[seen] = painted[seen]
-            tiles[tile] = result
-
-
-class StitchedPlaces:
-    """Places a flight's frames by the anchored mosaic, one after another: a frame that was not stitched lies as the one
-    before, moved to its own fix. Only `place` changes it.
-
-    `full` is the frames' camera, `small` the undistorted one at the size at which they were stitched. Without
-    `has_fixes` the first frame's place is the site's own origin, which no frame departs from.
-    """
-
-    def __init__(
-        self, full: Camera, small: Camera, site_from_mosaic: Matrix3, *, has_fixes: bool = True
-    ) -> None:
-        self._camera, self._site_from_mosaic, self._has_fixes = full, site_from_mosaic, has_fixes
-        self._corners: PointsPx = (
-            full.undistort_points(full.corners_px) if full.is_distorted else full.corners_px
-        )
-        scale = np.diag([small.width_px / full.width_px, small.height_px / full.height_px, 1.0])
-        scale[:2, 2] = 0.5 * np.diag(scale)[:2] - 0.5  # pixel centres stay on pixel centres
-        self._small_from_full: Matrix3 = scale
-        self._barycentre: Floats = np.array([(small.width_px - 1) / 2, (small.height_px - 1) / 2])
-        self._last: Matrix3 | None = None
-
-    def place(
-        self,
-        posed: PosedFrame,
-        stitched: Stitched | None,
-        time_ns: int,
-        status: Status,
-        reason: str,
-    ) -> PlacedFrame:
-        """The frame's record; the first frame of a flight is always stitched."""
-        if stitched is not None:
-            self._last = self._site_from_mosaic @ stitched.mosaic_from_image
-        assert self._last is not None
-        site_from_image = (
-            self._last
-            if stitched is not None
-            else self._moved(self._last, posed.prior.position_m[:2])
-        )
-        outline_m = apply_homography(site_from_image @ self._small_from_full, self._corners)
-        centre_m = apply_homography(site_from_image, self._barycentre[None])[0]
-        gps = np.full(3, np.nan)
-        if self._has_fixes and posed.prior.knows_place:
-            gps[:2] = centre_m - posed.prior.position_m[:2]
-        sigma_m = (
-            float(np.hypot(*posed.prior.position_sigma_m[:2])) if stitched is None else float("nan")
-        )
-        return PlacedFrame(
-            posed.frame.name,
-            posed.frame.index,
-            time_ns,
-            status,
-            reason,
-            self._camera,
-            None,
-            site_from_image @ self._small_from_full,
-            outline_m,
-            stitched.residual_px if stitched else float("nan"),
-            sigma_m,
-            gps_residual_m=gps,
-        )
-
-    def _moved(self, site_from_image: Matrix3, place_m: PointsM) -> Matrix3:
-        """Turned and scaled as the last frame, its barycentre at its own fix."""
-        now_m = apply_homography(site_from_image, self._barycentre[None])[0]
-        shift = np.eye(3)
-        shift[:2, 2] = place_m - now_m
-        return shift @ site_from_image
+    return [Notice("brightness_drifts", len(gains), text)]

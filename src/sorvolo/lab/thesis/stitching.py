@@ -1,16 +1,18 @@
 """Section 3.1.1: mosaicking. Each frame against the mosaic's region around the last one.
 
-Kept faithful as the baseline for ever: A-KAZE on the frame and on the region, brute-force matching, a
-similarity by RANSAC, gain compensation and multi-band blending into one growing picture. What is written is
-never moved again.
+The baseline: A-KAZE on the frame and on the region, brute-force matching, a similarity by RANSAC. A frame that is
+placed never moves. The gains are those of Brown and Lowe (2007), the thesis's [15].
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.linalg import spsolve
 
 from sorvolo.errors import GeometryError, SettingsError
 from sorvolo.geometry.arrays import (
@@ -18,21 +20,20 @@ from sorvolo.geometry.arrays import (
     Floats,
     ImageGray,
     ImageRGB,
-    ImageRGBA,
     Matrix3,
     PointsM,
     PointsPx,
     frozen,
 )
-from sorvolo.geometry.homography import apply_homography, fit_similarity
+from sorvolo.geometry.homography import apply_homography, fit_similarity, resized
 from sorvolo.geometry.polygons import polygon_area
-from sorvolo.mosaic.blending import fill_invalid
 from sorvolo.registration.features import gray_from_rgb
 
-_CHUNK_PX = 1024  # by which the picture grows: fewer copies for some empty ground
-
-MosaicOffset: TypeAlias = tuple[int, int]
-"""Mosaic coordinates (x, y) of the picture's pixel (0, 0); the mosaic frame is the first frame's pixels."""
+_NOISE_LEVELS, _GAIN_SIGMA = 10.0, 0.1  # sigma_N and sigma_g of Brown and Lowe (2007), 4
+_SHRINK = 8  # times smaller are the pictures whose overlaps give the gains
+_MOST_OVERLAPS = (
+    12  # of a frame, the nearest: what a hovering drone sees over and over adds nothing
+)
 
 
 @dataclass(frozen=True)
@@ -54,8 +55,6 @@ class RoiStitchingSettings:
     ransac_px: float = 3.0  # OpenCV's own for homographies
     min_inliers: int = 12
     roi_frames: float = 3.0  # side of the region, in frames ("three times the size of a frame")
-    bands: int = 5  # OpenCV's own of its blender
-    largest_px: int = 300_000_000  # of the whole picture: beyond, a frame was surely misplaced
 
     def __post_init__(self) -> None:
         for name, fits, needed in (
@@ -72,7 +71,6 @@ class RoiStitchingSettings:
             ("ransac_px", self.ransac_px > 0, "a positive number"),
             ("min_inliers", self.min_inliers >= 4, "at least 4"),
             ("roi_frames", self.roi_frames >= 1, "at least 1"),
-            ("bands", 1 <= self.bands <= 10, "1 to 10"),
         ):
             if not fits:
                 raise SettingsError(
@@ -108,47 +106,95 @@ class NotStitched:
     reason: str
 
 
+@dataclass(frozen=True, eq=False)
+class _Pasted:
+    """A placed frame as the region shows it, and the same small, for its gain."""
+
+    placed: Stitched
+    gray: ImageGray
+    small: Floats
+
+
 class RoiStitcher:
-    """The thesis's mosaic while it grows. Only `add` changes it."""
+    """The thesis's mosaic while it grows. Only `add` changes it.
+
+    The mosaic's frame is the first frame's pixels. The region is put together of the frames themselves, the newest on
+    top: blended pixels would lose detail with every frame, and features with it.
+    """
 
     def __init__(self, settings: RoiStitchingSettings = RoiStitchingSettings()) -> None:
         self._settings = settings
-        self._picture: ImageRGBA = np.zeros((0, 0, 4), np.uint8)
-        self._offset: MosaicOffset = (0, 0)
-        self._last: Stitched | None = None
+        self._pasted: list[_Pasted] = []
+        # by frames a and b: pixels that both show (share of a frame), and mean levels in a and in b
+        self._overlaps: dict[tuple[int, int], tuple[float, float, float]] = {}
         self._detector: Any = cv2.xfeatures2d.AKAZE_create(  # type: ignore[attr-defined]
             threshold=settings.akaze_threshold, max_points=settings.max_features
         )
 
     def add(self, frame_id: int, image: ImageRGB) -> Stitched | NotStitched:
-        """Place one undistorted frame and blend it in; the first frame defines the mosaic's pixels."""
-        height, width = image.shape[:2]
-        if self._last is None:
+        """Place one undistorted frame on top; the first frame defines the mosaic's pixels."""
+        gray = gray_from_rgb(image)
+        height, width = gray.shape
+        if not self._pasted:
             placed = Stitched(frame_id, np.eye(3), _barycentre(np.eye(3), width, height), 0, 0, 0.0)
         else:
-            found = self._register(frame_id, image, self._last)
+            found = self._register(frame_id, gray, self._pasted[-1].placed)
             if isinstance(found, NotStitched):
                 return found
             placed = found
         outline = apply_homography(placed.mosaic_from_image, _corners(width, height))
-        if reason := self._misplaced(outline, width * height):
+        if reason := _misplaced(outline, width * height):
             return NotStitched(frame_id, reason)
-        self._grow(outline)
-        self._blend(image, placed.mosaic_from_image, outline)
-        self._last = placed
+        small = cv2.resize(
+            gray, (width // _SHRINK, height // _SHRINK), interpolation=cv2.INTER_AREA
+        ).astype(np.float64)
+        new = _Pasted(placed, gray, small)
+        reach = float(np.hypot(width, height))
+        away = {
+            number: float(np.linalg.norm(each.placed.barycentre_px - placed.barycentre_px))
+            for number, each in enumerate(self._pasted)
+        }
+        for number in sorted(away, key=lambda each: away[each])[:_MOST_OVERLAPS]:
+            if away[number] < reach:
+                self._overlap(self._pasted[number], new)
+        self._pasted.append(new)
         return placed
 
-    def mosaic(self) -> tuple[ImageRGBA, MosaicOffset]:
-        """The picture, cut to what is painted (0 x 0 before the first frame), and where it lies."""
-        x, y, width, height = cv2.boundingRect(np.ascontiguousarray(self._picture[..., 3]))
-        offset = self._offset[0] + x, self._offset[1] + y
-        return self._picture[y : y + height, x : x + width].copy(), offset
+    def gains(self) -> dict[int, float]:
+        """The gain of each placed frame, by its id, all overlaps solved together."""
+        return solve_gains([each.placed.frame_id for each in self._pasted], self._overlaps)
 
-    def _register(self, frame_id: int, image: ImageRGB, last: Stitched) -> Stitched | NotStitched:
-        height, width = image.shape[:2]
+    def _overlap(self, old: _Pasted, new: _Pasted) -> None:
+        height, width = new.small.shape
+        full_from_small = resized(_SHRINK, _SHRINK)
+        new_from_old = (
+            np.linalg.inv(new.placed.mosaic_from_image @ full_from_small)
+            @ old.placed.mosaic_from_image
+            @ full_from_small
+        )
+        under = np.asarray(
+            cv2.warpPerspective(
+                old.small,
+                new_from_old,
+                (width, height),
+                borderMode=cv2.BORDER_CONSTANT,
+                borderValue=-1e6,
+            )
+        )
+        both = under >= 0
+        if both.any():
+            key = old.placed.frame_id, new.placed.frame_id
+            self._overlaps[key] = (
+                float(both.mean()),
+                float(under[both].mean()),
+                float(new.small[both].mean()),
+            )
+
+    def _register(self, frame_id: int, gray: ImageGray, last: Stitched) -> Stitched | NotStitched:
+        height, width = gray.shape
         roi, mask, origin = self._roi(last.barycentre_px, width, height)
         in_mosaic = self._features(roi, mask)
-        in_frame = self._features(gray_from_rgb(image), None)
+        in_frame = self._features(gray, None)
         if min(len(in_mosaic[0]), len(in_frame[0])) < self._settings.min_inliers:
             return NotStitched(
                 frame_id,
@@ -192,17 +238,25 @@ class RoiStitcher:
     ) -> tuple[ImageGray, NDArray[np.uint8], Floats]:
         """The mosaic around a point as gray, where it is painted, and its origin in mosaic coordinates."""
         half = self._settings.roi_frames * np.array([width, height]) / 2
-        limit = np.array(self._picture.shape[1::-1])
-        x0, y0 = np.clip(np.floor(centre_px - half) - self._offset, 0, limit).astype(int)
-        x1, y1 = np.clip(np.ceil(centre_px + half) - self._offset, 0, limit).astype(int)
-        part = self._picture[y0:y1, x0:x1]
-        painted = cv2.copyMakeBorder(
-            np.ascontiguousarray(part[..., 3]), 1, 1, 1, 1, cv2.BORDER_CONSTANT
-        )
+        low = np.floor(centre_px - half)
+        size: tuple[int, int] = tuple((np.ceil(centre_px + half) - low).astype(int).tolist())
+        roi, painted = np.zeros((2, *size[::-1]), np.uint8)
+        for each in self._pasted:
+            roi_from_image = (
+                np.array([[1, 0, -low[0]], [0, 1, -low[1]], [0, 0, 1.0]])
+                @ each.placed.mosaic_from_image
+            )
+            outline = apply_homography(roi_from_image, _corners(width, height))
+            if (outline.max(axis=0) <= 0).any() or (outline.min(axis=0) >= size).any():
+                continue
+            cv2.warpPerspective(
+                each.gray, roi_from_image, size, dst=roi, borderMode=cv2.BORDER_TRANSPARENT
+            )
+            cv2.fillConvexPoly(painted, np.rint(outline).astype(np.int32), 255)
         # a feature on the mosaic's own border describes where it ends, not the ground
-        mask = cv2.erode(painted, np.ones((11, 11), np.uint8))[1:-1, 1:-1]
-        gray = gray_from_rgb(np.ascontiguousarray(part[..., :3]))
-        return gray, mask, np.array([x0, y0], dtype=np.float64) + self._offset  # type: ignore[return-value]
+        framed = cv2.copyMakeBorder(painted, 1, 1, 1, 1, cv2.BORDER_CONSTANT)
+        mask = cv2.erode(framed, np.ones((11, 11), np.uint8))[1:-1, 1:-1]
+        return roi, mask, low  # type: ignore[return-value]
 
     def _features(self, gray: ImageGray, mask: ImageGray | None) -> tuple[PointsPx, Descriptors]:
         keypoints, descriptors = self._detector.detectAndCompute(gray, mask)
@@ -237,88 +291,50 @@ class RoiStitcher:
             return None, np.zeros(len(frame_px), dtype=bool)
         return matrix, inliers.ravel().astype(bool)
 
-    def _misplaced(self, outline: PointsPx, frame_px: int) -> str:
-        """Why an outline cannot be a frame's, in words; empty when it can."""
-        if not np.isfinite(outline).all():
-            return "its corners fall beyond the horizon"
-        edges = np.roll(outline, -1, axis=0) - outline
-        following = np.roll(edges, -1, axis=0)
-        turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
-        area_px = polygon_area([outline])
-        if not (turns > 0).all():
-            return "its outline would be folded"
-        if not 0.1 * frame_px <= area_px <= 10 * frame_px:
-            return f"it would be {np.sqrt(area_px / frame_px):.2f} times the first frame's size"
-        low, high = self._extent(outline)
-        if np.prod((high - low).astype(float)) > self._settings.largest_px:
-            return f"the mosaic would grow to {high[0] - low[0]}x{high[1] - low[1]} pixels"
-        return ""
 
-    def _extent(self, outline: PointsPx) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """The picture's corners in mosaic coordinates once it holds an outline: it grows by whole chunks."""
-        low = np.floor(outline.min(axis=0) / _CHUNK_PX).astype(np.int64) * _CHUNK_PX
-        high = (np.floor(outline.max(axis=0) / _CHUNK_PX).astype(np.int64) + 1) * _CHUNK_PX
-        if self._picture.size:
-            size = np.array(self._picture.shape[1::-1])
-            low, high = np.minimum(low, self._offset), np.maximum(high, size + self._offset)
-        return low, high
+def _misplaced(outline: PointsPx, frame_px: int) -> str:
+    """Why an outline cannot be a frame's, in words; empty when it can."""
+    if not np.isfinite(outline).all():
+        return "its corners fall beyond the horizon"
+    edges = np.roll(outline, -1, axis=0) - outline
+    following = np.roll(edges, -1, axis=0)
+    turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
+    area_px = polygon_area([outline])
+    if not (turns > 0).all():
+        return "its outline would be folded"
+    if not 0.1 * frame_px <= area_px <= 10 * frame_px:
+        return f"it would be {np.sqrt(area_px / frame_px):.2f} times the first frame's size"
+    return ""
 
-    def _grow(self, outline: PointsPx) -> None:
-        low, high = self._extent(outline)
-        width, height = (high - low).tolist()
-        if (height, width) == self._picture.shape[:2]:
-            return
-        wider = np.zeros((height, width, 4), np.uint8)
-        if self._picture.size:
-            x, y = (np.array(self._offset) - low).tolist()
-            wider[y : y + self._picture.shape[0], x : x + self._picture.shape[1]] = self._picture
-        self._picture, self._offset = wider, (int(low[0]), int(low[1]))
 
-    def _blend(self, image: ImageRGB, mosaic_from_image: Matrix3, outline: PointsPx) -> None:
-        """Put the frame on top, its gain matched to what it overlaps, its border blended in several bands."""
-        apron = 1 << (self._settings.bands + 1)
-        limit = np.array(self._picture.shape[1::-1])
-        x0, y0 = (
-            np.clip(np.floor(outline.min(axis=0)) - apron - self._offset, 0, limit)
-            .astype(int)
-            .tolist()
-        )
-        x1, y1 = (
-            np.clip(np.ceil(outline.max(axis=0)) + apron - self._offset, 0, limit)
-            .astype(int)
-            .tolist()
-        )
-        part = self._picture[y0:y1, x0:x1]
-        size = (x1 - x0, y1 - y0)
-        move = np.array([[1.0, 0, -x0 - self._offset[0]], [0, 1, -y0 - self._offset[1]], [0, 0, 1]])
-        part_from_image = move @ mosaic_from_image
-        warped = cv2.warpPerspective(
-            image, part_from_image, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
-        )
-        full = np.full(image.shape[:2], 255, np.uint8)
-        mask = np.asarray(
-            cv2.warpPerspective(full, part_from_image, size, flags=cv2.INTER_NEAREST), np.uint8
-        )
-        painted = np.ascontiguousarray(part[..., 3])
-        known = np.ascontiguousarray(part[..., :3])
-        shared = (mask > 0) & (painted > 0)
-        if shared.any():
-            gain = np.clip(known[shared].mean() / max(1.0, warped[shared].mean()), 0.5, 2.0)
-            warped = cv2.convertScaleAbs(warped, alpha=float(gain))
-        if not painted.any():
-            picture, both = warped, mask
-        else:
-            blender = cv2.detail_MultiBandBlender(0, self._settings.bands)  # type: ignore[attr-defined]
-            blender.prepare((0, 0, *size))
-            beneath = fill_invalid(known, painted > 0)
-            blender.feed(
-                beneath.astype(np.int16), cv2.bitwise_and(painted, cv2.bitwise_not(mask)), (0, 0)
-            )
-            blender.feed(warped.astype(np.int16), mask, (0, 0))
-            blended, both = blender.blend(None, None)
-            picture = np.clip(blended, 0, 255).astype(np.uint8)
-        part[..., :3][both > 0] = picture[both > 0]
-        part[..., 3] |= mask
+def solve_gains(
+    frames: list[int], overlaps: Mapping[tuple[int, int], tuple[float, float, float]]
+) -> dict[int, float]:
+    """The gain of each frame that makes overlaps alike, with a prior near 1: Brown and Lowe (2007), eq. 29.
+
+    An overlap of frames a and b is its size, the mean level there in a and that in b.
+    """
+    column = {each: number for number, each in enumerate(frames)}
+    rows, columns, values = [], [], []
+    right = np.zeros(len(frames))
+    for (a, b), (size, level_a, level_b) in overlaps.items():
+        for i, j, own, other in (
+            (column[a], column[b], level_a, level_b),
+            (column[b], column[a], level_b, level_a),
+        ):
+            rows += [i, i]
+            columns += [i, j]
+            values += [
+                size * (2 * own**2 / _NOISE_LEVELS**2 + _GAIN_SIGMA**-2),
+                -2 * size * own * other / _NOISE_LEVELS**2,
+            ]
+            right[i] += size * _GAIN_SIGMA**-2
+    lonely = np.flatnonzero(right == 0)
+    right[lonely] = 1.0
+    rows, columns = [*rows, *lonely], [*columns, *lonely]
+    values += [1.0] * len(lonely)
+    normal = coo_array((values, (rows, columns)), shape=(len(frames), len(frames))).tocsc()
+    return dict(zip(frames, np.atleast_1d(spsolve(normal, right)).tolist(), strict=True))
 
 
 def georeference(

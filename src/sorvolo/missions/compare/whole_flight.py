@@ -9,7 +9,6 @@ from sorvolo.change.flight_on_map import FlightFit, FlightOnMap, PhotoFeatures
 from sorvolo.change.views import ViewMaker
 from sorvolo.geometry.pose import Pose
 from sorvolo.missions.flight.setup import FlightSetup
-from sorvolo.missions.map.painting import site_from_image
 from sorvolo.mosaic.graph_settings import PoseGraphSettings
 from sorvolo.mosaic.placing import sees_horizon
 from sorvolo.mosaic.planar import PlanarMapper
@@ -93,7 +92,7 @@ class WholeFlight:
         camera = self._views.undistorted_camera
         return {
             each: FlightPlace(
-                fit.map_from_flight @ site_from_image(self._mapper, each, camera), fit.residual_m
+                fit.map_from_flight @ self._mapper.site_from_image(each, camera), fit.residual_m
             )
             for each in poses
             if each not in fit.elsewhere

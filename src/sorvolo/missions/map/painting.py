@@ -3,18 +3,19 @@
 import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from typing import Protocol
 
 from sorvolo.geometry.arrays import ImageRGB, Mask, Matrix3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid, TileIndex
-from sorvolo.geometry.homography import pose_from_homography, site_from_image_homography
+from sorvolo.geometry.homography import pose_from_homography
 from sorvolo.missions.flight.log import Ending, FlightLog, Stage
 from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.mosaic.canvas import Canvas, CoarseTiles, coarse_grid, coarseness
 from sorvolo.mosaic.canvas_frame import CanvasFrame
 from sorvolo.mosaic.exposure import Exposure
 from sorvolo.mosaic.placing import canvas_frame
-from sorvolo.mosaic.planar import KnownKeyframe, PlanarMapper
+from sorvolo.mosaic.planar import KnownKeyframe
 from sorvolo.registration.lens import Undistorter, at_size
 from sorvolo.store.exports.map_pictures import LivePreview
 from sorvolo.store.images import ImageCache
@@ -37,6 +38,26 @@ class StoredPicture:
 
     size_px: tuple[int, int]
     sha256: str
+
+
+class PlacedPictures(Protocol):
+    """What knows where a flight's pictures lie, and how bright they are, by keyframe."""
+
+    @property
+    def radial(self) -> float:
+        """Left-over radial distortion (see `PoseGraph.radial`)."""
+
+    def site_from_image(self, keyframe_id: int, camera: Camera) -> Matrix3:
+        """(3, 3) of an undistorted image of the size that `camera` has."""
+
+    def exposure(self) -> Exposure:
+        """Gains and vignette of all keyframes."""
+
+    def recent_exposure(self) -> Exposure:
+        """The same of the newest keyframes, while the flight goes on."""
+
+    def release(self) -> None:
+        """Put what is not needed for painting out of memory."""
 
 
 class KnownKeyframes:
@@ -154,7 +175,7 @@ class FlightPainter:
         self,
         writer: FlightWriter,
         archive: Archive,
-        mapper: PlanarMapper,
+        mapper: PlacedPictures,
         lens: Undistorter,
         known: KnownKeyframes,
         native_m_per_px: float,
@@ -304,7 +325,7 @@ class FlightPainter:
                 keyframe_id,
                 self._known.next_rank,
                 camera,
-                site_from_image(self._mapper, keyframe_id, camera),
+                self._mapper.site_from_image(keyframe_id, camera),
                 site_grid,
                 self.exposure.gains_of(keyframe_id),
                 self.exposure.vignette_of(0),
@@ -316,9 +337,3 @@ class FlightPainter:
             [frame for frame in frames.values() if frame is not None],
             forget=[keyframe_id for keyframe_id, frame in frames.items() if frame is None],
         )
-
-
-def site_from_image(mapper: PlanarMapper, keyframe_id: int, camera: Camera) -> Matrix3:
-    """Return (3, 3) of an undistorted image of the size that `camera` has: the stored one's or the frame's own."""
-    refined = camera.with_focal_px(camera.fx_px * mapper.focal_scale)
-    return site_from_image_homography(refined, mapper.pose(keyframe_id))

@@ -29,7 +29,7 @@ from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.flight.settings import TILES_MB, MapSettings, memory_budget_bytes
 from sorvolo.missions.flight.setup import FlightSetup, new_site
 from sorvolo.missions.map.coverage import FlightCoverage
-from sorvolo.missions.map.painting import FlightPainter, KnownKeyframes, site_from_image
+from sorvolo.missions.map.painting import FlightPainter, KnownKeyframes
 from sorvolo.mosaic.base_ties import BaseReport, FoundFrame, tie_to_base
 from sorvolo.mosaic.exposure import Exposure
 from sorvolo.mosaic.graph_settings import PoseGraphSettings
@@ -568,7 +568,7 @@ class PlanarRun(FlightRun):
             ending.reason,
             camera,
             pose,
-            site_from_image(self._mapper, keyframe_id, self._lens.camera),
+            self._mapper.site_from_image(keyframe_id, self._lens.camera),
             outline_m,
             unknown,
             unknown,
