@@ -477,11 +477,58 @@ def test_exif_states_the_positions_error(
     assert found.get("horizontal_sigma_m") == (None if sigma_m is None else pytest.approx(sigma_m))
 
 
-def test_a_void_fix_is_no_place(tmp_path: Path) -> None:
-    found = read_photo_metadata(
-        write_photo(tmp_path / "a.jpg", gps_extra={GPS.GPSStatus: "V"})
-    ).columns
-    assert "latitude_deg" not in found
+def dji_place(latitude: float, longitude: float) -> str:
+    place = f'drone-dji:GpsLatitude="{latitude:+.8f}" drone-dji:GpsLongitude="{longitude:+.8f}"'
+    return DJI.format(attributes=place, elements="")
+
+
+NO_REFERENCES = {GPS.GPSLatitudeRef: "", GPS.GPSLongitudeRef: ""}
+SOUTH_WEST, NORTH_EAST = (-46.5, -92.25), (46.5, 92.25)
+
+
+@pytest.mark.parametrize(
+    "gps, xmp, place, code",
+    [
+        (NO_REFERENCES, "", NORTH_EAST, "sign_assumed"),
+        (NO_REFERENCES, dji_place(*SOUTH_WEST), SOUTH_WEST, "sign_by_xmp"),
+        (NO_REFERENCES, dji_place(*NORTH_EAST), NORTH_EAST, ""),
+        (NO_REFERENCES, dji_place(0, 0), NORTH_EAST, "sign_assumed"),
+        ({GPS.GPSLatitudeRef: "O"}, "", (46.5, -92.25), "sign_assumed"),
+        ({GPS.GPSLatitudeRef: "North"}, dji_place(*SOUTH_WEST), SOUTH_WEST, "sign_by_xmp"),
+        ({GPS.GPSLatitudeRef: "South", GPS.GPSLongitudeRef: "west"}, "", SOUTH_WEST, ""),
+        (
+            {GPS.GPSLatitudeRef: "s", GPS.GPSLongitudeRef: "W"},
+            dji_place(*SOUTH_WEST),
+            SOUTH_WEST,
+            "",
+        ),
+        ({}, dji_place(-46.5003, -92.25), SOUTH_WEST, "position_contradicted"),
+        ({}, dji_place(-46.50003, -92.25), SOUTH_WEST, ""),
+        ({GPS.GPSStatus: "V"}, dji_place(*SOUTH_WEST), SOUTH_WEST, "void_fix_by_xmp"),
+        ({GPS.GPSStatus: "A"}, "", SOUTH_WEST, ""),
+        (
+            {GPS.GPSLatitude: dms(0), GPS.GPSLongitude: dms(0)},
+            dji_place(*SOUTH_WEST),
+            SOUTH_WEST,
+            "",
+        ),
+    ],
+)
+def test_positions_in_exif_and_xmp_are_held_against_each_other(
+    tmp_path: Path, gps: dict[int, object], xmp: str, place: tuple[float, float], code: str
+) -> None:
+    write_photo(tmp_path / "a.jpg", (*SOUTH_WEST, 198), xmp=xmp, gps_extra=gps)
+    source = open_photos(tmp_path)
+    found = [source.telemetry[name][0] for name in ("latitude_deg", "longitude_deg")]
+    assert found == pytest.approx(place, abs=1e-7)
+    assert set(codes(source)) - {"photo_without_time"} == ({code} if code else set())
+
+
+def test_a_void_fix_is_no_place_and_no_missing_one(tmp_path: Path) -> None:
+    write_photo(tmp_path / "a.jpg", gps_extra={GPS.GPSStatus: "V"})
+    source = open_photos(tmp_path)
+    assert not source.telemetry.has_fixes
+    assert codes(source) == {"void_fix": 1, "photo_without_time": 1}
 
 
 def test_a_real_fixed_wing_flight_states_heights_and_attitude() -> None:
@@ -573,6 +620,19 @@ def test_a_gps_clock_that_stands_still_is_replaced_by_the_cameras(tmp_path: Path
     source = open_photos(tmp_path)
     assert np.diff(source.telemetry.time_ns).tolist() == [2_000_000_000] * 3
     assert source.start_ns == 1_622_541_600 * 1_000_000_000
+
+
+@pytest.mark.parametrize("day", ["2021:06:01", "2021:06:02"])
+def test_photos_across_midnight_stay_in_order(tmp_path: Path, day: str) -> None:
+    """A receiver that keeps yesterday's date for a while puts the photos behind midnight a day too early."""
+    utc = ["2021:06:01 23:59:58", f"{day} 00:00:00", "2021:06:02 00:00:02"]
+    local = ["2021:06:02 01:59:58", "2021:06:02 02:00:00", "2021:06:02 02:00:02"]
+    for index in range(3):
+        write_photo(tmp_path / f"{index}.jpg", utc=utc[index], local=local[index], seed=index)
+    source = open_photos(tmp_path)
+    assert source.inputs == ("0.jpg", "1.jpg", "2.jpg")
+    assert np.diff(source.telemetry.time_ns).tolist() == [2_000_000_000] * 2
+    assert codes(source) == ({"gps_date": 1} if day == "2021:06:01" else {})
 
 
 def test_a_photo_without_gps_is_delivered_but_has_no_sample(tmp_path: Path) -> None:

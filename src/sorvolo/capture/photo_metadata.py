@@ -5,7 +5,8 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
-from math import isfinite, nan
+from enum import StrEnum
+from math import copysign, cos, hypot, isfinite, nan, radians
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -25,14 +26,31 @@ from sorvolo.capture.decoding import (
 )
 from sorvolo.capture.telemetry.cleaning import sigma_from_hdop_m
 from sorvolo.errors import InputError
-from sorvolo.geometry.units import KM_AN_HOUR_M_S, KNOT_M_S, MILE_AN_HOUR_M_S
+from sorvolo.geometry.units import (
+    KM_AN_HOUR_M_S,
+    KNOT_M_S,
+    M_PER_DEG_LATITUDE,
+    MILE_AN_HOUR_M_S,
+)
 
 _Tags: TypeAlias = Mapping[int, Any]
 _XMP_TAG = 700  # TIFF's number (XMP specification, part 3)
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 # the EXIF FocalPlaneResolutionUnit: inch, centimetre, millimetre, micrometre
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+_SIGN_OF_LETTER = ({"N": 1, "S": -1}, {"E": 1, "W": -1})  # of latitude, of longitude
+_APART_M = 10.0  # positions of one photo: rounding and corrections stay below; by choice
 _M_S_PER_SPEED_UNIT = {"K": KM_AN_HOUR_M_S, "M": MILE_AN_HOUR_M_S, "N": KNOT_M_S}
+
+
+class PlaceDoubt(StrEnum):
+    """What was to be decided about a photo's position; the value is the notice's code."""
+
+    VOID = "void_fix"
+    VOID_BY_XMP = "void_fix_by_xmp"
+    SIGN_ASSUMED = "sign_assumed"
+    SIGN_BY_XMP = "sign_by_xmp"
+    CONTRADICTED = "position_contradicted"
 
 
 @dataclass(frozen=True)
@@ -59,6 +77,7 @@ class PhotoMetadata:
     columns: Mapping[str, float] = field(default_factory=dict)
     unreadable: tuple[str, ...] = ()
     lens: photo_xmp.StatedLens = field(default_factory=photo_xmp.StatedLens)
+    place_doubt: PlaceDoubt | None = None
 
     @property
     def shown_size_px(self) -> tuple[int, int]:
@@ -97,6 +116,7 @@ def read_photo_metadata(path: Path) -> PhotoMetadata:
         header.width_px, header.height_px
     )
     full_height_px = round(full_width_px * header.height_px / header.width_px)
+    place, place_doubt = _place(gps, properties)
     return PhotoMetadata(
         header.width_px,
         header.height_px,
@@ -109,9 +129,10 @@ def read_photo_metadata(path: Path) -> PhotoMetadata:
         full_width_px,
         _utc_ns(main, detail, gps, properties),
         _camera_clock_ns(main, detail),
-        _telemetry_columns(gps, properties),
+        _telemetry_columns(gps, properties) | place,
         unreadable,
         photo_xmp.stated_lens(properties, full_width_px, full_height_px),
+        place_doubt,
     )
 
 
@@ -305,25 +326,49 @@ def _telemetry_columns(gps: _Tags, properties: Mapping[str, str]) -> dict[str, f
         columns["course_deg"] = (
             nan  # its GPSTrack repeats the heading, from which wind turns the course
         )
-    place = _finite(_exif_place(gps))
-    place = place if len(place) == 2 else _finite(photo_xmp.place_columns(properties))
-    if abs(place.get("latitude_deg", nan)) <= 90 and abs(place.get("longitude_deg", nan)) <= 180:
-        columns |= place
     return _finite(columns)
 
 
-def _exif_place(gps: _Tags) -> dict[str, float]:
-    """Latitude and longitude, none for a fix that the receiver calls void."""
-    if _text(gps.get(ExifTags.GPS.GPSStatus)) == "V":
+def _place(gps: _Tags, properties: Mapping[str, str]) -> tuple[dict[str, float], PlaceDoubt | None]:
+    """Latitude and longitude of EXIF and XMP held against each other, and what was in doubt.
+
+    EXIF goes first. A sign that its references N, S, E, W do not give is XMP's, and so is one that XMP has otherwise:
+    it stands within the number. A fix that the receiver calls void counts as none.
+    """
+    xmp = _on_earth(*photo_xmp.place_columns(properties).values())
+    size = [
+        _size_deg(gps.get(tag)) for tag in (ExifTags.GPS.GPSLatitude, ExifTags.GPS.GPSLongitude)
+    ]
+    signs = [
+        -1 if is_negative else letters.get(_text(gps.get(tag))[:1].upper(), 0)
+        for letters, tag, (_, is_negative) in zip(
+            _SIGN_OF_LETTER, (ExifTags.GPS.GPSLatitudeRef, ExifTags.GPS.GPSLongitudeRef), size
+        )
+    ]
+    exif = _on_earth(*(angle * (sign or 1) for (angle, _), sign in zip(size, signs)))
+    if exif and _text(gps.get(ExifTags.GPS.GPSStatus))[:1].upper() == "V":
+        return xmp, PlaceDoubt.VOID_BY_XMP if xmp else PlaceDoubt.VOID
+    if not exif or not any(exif.values()):
+        return xmp or exif, None
+    if not any(xmp.values()):  # 0/0 is what drones write before their first fix
+        return exif, None if all(signs) else PlaceDoubt.SIGN_ASSUMED
+    by_xmp = {name: copysign(angle, xmp[name]) for name, angle in exif.items()}
+    if _apart_m(by_xmp, xmp) > _APART_M:
+        return exif, PlaceDoubt.CONTRADICTED
+    return by_xmp, PlaceDoubt.SIGN_BY_XMP if _apart_m(exif, by_xmp) > _APART_M else None
+
+
+def _on_earth(latitude_deg: float, longitude_deg: float) -> dict[str, float]:
+    """The two as telemetry columns; none where they are no place."""
+    if not (abs(latitude_deg) <= 90 and abs(longitude_deg) <= 180):
         return {}
-    return {
-        "latitude_deg": _degrees(
-            gps.get(ExifTags.GPS.GPSLatitude), gps.get(ExifTags.GPS.GPSLatitudeRef)
-        ),
-        "longitude_deg": _degrees(
-            gps.get(ExifTags.GPS.GPSLongitude), gps.get(ExifTags.GPS.GPSLongitudeRef)
-        ),
-    }
+    return {"latitude_deg": latitude_deg, "longitude_deg": longitude_deg}
+
+
+def _apart_m(one: Mapping[str, float], other: Mapping[str, float]) -> float:
+    north_deg, east_deg = (one[name] - other[name] for name in ("latitude_deg", "longitude_deg"))
+    east_deg = (east_deg + 180) % 360 - 180
+    return M_PER_DEG_LATITUDE * hypot(north_deg, east_deg * cos(radians(one["latitude_deg"])))
 
 
 def _finite(columns: Mapping[str, float]) -> dict[str, float]:
@@ -340,15 +385,15 @@ def _horizontal_sigma_m(gps: _Tags) -> float:
     )
 
 
-def _degrees(parts: Any, reference: Any) -> float:
-    """Signed degrees of degrees, minutes, seconds and N, S, E or W; NaN if any part is missing."""
+def _size_deg(parts: Any) -> tuple[float, bool]:
+    """Degrees without sign of degrees, minutes, seconds, NaN if any part is missing; whether any part is negative."""
     numbers = (
         [_number(part) for part in parts] if isinstance(parts, (tuple, list)) else [_number(parts)]
     )
     if not 1 <= len(numbers) <= 3:
-        return nan
-    angle_deg = sum(number / 60**power for power, number in enumerate(numbers))
-    return -angle_deg if _text(reference).upper() in ("S", "W") else angle_deg
+        return nan, False
+    angle_deg = sum(abs(number) / 60**power for power, number in enumerate(numbers))
+    return angle_deg, any(number < 0 for number in numbers)
 
 
 def _altitude(gps: _Tags) -> tuple[float, bool]:

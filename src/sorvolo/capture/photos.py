@@ -15,11 +15,12 @@ import cv2
 import numpy as np
 
 from sorvolo.capture.decoding import LARGEST_FRAME_PX, decode_photo
-from sorvolo.capture.photo_metadata import PhotoMetadata, read_photo_metadata
+from sorvolo.capture.photo_metadata import PhotoMetadata, PlaceDoubt, read_photo_metadata
 from sorvolo.capture.picture_sizes import is_same_shape, other_size
 from sorvolo.capture.telemetry.cleaning import clean, notice
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.geometry.units import DAY_NS, SECOND_NS
 from sorvolo.survey.flight import (
     TELEMETRY_COLUMNS,
     CameraModel,
@@ -31,6 +32,9 @@ from sorvolo.survey.flight import (
 )
 
 _LOOK_AHEAD = 1  # photos decoded while one is worked on; each takes tens of megabytes
+_SAME_CLOCK_NS = (
+    600 * SECOND_NS
+)  # that a camera's clock is off its receiver's by more or less; by choice
 _STEP_NS = 1_000_000  # between photos of the same second
 _UNTIMED_STEP_NS = (
     1_000_000_000  # between photos that state no time: their order is kept, a second each by choice
@@ -40,6 +44,13 @@ _EDGE_BYTES = (
     65_536  # of a photo's beginning and end, by which a copy of it is recognised; by choice
 )
 _EXIF_UTC = "UTC in the photos' EXIF"
+_DOUBTS = {
+    PlaceDoubt.VOID: "photos whose position is there, but marked void (V) by the camera, and not used: {}",
+    PlaceDoubt.VOID_BY_XMP: "photos whose EXIF position is marked void (V), placed by their XMP: {}",
+    PlaceDoubt.SIGN_ASSUMED: "photos whose position lacks its N or S, E or W, taken as north and east: {}",
+    PlaceDoubt.SIGN_BY_XMP: "photos whose EXIF position has another sign than their XMP's, which is taken: {}",
+    PlaceDoubt.CONTRADICTED: "photos whose XMP position is more than 10 m from that in EXIF, which is taken: {}",
+}
 
 
 class PhotoFault(Enum):
@@ -234,8 +245,10 @@ def _best_times(photos: Sequence[Photo]) -> tuple[list[int], str, list[Notice]]:
         "photos without a time, placed by their names: {}",
     )
     if any(utc and local for utc, local in zip(utc_ns, local_ns)):
+        utc_ns, moved = _dates_mended(utc_ns, local_ns)
         times_ns, origin = _times_of_two_clocks(utc_ns, local_ns)
-        return times_ns, origin, untimed
+        words = "photos whose GPS date is a day off by the camera's clock, set right: {}"
+        return times_ns, origin, [*notice("gps_date", moved, words), *untimed]
     if any(utc_ns):
         return utc_ns, _EXIF_UTC, untimed
     if any(local_ns):
@@ -251,6 +264,19 @@ def _best_times(photos: Sequence[Photo]) -> tuple[list[int], str, list[Notice]]:
         "unknown: no photo has a time; they are taken to be one second apart, by name",
         untimed,
     )
+
+
+def _dates_mended(utc_ns: Sequence[int], local_ns: Sequence[int]) -> tuple[list[int], int]:
+    """The photos' UTC, and how many were moved by a day: some receivers change their date late, not at midnight UTC."""
+    offsets_ns = [utc - local if utc and local else None for utc, local in zip(utc_ns, local_ns)]
+    # of two dates the right one is nearer to the camera's clock, which is off by its time zone alone
+    usual_ns = min((each for each in offsets_ns if each is not None), key=abs)
+    mended = []
+    for utc, offset_ns in zip(utc_ns, offsets_ns):
+        off_ns = 0 if offset_ns is None else offset_ns - usual_ns
+        is_a_day = abs(abs(off_ns) - DAY_NS) < _SAME_CLOCK_NS
+        mended.append(utc - DAY_NS * (1 if off_ns > 0 else -1) if is_a_day else utc)
+    return mended, sum(new != old for new, old in zip(mended, utc_ns))
 
 
 def _times_of_two_clocks(utc_ns: list[int], local_ns: list[int]) -> tuple[list[int], str]:
@@ -349,9 +375,15 @@ def _telemetry_of(photos: Sequence[Photo]) -> tuple[Telemetry, list[Notice]]:
         if photo.metadata.width_px and photo.fault is not PhotoFault.DUPLICATE
     ]
     placed = sum("latitude_deg" in photo.metadata.columns for photo in readable)
-    missing = notice(
-        "photo_without_gps", len(readable) - placed, "photos without a GPS position: {}"
-    )
+    doubts = Counter(photo.metadata.place_doubt for photo in readable)
+    missing = [
+        *notice(
+            "photo_without_gps",
+            len(readable) - placed - doubts[PlaceDoubt.VOID],
+            "photos without a GPS position: {}",
+        ),
+        *(each for doubt, words in _DOUBTS.items() for each in notice(doubt, doubts[doubt], words)),
+    ]
     if not placed:
         return no_telemetry(), missing
     sampled = [photo for photo in readable if photo.metadata.columns]
