@@ -12,6 +12,7 @@ import rasterio
 from fake_changes import fake_change
 from fake_flights import LOCAL_SITE, SITE, frame, map_flight, tile
 
+from sealing import seal_again
 from sorvolo.cli.main import main
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.site.history import export_version, find_version, site_history
@@ -81,6 +82,7 @@ def test_a_date_means_its_whole_day_and_a_time_its_minute_or_second(site: Path) 
     with sqlite3.connect(site / "site.db") as connection:  # flights whose clocks have no date
         connection.execute("UPDATE flown SET first_ns = 7, last_ns = 8")
     connection.close()
+    seal_again(site / "site.db")
     with Archive.open(site, write=False) as archive:
         made = [datetime.fromisoformat(version.created_utc) for version in archive.versions()]
         assert find_version(archive, "1").id == 1

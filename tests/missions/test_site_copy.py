@@ -33,7 +33,7 @@ def test_the_command_copies_verifies_and_reports_it(
     assert "copied 0 of" in (shown := capsys.readouterr().out) and "the copy is complete" in shown
     (target / "preview.png").write_bytes(b"")
     assert main(["site", "copy", str(site), str(target), "--verify"]) == 1
-    assert "preview.png: differs" in capsys.readouterr().err
+    assert "preview.png: damaged" in capsys.readouterr().err
     assert main(["site", "copy", str(site), str(target)]) == 0
     assert main(["site", "copy", str(site), str(target), "--verify"]) == 0
     assert "every file matches" in capsys.readouterr().out

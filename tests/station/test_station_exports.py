@@ -15,16 +15,22 @@ URL = "/api/sites/field/exports"
 
 
 def test_listed_files_can_be_taken_and_nothing_else(client: TestClient, root: Path) -> None:
-    (root / "field" / "mosaic.tif").write_bytes(b"II*\0 a map")
+    written = (root / "field" / "mosaic.tif").read_bytes()
     listed = {each["id"]: each for each in client.get(URL).json()}
-    assert listed["mosaic.tif"]["bytes"] == 10
+    assert listed["mosaic.tif"]["bytes"] == len(written)
     answer = client.get(listed["mosaic.tif"]["url"])
-    assert answer.content == b"II*\0 a map"
+    assert answer.content == written
     assert answer.headers["content-disposition"].startswith(
         "attachment; filename*=UTF-8''field-mosaic.tif"
     )
     for wrong in ("site.db", "..%2Fstation%2Fstation.db", "pod.tif"):
         assert client.get(f"{URL}/{wrong}").status_code == 404
+
+
+def test_a_damaged_file_is_refused(client: TestClient, root: Path) -> None:
+    (root / "field" / "mosaic.tif").write_bytes(b"II*\0 a map")
+    answer = client.get(f"{URL}/mosaic.tif")
+    assert answer.status_code == 409 and "mosaic.tif is damaged" in answer.text
 
 
 def test_a_link_in_a_files_place_is_refused(client: TestClient, root: Path) -> None:

@@ -16,6 +16,7 @@ from fake_flights import LOCAL_SITE, SITE, frame, map_flight, tile
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sealing import seal_again
 from sorvolo.errors import InputError, StoreError
 from sorvolo.geometry.polygons import signed_area
 from sorvolo.store.exports.change_files import changes_geojson, mask_name, write_view_masks
@@ -467,6 +468,7 @@ def test_a_version_is_found_by_its_time_and_differs_by_its_tiles(folder: Path) -
     with sqlite3.connect(folder / "site.db") as connection:  # flights whose clocks have no date
         connection.execute("UPDATE flown SET first_ns = 7, last_ns = 8")
     connection.close()
+    seal_again(folder / "site.db")
     with Archive.open(folder, write=False) as archive:
         made = [datetime.fromisoformat(version.created_utc) for version in archive.versions()]
         assert (

@@ -228,7 +228,7 @@ def test_damage_is_found_and_named(site: Path, tmp_path: Path) -> None:
     (target / "flights/flight-1/report.html").unlink()
     faults = verified(site, target).faults
     assert (
-        faults["preview.png"] == "differs" and faults["flights/flight-1/report.html"] == "missing"
+        faults["preview.png"] == "damaged" and faults["flights/flight-1/report.html"] == "missing"
     )
     assert faults[name] == "missing" and len(faults) == 4
 

@@ -169,7 +169,7 @@ def _within_bounds(
 
 def _path_of(shelf: SiteShelf) -> Callable[[str, str], str]:
     def path_of(site: str, cog: str) -> str:
-        """The file of a raster by its id. Raises Problem (404), StoreError where its path holds a link."""
+        """The file of a raster by its id. Raises Problem (404), StoreError for a link or damage."""
         archive = shelf.open(site)
         found = cogs_of(archive).get(cog)
         if found is None:
@@ -177,6 +177,7 @@ def _path_of(shelf: SiteShelf) -> Callable[[str, str], str]:
                 404,
                 f"the site has no raster {cog[:80]!r}; /api/sites/{site}/cogs lists those there are",
             )
+        archive.require_sound(found.file)
         with open_below(archive.folder, found.file):  # refuses links on the way
             return str(archive.folder / found.file)
 

@@ -262,7 +262,7 @@ def _frames(archive: Archive) -> list[Feature]:
 def _frames_of(archive: Archive, site: Site, flight: str) -> list[Feature]:
     """The frames of one flight."""
     features = []
-    for each in _features_of(archive, f"flights/{flight}", "frames", local=site.is_local):
+    for each in archive.features(f"flights/{flight}", "frames"):
         values = dict(each.get("properties") or {})
         values |= {"flight": flight, "datetime": values.get("time")}
         geometry = _lonlat(each.get("geometry"), site)
@@ -355,7 +355,7 @@ def _with(
 def _coverage(archive: Archive) -> list[Feature]:
     features = []
     for flight in _flights(archive):
-        for number, each in enumerate(_features_of(archive, f"flights/{flight}", COVERAGE)):
+        for number, each in enumerate(archive.features(f"flights/{flight}", COVERAGE)):
             values = {**(each.get("properties") or {}), "flight": flight}
             geometry = _lonlat(each.get("geometry"), archive.site())
             features.append(
@@ -367,7 +367,7 @@ def _coverage(archive: Archive) -> list[Feature]:
                 }
             )
     for number, each in enumerate(
-        _features_of(archive, "", _LIVE_COVERAGE, local=False)
+        archive.features("", _LIVE_COVERAGE, is_local=False)
     ):  # of the flight in the air
         values = {**(each.get("properties") or {}), "flight": None}
         geometry = _lonlat(each.get("geometry"), archive.site())
@@ -385,7 +385,7 @@ def _pod(archive: Archive) -> list[Feature]:
             "geometry": each.get("geometry"),
             "properties": each.get("properties"),
         }
-        for number, each in enumerate(_features_of(archive, SEARCH_FOLDER, "pod", local=False))
+        for number, each in enumerate(archive.features(SEARCH_FOLDER, "pod", is_local=False))
     ]
 
 
@@ -405,21 +405,6 @@ def _flights(archive: Archive) -> list[str]:
 
 def _complete(archive: Archive) -> list[FlightEntry]:
     return [each for each in archive.flights() if each.status == "complete"]
-
-
-def _features_of(
-    archive: Archive, folder: str, name: str, *, local: bool | None = None
-) -> list[Feature]:
-    """The features of a GeoJSON file of the site; none where there is no such file or somebody broke it."""
-    is_local = archive.site().is_local if local is None else local
-    try:
-        file = "/".join(filter(None, (folder, features_name(name, is_local=is_local))))
-        features = json.loads(read_below(archive.folder, file, _MOST_BYTES)).get("features")
-    except (OSError, ValueError, RecursionError, AttributeError):
-        return []
-    return (
-        [each for each in features if isinstance(each, dict)] if isinstance(features, list) else []
-    )
 
 
 def _lonlat(geometry: Any, site: Site) -> Any:

@@ -25,7 +25,6 @@ from sorvolo.station.tokens import Role
 from sorvolo.store.exports.change_files import crop_names
 from sorvolo.store.exports.object_files import CROPS, crop_name
 from sorvolo.store.images import jpeg_from_image, rgba_from_png
-from sorvolo.store.nofollow import read_below
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import StoredKeyframe
 
@@ -127,7 +126,7 @@ def cut(archive: Archive, frame: StoredKeyframe, place_m: PointsM) -> ImageRGB:
 
 def _read(archive: Archive, file: str) -> bytes:
     try:
-        return read_below(archive.folder, file)
+        return archive.read_file(file)
     except FileNotFoundError as error:
         raise Problem(404, "this picture was not kept") from error
 

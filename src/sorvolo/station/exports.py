@@ -91,6 +91,8 @@ def export_routes(shelf: SiteShelf, collections: SiteCollections) -> APIRouter:
             return _geopackage(site, archive, collections)
         found = next((each for each in export_files(archive) if each.id == export_id), None)
         try:
+            if found is not None:
+                archive.require_sound(found.path)
             file = open_below(archive.folder, found.path) if found is not None else None
         except FileNotFoundError:
             file = None

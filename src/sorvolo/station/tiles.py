@@ -108,10 +108,9 @@ class WebTiles:
         tiles = archive.live_tiles() if name == "live" else archive.tiles(int(name))
         grid = archive.site_grid().grid
         made = TilePyramid(tiles, grid.tile_px, self._pictures)
-        if _is_exported(archive, name):
-            made = TilePyramid(
-                tiles, grid.tile_px, self._pictures, MapOverview(archive.mosaic_path, grid).tile
-            )
+        path = archive.mosaic_path
+        if _is_exported(archive, name) and archive.is_sound(path.name):
+            made = TilePyramid(tiles, grid.tile_px, self._pictures, MapOverview(path, grid).tile)
         with self._lock:
             if len(self._states) > 200:
                 self._states.clear()

@@ -1,18 +1,21 @@
 """Files of a folder that a stranger may have made: read without following a link, refused where one lies."""
 
 import errno
+import hashlib
 import os
 import stat
+from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
 from sorvolo.errors import StoreError
 
-_MOST_BYTES = 512_000_000  # of one file: the largest keyframe takes a tenth
+MOST_BYTES = 512_000_000  # of one file: the largest keyframe takes a tenth
+_CHUNK_BYTES = 1 << 20
 _LINK_ERRORS = {errno.ELOOP, errno.ENOTDIR, errno.EMLINK}
 
 
-def read_below(folder: Path, relative: str, most_bytes: int = _MOST_BYTES) -> bytes:
+def read_below(folder: Path, relative: str, most_bytes: int = MOST_BYTES) -> bytes:
     """The bytes of the file `relative` below the folder; no part of that path may be a link.
 
     The folder itself may be one. Raises FileNotFoundError when there is no such file, and StoreError for a link, for
@@ -31,6 +34,20 @@ def read_below(folder: Path, relative: str, most_bytes: int = _MOST_BYTES) -> by
 def open_below(folder: Path, relative: str) -> BinaryIO:
     """The file `relative` below the folder, opened to be read piece by piece; raises as `read_below`."""
     return os.fdopen(_descriptor_below(folder, relative), "rb")
+
+
+def chunks_of(stream: BinaryIO) -> Iterator[bytes]:
+    """The rest of a stream, in pieces."""
+    while chunk := stream.read(_CHUNK_BYTES):
+        yield chunk
+
+
+def sha256_of(stream: BinaryIO) -> str:
+    """The SHA-256 of the rest of a stream."""
+    digest = hashlib.sha256()
+    for chunk in chunks_of(stream):
+        digest.update(chunk)
+    return digest.hexdigest()
 
 
 def refuse_links(folder: Path, *, skipped: frozenset[str] = frozenset()) -> None:

@@ -368,6 +368,7 @@ class CompareRun:
         result = FlightResult(placed, self._setup.source.camera.camera, makes_map=False)
         notices = [
             *notices,
+            *self._archive.notices,
             *self._objects.notices,
             *flight_notices(self._counts, self._flight_fit),
         ]
@@ -430,7 +431,7 @@ def _earlier_pictures(archive: Archive, superseded: str) -> EarlierPictures:
     show any more."""
     keyframes = [
         each
-        for each in archive.keyframes()
+        for each in archive.sound_keyframes()
         if each.flight_id != superseded and each.status is Status.VISION
     ]
     tall = flight_with_heights(archive, but=superseded)

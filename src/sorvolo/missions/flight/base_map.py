@@ -28,6 +28,8 @@ from sorvolo.mosaic.base_ties import (
 )
 from sorvolo.mosaic.planar import PlanarMapper
 from sorvolo.store.rasters.base_map import BaseMap
+from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.catalogue_place import is_site
 from sorvolo.survey.flight import Notice
 
 _COARSEST = 8.0  # times the photos' own pixels
@@ -190,5 +192,8 @@ def _found_as_one(
 
 
 def open_base(path: Path, source: Source) -> FlightBase:
-    """Open a flight's base map. Raises InputError with what to do."""
+    """Open a flight's base map. Raises InputError with what to do, StoreError for a site whose map is damaged."""
+    if is_site(path):
+        with Archive.open(path, write=False) as archive:
+            archive.require_sound(archive.mosaic_path.name)
     return FlightBase(source, BaseMap.open(path), not source.telemetry.has_fixes)

@@ -17,10 +17,9 @@ from sorvolo.missions.heights.run import height_grid, newest_flight, run_of
 from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.store.exports.places import longitude_latitude
 from sorvolo.store.exports.plain import feature_collection, geojson_bytes
-from sorvolo.store.nofollow import read_below
 from sorvolo.store.rasters.heights import read_height_cog
 from sorvolo.store.site.archive import Archive
-from sorvolo.store.site.files import HeightFile
+from sorvolo.store.site.files import DamagedError, HeightFile
 from sorvolo.survey.flight import Site
 
 _MOST_BYTES = 16_000_000  # of heights.json, which has kilobytes; by choice
@@ -129,6 +128,11 @@ def read_field(archive: Archive, flight_id: str, file: HeightFile) -> HeightFiel
 
 
 def _read(archive: Archive, flight_id: str, file: HeightFile, cell_m: float) -> HeightField:
+    if not archive.is_sound(f"flights/{flight_id}/{file}"):
+        raise NoHeightsError(
+            f"{file} of flight {flight_id} is damaged; make the heights again: "
+            f"sorvolo heights {archive.folder} --flight {flight_id}"
+        )
     site_grid = height_grid(archive.site(), cell_m)
     read = read_height_cog(archive.height_path(flight_id, file), site_grid.grid)
     rows, columns = read.bands[0].shape
@@ -213,12 +217,14 @@ def _report(archive: Archive, flight_id: str) -> Mapping[str, Any]:
 def _read_report(archive: Archive, flight_id: str) -> Mapping[str, Any] | None:
     try:
         report = json.loads(
-            read_below(archive.flight_folder(flight_id), HeightFile.REPORT, _MOST_BYTES)
+            archive.read_file(f"flights/{flight_id}/{HeightFile.REPORT}", _MOST_BYTES)
         )
         known = {"run": report["run"], "cell_m": float(report["cell_m"])}
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, DamagedError):
         return None
-    return known if 0 < known["cell_m"] < math.inf else None
+    files = (f"flights/{flight_id}/{file}" for file in (HeightFile.SURFACE, HeightFile.GROUND))
+    is_usable = 0 < known["cell_m"] < math.inf and all(map(archive.is_sound, files))
+    return known if is_usable else None
 
 
 def _line(line: Any, level_m: float, site: Site) -> dict[str, Any]:

@@ -35,7 +35,6 @@ from sorvolo.store.atomic import atomic_write_bytes, scratch_folder
 from sorvolo.store.exports.plain import features_name, json_bytes
 from sorvolo.store.freed_memory import give_back
 from sorvolo.store.images import ImageCache, png_from_rgba
-from sorvolo.store.nofollow import read_below
 from sorvolo.store.rasters.geotiff import write_cog
 from sorvolo.store.rasters.heights import write_height_cog
 from sorvolo.store.site.archive import Archive
@@ -85,7 +84,8 @@ def _residuals_m(archive: Archive, flight_id: str) -> dict[str, tuple[float | No
     """Camera minus fix of each frame by name, None where there was no fix."""
     path = archive.flight_folder(flight_id) / features_name("frames", is_local=False)
     try:
-        features = json.loads(read_below(path.parent, path.name, _MOST_BYTES))["features"]
+        name = path.relative_to(archive.folder).as_posix()
+        features = json.loads(archive.read_file(name, _MOST_BYTES))["features"]
         rows = [each["properties"] for each in features]
         return {
             str(row["frame"]): tuple(row[f"gps_residual_{axis}_m"] for axis in _AXES)
@@ -218,7 +218,7 @@ def make_heights(
     with Archive.open(site, write=True, catalogues=catalogues) as archive:
         flight_id = flight or newest_flight(archive)
         keyframes = [
-            each for each in archive.keyframes(flight_id) if each.site_from_camera is not None
+            each for each in archive.sound_keyframes(flight_id) if each.site_from_camera is not None
         ]
         started_s = time.monotonic()
         views = flight_views(archive, flight_id, keyframes)
@@ -234,32 +234,37 @@ def make_heights(
         mapped = archive.report(flight_id)
         yield HeightsUpdate(flight_id, "ground", 0.0)
         ground, shows_ground = terrain(surface.lattice, surface.up_m, settings.terrain)
-        _write_models(archive, flight_id, surface, ground)
-        heights_s = time.monotonic() - started_s
-        give_back()
-        if settings.has_orthophoto:
-            yield from _paint(archive, surface, solved, pictures, settings, flight_id)
-        report = {
-            "flight": flight_id,
-            "run": run_of(keyframes),
-            "cell_m": surface.lattice.cell_m,
-            "height_reference": archive.site().height_reference,
-            "cameras": camera_figures(solved),
-            "surface": surface_figures(surface, shows_ground, judgement),
-            "warnings": [
-                *_map_warnings(mapped),
-                *camera_warnings(solved),
-                *surface_warnings(surface),
-            ],
-            "contradicts_itself": contradicts_itself(mapped),
-            "seconds": {
-                "cameras": cameras_s,
-                "heights": heights_s,
-                "total": time.monotonic() - started_s,
-            },
-            "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        }
-        atomic_write_bytes(archive.height_path(flight_id, HeightFile.REPORT), json_bytes(report))
+        files = (f"flights/{flight_id}/{file}" for file in HeightFile)
+        with archive.replacing(*files):
+            _write_models(archive, flight_id, surface, ground)
+            heights_s = time.monotonic() - started_s
+            give_back()
+            if settings.has_orthophoto:
+                yield from _paint(archive, surface, solved, pictures, settings, flight_id)
+            report = {
+                "flight": flight_id,
+                "run": run_of(keyframes),
+                "cell_m": surface.lattice.cell_m,
+                "height_reference": archive.site().height_reference,
+                "cameras": camera_figures(solved),
+                "surface": surface_figures(surface, shows_ground, judgement),
+                "warnings": [
+                    *_map_warnings(mapped),
+                    *camera_warnings(solved),
+                    *surface_warnings(surface),
+                    *(each.text for each in archive.notices),
+                ],
+                "contradicts_itself": contradicts_itself(mapped),
+                "seconds": {
+                    "cameras": cameras_s,
+                    "heights": heights_s,
+                    "total": time.monotonic() - started_s,
+                },
+                "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+            }
+            atomic_write_bytes(
+                archive.height_path(flight_id, HeightFile.REPORT), json_bytes(report)
+            )
         yield HeightsUpdate(flight_id, "done", 1.0)
 
 

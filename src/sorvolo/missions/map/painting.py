@@ -74,7 +74,7 @@ class KnownKeyframes:
         if archive.has_site:
             newest = next((v for v in reversed(archive.versions()) if v.complete), None)
             left_out = flight if newest is not None and newest.flight_id == flight else None
-            self.stored = [each for each in archive.keyframes() if each.flight_id != left_out]
+            self.stored = [each for each in archive.sound_keyframes() if each.flight_id != left_out]
             rank_of = {each.id: each.rank for each in archive.flights()}
             self._ranks = [rank_of[each.flight_id] for each in self.stored]
         self.superseded = [

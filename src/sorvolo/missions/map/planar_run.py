@@ -392,7 +392,7 @@ class PlanarRun(FlightRun):
             result,
             self._archive.site(),
             shown,
-            [*notices, *self._detector_notices],
+            [*notices, *self._archive.notices, *self._detector_notices],
             time.monotonic() - started_s,
         )
         report["objects"] = self._search_summary(search)

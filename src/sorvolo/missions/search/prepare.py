@@ -48,7 +48,7 @@ def search_frames(archive: Archive, flight_id: str) -> list[SearchFrame]:
     """The frames of a flight that have a place. Raises InputError where none has."""
     frames = [
         frame
-        for stored in archive.keyframes(flight_id)
+        for stored in archive.sound_keyframes(flight_id)
         if (frame := search_frame(archive, stored)) is not None
     ]
     if not frames:

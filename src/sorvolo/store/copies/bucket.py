@@ -23,14 +23,13 @@ from sorvolo.store.copies.site_state import (
     SiteFile,
     SiteState,
     checked_path,
-    chunks_of,
     find_state,
     missing_from,
     named_files,
     refuse_damaged,
     tile_of,
-    tile_path,
 )
+from sorvolo.store.nofollow import chunks_of
 from sorvolo.store.site.catalogue import Catalogue
 from sorvolo.store.site.catalogue_place import CATALOGUE
 from sorvolo.store.site.names import checked_sha256
@@ -180,24 +179,23 @@ class BucketEnd:
         path = scratch / CATALOGUE
         size, sha256 = manifest.catalogue
         self.fetch(SiteFile(catalogue_key(sha256), size, sha256), catalogue_key(sha256), path)
-        with closing(Catalogue.at(path, write=True)) as catalogue:
+        place = f"the catalogue at {self.name}"
+        with closing(Catalogue.at(path, write=True, place=place)) as catalogue:
             held = find_state(catalogue)
-            tiles, keyframes, _ = named_files(catalogue)
+            lasting, _, _ = named_files(catalogue)
         if held is None or held.identity != manifest.held.identity:
             raise StoreError(
                 f"{self.name}: the catalogue is not the one of this site; restore it from a copy"
             )
         sizes = self._objects.sizes("tiles")
         files = dict(manifest.files)
+        tiles = {path: sha256 for path, sha256 in lasting.items() if tile_of(path)}
         files |= {
-            tile_path(each): SiteFile(tile_path(each), sizes.get(tile_path(each), 0), each)
-            for each in tiles
+            path: SiteFile(path, sizes.get(path, 0), sha256) for path, sha256 in tiles.items()
         }
-        files |= {path: SiteFile(path, 0) for path in keyframes - files.keys()}
-        self.shown, self.tile_bytes = (
-            manifest,
-            {each: sizes.get(tile_path(each), 0) for each in tiles},
-        )
+        files |= {path: SiteFile(path, 0) for path in lasting.keys() - files.keys()}
+        self.shown = manifest
+        self.tile_bytes = {sha256: sizes.get(path, 0) for path, sha256 in tiles.items()}
         return SiteState(held, path, files)
 
     def is_still(self, state: SiteState, scratch: Path) -> bool:
@@ -267,17 +265,12 @@ class BucketEnd:
 
     def lacks(self, state: SiteState) -> list[SiteFile]:
         """The files whose bytes are not there, judged by names and sizes; the others are noted."""
-        known = self._former.files if self._former is not None else {}
         lacking = []
         for file in state.files.values():
-            former = known.get(file.path)
-            same = former if former and _is_same_picture(file, former) else file
-            stored = self._stored.get(key_of(same)) if same.sha256 else None
-            if stored is not None and same.size in (
-                stored,
-                0,
-            ):  # 0: not fetched into a working copy
-                self._put[file.path] = same
+            stored = self._stored.get(key_of(file)) if file.sha256 else None
+            # 0: not fetched into a working copy
+            if stored is not None and file.size in (stored, 0):
+                self._put[file.path] = replace(file, size=stored)
             else:
                 lacking.append(file)
         return lacking
@@ -457,10 +450,6 @@ def sites_at(objects: Objects) -> list[str]:
     if BucketEnd(objects).has_site:
         return ["."]
     return sorted(each for each in objects.folders() if objects.has(f"{each}/{MANIFEST}"))
-
-
-def _is_same_picture(file: SiteFile, former: SiteFile) -> bool:
-    return not file.sha256 and file.is_lasting and file.size in (former.size, 0)
 
 
 def key_of(file: SiteFile) -> str:

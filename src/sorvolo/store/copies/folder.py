@@ -27,25 +27,24 @@ from sorvolo.store.copies.site_state import (
     CatalogueState,
     SiteFile,
     SiteState,
-    chunks_of,
     find_state,
     is_left_out,
     is_site_path,
     missing_from,
     named_files,
     refuse_damaged,
-    sha256_of,
     tile_of,
-    tile_path,
 )
-from sorvolo.store.nofollow import open_below, refuse_links
+from sorvolo.store.nofollow import chunks_of, open_below, refuse_links, sha256_of
 from sorvolo.store.site import catalogue as records
 from sorvolo.store.site import schema
+from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import Catalogue
 from sorvolo.store.site.catalogue_place import (
     CATALOGUE,
     POINTER,
     Catalogues,
+    catalogue_file,
     create_database,
     is_site,
 )
@@ -56,7 +55,6 @@ from sorvolo.store.site.files import (
     LIVE_COVERAGE,
     LIVE_PREVIEW,
     LOCK,
-    SiteFolder,
     lock_folder,
     refuse_unfinished,
 )
@@ -225,12 +223,13 @@ class FolderEnd:
     ) -> tuple[CatalogueState | None, Mapping[str, SiteFile], tuple[str, ...]]:
         """What a copy of the catalogue in a new file holds (None: no map), unfinished runs apart; the site's files,
         and files that do not belong to it."""
-        site = SiteFolder.open(self.folder, write=False, catalogues=self._catalogues)
+        site = Archive.open(self.folder, write=False, catalogues=self._catalogues)
         try:
             _copy_catalogue(site.catalogue, path)
         finally:
             site.close()
-        with closing(Catalogue.at(path, write=True)) as copied:
+        place = str(catalogue_file(self.folder) or self.folder)
+        with closing(Catalogue.at(path, write=True, place=place)) as copied:
             with copied.changing() as connection:
                 records.drop_unfinished(connection)
             return find_state(copied), *_listed(self.folder, *named_files(copied))
@@ -244,7 +243,7 @@ class FolderEnd:
             return False
         if file.is_lasting or (file.stamp and about.st_mtime_ns == file.stamp):
             return True
-        if file.stamp or not file.sha256:
+        if not file.sha256:
             return False
         with open_below(self.folder, file.path) as stream:
             return sha256_of(stream) == file.sha256
@@ -333,30 +332,26 @@ def _paths(folder: Path) -> Iterator[str]:
 
 
 def _listed(
-    folder: Path, tiles: set[str], keyframes: set[str], owed: set[tuple[str, str]]
+    folder: Path, lasting: Mapping[str, str], others: Mapping[str, str], owed: set[tuple[str, str]]
 ) -> tuple[dict[str, SiteFile], tuple[str, ...]]:
     """The files that make the state up, those missing of which the catalogue names (as of size 0), and what is none."""
-    lasting = {tile_path(each): each for each in tiles} | dict.fromkeys(keyframes, "")
     found: dict[str, SiteFile] = {}
     foreign = []
     for path in _paths(folder):
-        if path in lasting or (is_site_path(path) and not is_left_out(path, keyframes, owed)):
-            if (file := _file(folder, path, lasting.get(path, ""))) is not None:
-                found[path] = file
+        if path in lasting or (is_site_path(path) and not is_left_out(path, lasting, owed)):
+            try:
+                about = (folder / path).lstat()
+            except FileNotFoundError:  # replaced meanwhile
+                continue
+            sha256 = lasting.get(path, "")
+            stamp = 0 if sha256 else about.st_mtime_ns
+            found[path] = SiteFile(path, about.st_size, sha256 or others.get(path, ""), stamp)
         elif not (
             path in _OF_THE_FOLDER or is_site_path(path) or tile_of(path) or _is_passing(path)
         ):
             foreign.append(path)
     missing = {path: SiteFile(path, 0, lasting[path]) for path in lasting.keys() - found.keys()}
     return found | missing, tuple(sorted(foreign))
-
-
-def _file(folder: Path, path: str, sha256: str) -> SiteFile | None:
-    try:
-        about = (folder / path).lstat()
-    except FileNotFoundError:  # replaced meanwhile
-        return None
-    return SiteFile(path, about.st_size, sha256, 0 if sha256 else about.st_mtime_ns)
 
 
 def _is_passing(path: str) -> bool:

@@ -3,20 +3,19 @@
 import hashlib
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
 
-from sqlalchemy import Connection, Table, select
+from sqlalchemy import Connection, select
 
 from sorvolo.errors import StoreError
 from sorvolo.store.atomic import TEMPORARY_PREFIX
 from sorvolo.store.site import catalogue as records
 from sorvolo.store.site import schema
 from sorvolo.store.site.catalogue import Catalogue
-from sorvolo.store.site.files import JOURNAL, STAGED, HeightFile
-from sorvolo.store.site.names import checked_image_path, is_plain_name, is_sha256
+from sorvolo.store.site.files import JOURNAL, STAGED, DamagedError, HeightFile
+from sorvolo.store.site.names import is_plain_name, is_sha256
 
 _MAP_FILES = frozenset(
     {
@@ -29,7 +28,6 @@ _MAP_FILES = frozenset(
         "objects.gpx",
     }
 )
-_CHUNK_BYTES = 1 << 20
 _MOST_PARTS = 6  # of a file's path: flights/<flight>/staged/<run>/changes/<file>
 _HOW_FAR_WRITTEN = {
     "site": {"derived_version"},
@@ -92,10 +90,6 @@ class SiteState:
     left_out: tuple[str, ...] = ()
 
 
-class DamagedError(Exception):
-    """A file's bytes are not those that were written: it is counted and reported."""
-
-
 def find_state(catalogue: Catalogue) -> CatalogueState | None:
     """What a catalogue holds; None where no flight was ever mapped."""
     with catalogue.reading() as connection:
@@ -119,16 +113,19 @@ def find_state(catalogue: Catalogue) -> CatalogueState | None:
         )
 
 
-def named_files(catalogue: Catalogue) -> tuple[set[str], set[str], set[tuple[str, str]]]:
-    """The tiles (SHA-256), the keyframes (paths), and flights with runs whose staged files are still to be placed."""
+def named_files(
+    catalogue: Catalogue,
+) -> tuple[dict[str, str], dict[str, str], set[tuple[str, str]]]:
+    """The tiles and keyframes, and the other files, by path, with their SHA-256; flights with runs whose staged files
+    are still to be placed."""
     with catalogue.reading() as connection:
-        tiles = records.used_hashes(connection)
-        keyframes = {
-            checked_image_path(each.image_path, each.flight_id)
-            for each in records.load_keyframes(connection, None)
+        lasting = {tile_path(each): each for each in records.used_hashes(connection)}
+        lasting |= {
+            each.image_path: each.sha256 for each in records.load_keyframes(connection, None)
         }
         owed = {(each.flight_id, str(each.run_id)) for each in records.owed_files(connection)}
-    return tiles, keyframes, owed
+        others = records.file_hashes(connection)
+    return lasting, others, owed
 
 
 def missing_from(held: CatalogueState, files: Mapping[str, SiteFile], other: SiteState) -> str:
@@ -179,27 +176,13 @@ def tile_of(path: str) -> str:
     return found[1] if found and path == tile_path(found[1]) and is_sha256(found[1]) else ""
 
 
-def chunks_of(stream: BinaryIO) -> Iterator[bytes]:
-    """The rest of a stream, in pieces."""
-    while chunk := stream.read(_CHUNK_BYTES):
-        yield chunk
-
-
-def sha256_of(stream: BinaryIO) -> str:
-    """The SHA-256 of the rest of a stream."""
-    digest = hashlib.sha256()
-    for chunk in chunks_of(stream):
-        digest.update(chunk)
-    return digest.hexdigest()
-
-
 def refuse_damaged(file: SiteFile, sha256: str) -> None:
     """Raise DamagedError where a file's bytes are known and have another SHA-256."""
     if file.sha256 and file.sha256 != sha256:
         raise DamagedError(file.path)
 
 
-def is_left_out(path: str, keyframes: set[str], owed: set[tuple[str, str]]) -> bool:
+def is_left_out(path: str, lasting: Collection[str], owed: set[tuple[str, str]]) -> bool:
     """Whether a copy leaves a file below `flights` out on purpose: what only an unfinished run needs."""
     parts = path.split("/")
     if parts[0] != "flights" or len(parts) < 3:
@@ -207,24 +190,20 @@ def is_left_out(path: str, keyframes: set[str], owed: set[tuple[str, str]]) -> b
     if parts[2] == STAGED:
         return len(parts) < 4 or (parts[1], parts[3]) not in owed
     if parts[2] == "keyframes":
-        return path not in keyframes
+        return path not in lasting
     return parts[2] == JOURNAL or parts[-1].startswith(TEMPORARY_PREFIX)
 
 
 def _digest(connection: Connection) -> str:
-    """A hash of everything in the catalogue except the progress of derived files."""
+    """A hash of everything in the catalogue except the progress of derived files, and what these are."""
     digest = hashlib.sha256()
     for table in schema.metadata.sorted_tables:
-        if table is schema.leftovers:
+        if table in (schema.leftovers, schema.files):
             continue
         digest.update(table.name.encode())
-        for row in _rows(connection, table):
-            digest.update(json.dumps(row, sort_keys=True, default=repr).encode())
+        skipped = _HOW_FAR_WRITTEN.get(table.name, set())
+        query = select(table).order_by(*table.primary_key.columns)
+        for row in schema.checked_rows(connection, table, query):
+            values = [value for name, value in row._mapping.items() if name not in skipped]
+            digest.update(json.dumps(values, sort_keys=True, default=repr).encode())
     return digest.hexdigest()
-
-
-def _rows(connection: Connection, table: Table) -> Iterator[list[Any]]:
-    skipped = _HOW_FAR_WRITTEN.get(table.name, set())
-    columns = [each for each in table.columns if each.name not in skipped]
-    for row in connection.execute(select(*columns).order_by(*table.primary_key.columns)):
-        yield list(row)

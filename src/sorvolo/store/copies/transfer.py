@@ -9,7 +9,9 @@ from pathlib import Path
 from sorvolo.errors import StoreError
 from sorvolo.store.copies.bucket import BucketEnd
 from sorvolo.store.copies.folder import FolderEnd
-from sorvolo.store.copies.site_state import DamagedError, SiteFile, sha256_of
+from sorvolo.store.copies.site_state import SiteFile
+from sorvolo.store.nofollow import sha256_of
+from sorvolo.store.site.files import DamagedError
 
 SiteEnd = FolderEnd | BucketEnd
 
@@ -57,15 +59,13 @@ def copy(
     StoreError. Raises StoreError as both ends do, and when the source changed during each of `most_rounds` rounds.
     """
     copied = copied_bytes = 0
-    faults: dict[str, str] = {}
-    gone_before: set[str] = set()
 
     def move(file: SiteFile) -> str:
         try:
             with source.opened(file) as stream:
                 return "" if target.put(file, stream) else "there"
         except FileNotFoundError:
-            return "gone"
+            return "missing"
         except DamagedError:
             return "damaged"
 
@@ -73,24 +73,19 @@ def copy(
         for _ in range(most_rounds):
             state = source.state(scratch)
             target.accept(state, scratch)
-            lacking = [file for file in target.lacks(state) if file.path not in faults]
+            lacking = target.lacks(state)
             total = sum(file.size for file in lacking)
             room(total, target.free_bytes())
-            gone: set[str] = set()
+            faults: dict[str, str] = {}
             done = done_bytes = 0
             for file, outcome in in_parallel(move, lacking, threads):
-                if outcome == "gone":
-                    gone.add(file.path)
-                elif outcome == "damaged":
+                if outcome in ("missing", "damaged"):
                     faults[file.path] = outcome
                 elif not outcome:
                     copied, copied_bytes = copied + 1, copied_bytes + file.size
                 done, done_bytes = done + 1, done_bytes + file.size
                 yield CopyUpdate(done, len(lacking), done_bytes, total)
-            # gone in two rounds: another process is not just replacing it
-            faults |= dict.fromkeys(gone & gone_before, "missing")
-            gone_before = gone
-            if not gone - faults.keys() and source.is_still(state, scratch):
+            if source.is_still(state, scratch):
                 target.conclude(state)
                 size = sum(file.size for file in state.files.values())
                 return CopyOutcome(

@@ -17,14 +17,13 @@ from sorvolo.store.copies.folder import FolderEnd
 from sorvolo.store.copies.object_store import Objects, open_objects
 from sorvolo.store.copies.site_state import (
     CatalogueState,
-    DamagedError,
     SiteFile,
     SiteState,
     tile_of,
 )
 from sorvolo.store.copies.transfer import CopyUpdate, copy
 from sorvolo.store.site.catalogue_place import is_site
-from sorvolo.store.site.files import lock_folder
+from sorvolo.store.site.files import DamagedError, lock_folder
 from sorvolo.store.site.origin import ORIGIN, TILE_SIZES, UNSENT, cache_folder
 
 
@@ -106,7 +105,7 @@ class WorkingCopy:
         if outcome.faults:
             lost = ", ".join(outcome.faults)
             raise StoreError(
-                f"{self.folder} lacks files that {self.address} has not either: {lost}"
+                f"{self.folder} lacks whole files that {self.address} has not either: {lost}"
             )
         self._note(end)
         (self.folder / UNSENT).unlink(missing_ok=True)

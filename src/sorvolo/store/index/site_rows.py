@@ -128,7 +128,11 @@ def _frames(archive: Archive, flight: str, site: Site) -> FrameRows:
     """What the flight's frames show, by its frames.geojson; by the key frames alone where that is missing."""
     keyframes = archive.keyframes(flight)
     kept = {each.name for each in keyframes}
-    rows = [row for each in archive.frames(flight) if (row := _written(each, kept)) is not None]
+    rows = [
+        row
+        for each in archive.features(f"flights/{flight}", "frames")
+        if (row := _written(each, kept)) is not None
+    ]
     rows = rows or [row for each in keyframes if (row := _shown(each, site)) is not None]
     if not rows:
         return FrameRows()

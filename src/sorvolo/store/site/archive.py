@@ -1,27 +1,56 @@
 """A site on disk, opened to be read or written: what is in it, and how a flight begins to enter."""
 
+import hashlib
+import json
+import os
 import warnings
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 from sqlalchemy import Connection
 
 from sorvolo.errors import InputError, NotFoundError, SettingsError, SorvoloWarning, StoreError
 from sorvolo.geometry.arrays import ImageRGB
-from sorvolo.store.exports.plain import plain_json
+from sorvolo.geometry.grid import SiteGrid
+from sorvolo.store.exports.plain import features_name, plain_json
+from sorvolo.store.images import image_from_jpeg
+from sorvolo.store.nofollow import MOST_BYTES, open_below, read_below, sha256_of
 from sorvolo.store.site import catalogue as records
 from sorvolo.store.site import change_records, object_records
-from sorvolo.store.site.catalogue import FlightEntry, StoredKeyframe, TileDifference, VersionEntry
-from sorvolo.store.site.catalogue_place import Catalogues
+from sorvolo.store.site.catalogue import (
+    Catalogue,
+    FlightEntry,
+    StoredKeyframe,
+    TileDifference,
+    VersionEntry,
+)
+from sorvolo.store.site.catalogue_place import Catalogues, is_site
 from sorvolo.store.site.change_records import StoredChange, StoredReview
-from sorvolo.store.site.files import SiteFolder
+from sorvolo.store.site.files import (
+    JOURNAL,
+    LIVE_COVERAGE,
+    LIVE_PREVIEW,
+    STAGED,
+    DamagedError,
+    HeightFile,
+    begin_writing,
+    refuse_traps,
+)
 from sorvolo.store.site.flight_writer import FlightWriter
 from sorvolo.store.site.journal import RunJournal
-from sorvolo.store.site.names import is_plain_name
+from sorvolo.store.site.names import (
+    checked_document,
+    checked_image_path,
+    checked_name,
+    is_plain_name,
+)
 from sorvolo.store.site.object_records import StoredObject, StoredSearch
-from sorvolo.store.site.tiles import GrowingTiles, TileView
+from sorvolo.store.site.origin import find_origin
+from sorvolo.store.site.tiles import GrowingTiles, TileBlobs, TileView
 from sorvolo.store.site.upkeep import (
     forget_journals,
     forget_unfinished,
@@ -30,21 +59,35 @@ from sorvolo.store.site.upkeep import (
     stopped_flights,
 )
 from sorvolo.survey.findings import Verdict
-from sorvolo.survey.flight import Site
+from sorvolo.survey.flight import Notice, Site
 
 __all__ = ["Archive", "FlightWriter"]
 
+T = TypeVar("T")
 _MEGABYTE = 1_000_000
+_MOST_DOCUMENT_BYTES = 256_000_000  # of a report.json: an hour's track takes a hundredth
 
 
-class Archive(SiteFolder):
+class Archive:
     """One site on disk; a context manager. Made by `open`.
 
     The catalogue is the truth. Tiles and keyframe images are files that it names; everything else is derived
-    from them and replaced whole, so that the folder can be read at any moment, whatever was killed when.
+    from them and replaced whole, so that the folder can be read at any moment, whatever was killed when. It has the
+    SHA-256 of each, which is looked at when the file is read. Names that come out of it are checked before they
+    become paths.
     """
 
-    _writer: FlightWriter | None = None
+    def __init__(self, folder: Path, catalogue: Catalogue, lock: int | None) -> None:
+        self.folder, self.catalogue = folder, catalogue
+        self._origin = find_origin(folder)
+        self.blobs = TileBlobs(folder / "tiles", self._origin)
+        self._lock = lock
+        self._writer: FlightWriter | None = None
+        self.notices: list[Notice] = []
+        """Of pictures that were left out, as they are damaged."""
+        self._sound: set[tuple[str, int, int]] = (
+            set()
+        )  # files, by size and time, whose bytes were looked at
 
     @classmethod
     def open(cls, folder: Path, *, write: bool, catalogues: Catalogues | None = None) -> Self:
@@ -55,15 +98,36 @@ class Archive(SiteFolder):
         StoreError when the folder is no site, is being written by another process, cannot be written, is
         damaged, holds a link, or has another format version; then nothing in it was changed.
         """
-        archive = super().open(Path(folder), write=write, catalogues=catalogues)
+        folder = Path(folder)
+        if not write:
+            if not is_site(folder):
+                raise NotFoundError(
+                    f"no site at {folder}; make one with: sorvolo map INPUT --site {folder}"
+                )
+            # those are read link by link
+            refuse_traps(folder, skipped=frozenset({"tiles", "keyframes"}))
+            return cls(folder, Catalogue.open(folder, write=False, catalogues=catalogues), None)
+        lock = begin_writing(folder, catalogues)
         try:
-            if write:
-                forget_unfinished(archive)
-                repair(archive)
+            catalogue = Catalogue.open(folder, write=True, catalogues=catalogues)
+        except BaseException:
+            os.close(lock)
+            raise
+        archive = cls(folder, catalogue, lock)
+        try:
+            forget_unfinished(archive)
+            repair(archive)
         except BaseException:
             archive.close()
             raise
         return archive
+
+    def close(self) -> None:
+        """Let go of the catalogue and of the right to write."""
+        self.catalogue.close()
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
 
     def __enter__(self) -> Self:
         return self
@@ -201,9 +265,39 @@ class Archive(SiteFolder):
         """Keyframes of complete runs, by flight rank and index; of one flight when its id is given."""
         return self.catalogue_rows(records.load_keyframes, flight_id)
 
+    def sound_keyframes(self, flight_id: str | None = None) -> list[StoredKeyframe]:
+        """`keyframes` less those whose images are damaged or gone: `notices` and a warning count them.
+
+        In a working copy, images that are not here are fetched, and looked at, when asked for.
+        """
+
+        def fault(keyframe: StoredKeyframe) -> str:
+            is_sound = self._is_as_written(keyframe.image_path, keyframe.sha256)
+            return {True: "", False: "damaged", None: "gone" if self._origin is None else ""}[
+                is_sound
+            ]
+
+        stored = self.keyframes(flight_id)
+        with ThreadPoolExecutor() as pool:
+            faults = list(pool.map(fault, stored))
+        unsound: dict[tuple[str, str], list[int]] = {}
+        for keyframe, found in zip(stored, faults):
+            if found:
+                unsound.setdefault((keyframe.flight_id, found), []).append(keyframe.index)
+        for (flight, found), frames in unsound.items():
+            numbers = ", ".join(map(str, frames))
+            what = f"key frame {numbers} of {flight} is"
+            if len(frames) > 1:
+                what = f"{len(frames):,} key frames of {flight} ({numbers}) are"
+            notice = Notice("damaged_keyframes", len(frames), f"{what} {found}: left out")
+            if notice not in self.notices:
+                self.notices.append(notice)
+                _warn(notice.text)
+        return [keyframe for keyframe, found in zip(stored, faults) if not found]
+
     def image(self, keyframe: StoredKeyframe) -> ImageRGB:
-        """A keyframe's undistorted image; raises StoreError when its flight was mapped again meanwhile."""
-        return self.stored_image(keyframe.flight_id, keyframe.image_path)
+        """A keyframe's undistorted image; raises StoreError when it is damaged, or its flight was mapped again."""
+        return self.stored_image(keyframe.flight_id, keyframe.image_path, keyframe.sha256)
 
     def tiles(self, version: int | None = None) -> TileView:
         """The tiles of a version, of the newest complete one by default, read when asked for; {} if none.
@@ -291,13 +385,10 @@ class Archive(SiteFolder):
         grid = self.site_grid().grid
         if journal is None:
             self._forget_stopped(None, but=flight_id)
+        plain = plain_json(settings)
         with self.catalogue.changing() as connection:
             run_id, version_id = records.begin_run(
-                connection,
-                flight_id,
-                fingerprint,
-                str(settings.get("method", "")),
-                plain_json(settings),
+                connection, flight_id, fingerprint, str(settings.get("method", "")), plain
             )
             base = records.tile_hashes(connection, version_id)
         self.blobs.cache_bytes = min(self.blobs.cache_bytes, tiles_mb * _MEGABYTE)
@@ -307,8 +398,207 @@ class Archive(SiteFolder):
         )
         return self._writer
 
+    @property
+    def mosaic_path(self) -> Path:
+        """The map as a Cloud Optimized GeoTIFF."""
+        return self.folder / "mosaic.tif"
+
+    @property
+    def preview_path(self) -> Path:
+        """The map as a small PNG."""
+        return self.folder / "preview.png"
+
+    @property
+    def kmz_path(self) -> Path:
+        """The map for Google Earth."""
+        return self.folder / "mosaic.kmz"
+
+    @property
+    def live_preview_path(self) -> Path:
+        """A small PNG of the growing map."""
+        return self.folder / LIVE_PREVIEW
+
+    @property
+    def live_coverage_path(self) -> Path:
+        """The ground that a flight which is being mapped has seen by now."""
+        return self.folder / LIVE_COVERAGE
+
+    def flight_folder(self, flight_id: str) -> Path:
+        """Where a flight's files lie; raises StoreError for an id that is no plain name."""
+        return self.folder / "flights" / checked_name(flight_id, "flight")
+
+    def flight_folders(self) -> list[Path]:
+        """The folders of all flights that have one, whether the catalogue knows them or not."""
+        return [
+            path
+            for path in (self.folder / "flights").glob("*")
+            if path.is_dir() and not path.is_symlink()
+        ]
+
+    def document_path(self, flight_id: str, name: str) -> Path:
+        """A text file of a flight; raises StoreError for a name that could lie elsewhere."""
+        return self.flight_folder(flight_id) / checked_document(name)
+
+    def height_path(self, flight_id: str, file: HeightFile) -> Path:
+        """Where a file of a flight's heights lies, whether it is there or not."""
+        return self.flight_folder(flight_id) / file
+
+    def journal_path(self, flight_id: str) -> Path:
+        """Where a run notes how far it is, until it is committed."""
+        return self.flight_folder(flight_id) / JOURNAL
+
+    def staged_folder(self, flight_id: str, run_id: int) -> Path:
+        """Where a run collects pictures until it is committed."""
+        return self.flight_folder(flight_id) / STAGED / str(int(run_id))
+
+    def image_name(self, flight_id: str, run_id: int, index: int) -> str:
+        """The path of a keyframe's image in the site folder, as the catalogue holds it."""
+        return (
+            f"flights/{checked_name(flight_id, 'flight')}/keyframes/{int(run_id)}/{index:06d}.jpg"
+        )
+
+    def stored_image(self, flight_id: str, image_path: str, sha256: str, step: int = 1) -> ImageRGB:
+        """A stored keyframe, at a `step`-th (1, 2, 4, 8) of its size.
+
+        Raises StoreError when it is gone, damaged, or no keyframe of this flight.
+        """
+        name = checked_image_path(image_path, flight_id)
+        if self._origin is not None and not (self.folder / name).exists():
+            self._origin.fetch(name)
+        try:
+            data = read_below(self.folder, name)
+        except FileNotFoundError as error:
+            raise StoreError(
+                f"the keyframe {self.folder / name} is gone; if its flight was mapped again meanwhile, list the "
+                "keyframes anew"
+            ) from error
+        if hashlib.sha256(data).hexdigest() != sha256:
+            raise self._damaged(name)
+        return image_from_jpeg(data, str(self.folder / name), step=step)
+
+    def read_file(self, name: str, most_bytes: int = MOST_BYTES) -> bytes:
+        """A file below the folder, as it was written.
+
+        Raises FileNotFoundError when there is none, StoreError when it is damaged, too large, or behind a link.
+        """
+        for _ in range(3):  # a writer may replace it
+            sha256 = self.catalogue_rows(records.file_hash, name)
+            data = read_below(self.folder, name, most_bytes)
+            if sha256 in ("", hashlib.sha256(data).hexdigest()):
+                return data
+        raise self._damaged(name)
+
+    def is_sound(self, name: str) -> bool:
+        """Whether a file below the folder is as it was written, as far as this is known; True where there is none."""
+        for _ in range(3):
+            sha256 = self.catalogue_rows(records.file_hash, name)
+            if not sha256 or self._is_as_written(name, sha256) is not False:
+                return True
+        return False
+
+    def require_sound(self, name: str) -> None:
+        """Raise StoreError for a file below the folder that is not as it was written."""
+        if not self.is_sound(name):
+            raise self._damaged(name)
+
+    def _is_as_written(self, name: str, sha256: str) -> bool | None:
+        """Whether a file has this SHA-256; None where it is gone. A file that has not changed is not read again."""
+        try:
+            with open_below(self.folder, name) as file:
+                about = os.fstat(file.fileno())
+                mark = sha256, about.st_size, about.st_mtime_ns
+                if mark not in self._sound and sha256_of(file) == sha256:
+                    self._sound.add(mark)
+                return mark in self._sound
+        except FileNotFoundError:
+            return None
+
+    def _damaged(self, name: str) -> DamagedError:
+        return DamagedError(
+            f"{self.folder / name} is damaged: its bytes are not those that were written; restore it from a copy of "
+            "the site, or make it again"
+        )
+
+    @contextmanager
+    def replacing(self, *paths: str) -> Iterator[None]:
+        """Note the SHA-256 of the files at these paths, and in folders there, which the block writes or removes.
+
+        Meanwhile they are not known.
+        """
+        with self.catalogue.changing() as connection:
+            records.forget_files(connection, paths)
+        yield
+        hashes = {}
+        for path in paths:
+            for file in (self.folder / path, *(self.folder / path).glob("*")):
+                if file.is_file():
+                    with file.open("rb") as opened:
+                        name = file.relative_to(self.folder).as_posix()
+                        hashes[name] = sha256_of(opened)
+        with self.catalogue.changing() as connection:
+            records.note_files(connection, hashes)
+
+    def report(self, flight_id: str) -> Mapping[str, Any]:
+        """A flight's report.json; empty when somebody took it away or broke it, of which a warning tells."""
+        return self._document(f"flights/{checked_name(flight_id, 'flight')}/report.json")
+
+    def features(
+        self, folder: str, name: str, *, is_local: bool | None = None
+    ) -> list[dict[str, Any]]:
+        """The features of a GeoJSON file in a folder of the site; none when somebody took it away or broke it."""
+        is_local = self.site().is_local if is_local is None else is_local
+        file = "/".join(filter(None, (folder, features_name(name, is_local=is_local))))
+        features = self._document(file).get("features")
+        if not isinstance(features, list):
+            return []
+        return [each for each in features if isinstance(each, dict)]
+
+    def _document(self, name: str) -> Mapping[str, Any]:
+        """A JSON object in a file; empty when it is missing, damaged or broken."""
+        try:
+            content = json.loads(self.read_file(name, _MOST_DOCUMENT_BYTES))
+        except FileNotFoundError:
+            return {}
+        except (OSError, ValueError, RecursionError, DamagedError) as error:
+            _warn(f"{name} is left out: {error}")
+            return {}
+        return content if isinstance(content, dict) else {}
+
+    def catalogue_rows(self, query: Callable[..., T], *arguments: object) -> T:
+        """What a query finds in one transaction."""
+        with self.catalogue.reading() as connection:
+            return query(connection, *arguments)
+
+    def find_site(self) -> Site | None:
+        """The site; None while there is none."""
+        return self.catalogue_rows(records.load_site)
+
+    def site(self) -> Site:
+        """The site; raises StoreError while there is none."""
+        site = self.find_site()
+        if site is None:
+            raise StoreError(f"{self.folder} has no site yet; map a flight into it first")
+        return site
+
+    def site_grid(self) -> SiteGrid:
+        """The pixel grid of the site's tiles; raises StoreError while there is no site."""
+        site = self.site()
+        return SiteGrid.at(site.origin, site.m_per_px, site.crs)
+
+    def versions(self) -> list[VersionEntry]:
+        """Every state of the map, oldest first."""
+        return self.catalogue_rows(records.list_versions)
+
+    def version_tiles(self, version_id: int) -> TileView:
+        """The tiles of a version, read when asked for; none for a version that does not exist."""
+
+        def hashes() -> Mapping[Any, str]:
+            return self.catalogue_rows(records.tile_hashes, version_id)
+
+        return TileView(self.blobs, hashes(), hashes)
+
     def _require_writable(self) -> None:
-        if not self.is_writable:
+        if self._lock is None:
             raise StoreError(f"{self.folder} was opened to be read; open it with write=True")
 
 

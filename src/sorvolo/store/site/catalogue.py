@@ -18,6 +18,7 @@ from sqlalchemy import (
     func,
     insert,
     literal,
+    or_,
     select,
     update,
 )
@@ -34,9 +35,19 @@ from sorvolo.store.rasters.geotiff import COMPRESSIONS
 from sorvolo.store.site import schema
 from sorvolo.store.site.catalogue_place import Catalogues, open_database
 from sorvolo.store.site.database import Database, SqliteDatabase
-from sorvolo.store.site.names import checked_crs, checked_image_path
+from sorvolo.store.site.names import checked_crs, checked_image_path, checked_sha256
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import Status
+
+# what values that no Sorvolo wrote raise where they are read
+_IMPOSSIBLE = (
+    TypeError,
+    ValueError,
+    LookupError,
+    AttributeError,
+    ArithmeticError,
+    GeometryError,
+)
 
 
 @dataclass(frozen=True)
@@ -104,7 +115,8 @@ class TileDifference:
 class StoredKeyframe:
     """A keyframe of a complete run. Its image is undistorted and may be smaller than the frame was.
 
-    `camera` and `site_from_image` (3, 3) are those of the stored image; `gains` (3,) multiply its RGB
+    `sha256` is that of the image's bytes, `camera` and `site_from_image` (3, 3) are the stored image's; `gains` (3,)
+    multiply its RGB
     once the lens's `vignette` (2,) is undone (mosaic.exposure);
     `site_from_camera` is None where the method knows no 6-DoF pose.
     """
@@ -115,6 +127,7 @@ class StoredKeyframe:
     time_ns: int
     status: Status
     image_path: str
+    sha256: str
     camera: Camera
     site_from_image: Matrix3
     site_from_camera: Pose | None
@@ -125,14 +138,16 @@ class StoredKeyframe:
 
 
 class Catalogue:
-    """The open catalogue; `reading` and `changing` give one transaction each, the functions below use them."""
+    """The open catalogue; `reading` and `changing` give one transaction each, the functions below use them.
+
+    Both raise StoreError for rows that are damaged.
+    """
 
     def __init__(self, database: Database, site: Path, *, write: bool) -> None:
         """Raises StoreError when it is damaged, no catalogue, of a format that is not known, or out of reach; for a
         writer, also when another process writes.
         """
         self._database = database
-        self.reading, self.changing = database.reading, database.changing
         self.fold_log, self.change_mark, self.close = (
             database.fold_log,
             database.change_mark,
@@ -151,14 +166,33 @@ class Catalogue:
         return cls(open_database(folder, write=write, catalogues=catalogues), folder, write=write)
 
     @classmethod
-    def at(cls, path: Path, *, write: bool) -> Self:
-        """A catalogue in a file of SQLite's. Raises as the constructor."""
-        return cls(SqliteDatabase(path, write=write), path.parent, write=write)
+    def at(cls, path: Path, *, write: bool, place: str = "") -> Self:
+        """A catalogue in a file of SQLite's, which messages call `place`. Raises as the constructor."""
+        database = SqliteDatabase(path, write=write)
+        database.place = place or database.place
+        return cls(database, path.parent, write=write)
 
-    @property
-    def place(self) -> str:
-        """What messages call it."""
-        return self._database.place
+    @contextmanager
+    def reading(self) -> Iterator[Connection]:
+        """A transaction that sees one state of the catalogue."""
+        with self._naming_damage(), self._database.reading() as connection:
+            yield connection
+
+    @contextmanager
+    def changing(self) -> Iterator[Connection]:
+        """A transaction, durable when it ends."""
+        with self._naming_damage(), self._database.changing() as connection:
+            yield connection
+
+    @contextmanager
+    def _naming_damage(self) -> Iterator[None]:
+        try:
+            yield
+        except _IMPOSSIBLE as error:
+            raise StoreError(
+                f"{self._database.place} is damaged: {error}; restore it from a copy of the site, or map into a new "
+                "folder"
+            ) from error
 
     def _check_format(self, site: Path) -> None:
         with self.reading() as connection:
@@ -170,17 +204,6 @@ class Catalogue:
             )
 
 
-@contextmanager
-def reading_rows(what: str) -> Iterator[None]:
-    """Turn values in a row that no Sorvolo wrote into a StoreError."""
-    try:
-        yield
-    except (TypeError, ValueError, KeyError, AttributeError, OverflowError, GeometryError) as error:
-        raise StoreError(
-            f"the site's catalogue holds a {what} that cannot be ({error}); restore the site from a copy, or map again"
-        ) from error
-
-
 def utc_now() -> str:
     """The time, ISO 8601 UTC to the millisecond."""
     return datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
@@ -188,16 +211,15 @@ def utc_now() -> str:
 
 def load_site(connection: Connection) -> Site | None:
     """The site, None before it was created."""
-    row = connection.execute(select(schema.site)).one_or_none()
+    row = next(schema.checked_rows(connection, schema.site, select(schema.site)), None)
     if row is None:
         return None
-    with reading_rows("site"):
-        origin = Geodetic(row.latitude_deg, row.longitude_deg, row.height_m)
-        if not 0 < row.m_per_px < np.inf:
-            raise ValueError(f"{row.m_per_px} metres a pixel")
-        return Site(
-            row.name, origin, checked_crs(row.crs), row.m_per_px, row.is_local, row.height_reference
-        )
+    origin = Geodetic(row.latitude_deg, row.longitude_deg, row.height_m)
+    if not 0 < row.m_per_px < np.inf:
+        raise ValueError(f"the site has {row.m_per_px} metres a pixel")
+    return Site(
+        row.name, origin, checked_crs(row.crs), row.m_per_px, row.is_local, row.height_reference
+    )
 
 
 def created_utc(connection: Connection) -> str:
@@ -213,9 +235,8 @@ def add_site(connection: Connection, site: Site) -> None:
         name: getattr(site, name)
         for name in ("name", "height_reference", "crs", "m_per_px", "is_local")
     }
-    connection.execute(
-        insert(schema.site).values(id=1, **place, **facts, created_utc=utc_now(), derived_version=0)
-    )
+    row = {"id": 1, **place, **facts, "created_utc": utc_now(), "derived_version": 0}
+    schema.add_rows(connection, schema.site, [row])
 
 
 def list_flights(connection: Connection) -> list[FlightEntry]:
@@ -249,7 +270,8 @@ def _named(row: Row[Any], record: Any, *without: str) -> dict[str, Any]:
 def list_versions(connection: Connection) -> list[VersionEntry]:
     """Every version, oldest first."""
     tiles = func.count(schema.version_tiles.c.sha256)
-    flown_ns = {row.version_id: row.first_ns for row in connection.execute(select(schema.flown))}
+    flown = schema.checked_rows(connection, schema.flown, select(schema.flown))
+    flown_ns = {row.version_id: row.first_ns for row in flown}
     compressions = _compressions(connection)
     rows = connection.execute(
         select(schema.versions, tiles.label("tiles"))
@@ -291,8 +313,9 @@ def newest_version(connection: Connection, *, complete: bool = True) -> int:
 
 def tile_hashes(connection: Connection, version_id: int) -> dict[TileIndex, str]:
     """SHA-256 of every tile of a version; empty for a version that does not exist."""
-    rows = connection.execute(
-        select(schema.version_tiles).where(schema.version_tiles.c.version_id == version_id)
+    tiles = schema.version_tiles
+    rows = schema.checked_rows(
+        connection, tiles, select(tiles).where(tiles.c.version_id == version_id)
     )
     return {(row.tile_column, row.tile_row): row.sha256 for row in rows}
 
@@ -375,11 +398,9 @@ def begin_run(
         },
     )
     tiles = schema.version_tiles
-    base = select(literal(version_id), tiles.c.tile_column, tiles.c.tile_row, tiles.c.sha256)
-    columns = list(tiles.c.keys())
-    connection.execute(
-        insert(tiles).from_select(columns, base.where(tiles.c.version_id == base_id))
-    )
+    _, *columns = tiles.c
+    base = select(literal(version_id), *columns).where(tiles.c.version_id == base_id)
+    connection.execute(insert(tiles).from_select(tiles.c.keys(), base))
     return run_id, version_id
 
 
@@ -402,8 +423,7 @@ def change_tiles(
         for (column, row), sha256 in changed.items()
         if sha256 is not None
     ]
-    if painted:
-        connection.execute(insert(tiles), painted)
+    schema.add_rows(connection, tiles, painted)
 
 
 def complete_run(
@@ -447,13 +467,11 @@ def complete_run(
     )
     if flown_ns is not None:
         first_ns, last_ns = flown_ns
-        connection.execute(
-            insert(schema.flown).values(version_id=version_id, first_ns=first_ns, last_ns=last_ns)
-        )
-    if keyframes:
-        connection.execute(
-            insert(schema.keyframes), [_row_of(keyframe, run_id) for keyframe in keyframes]
-        )
+        row = {"version_id": version_id, "first_ns": first_ns, "last_ns": last_ns}
+        schema.add_rows(connection, schema.flown, [row])
+    schema.add_rows(
+        connection, schema.keyframes, [_row_of(keyframe, run_id) for keyframe in keyframes]
+    )
     if documents:
         connection.execute(
             insert(schema.documents),
@@ -512,8 +530,35 @@ def run_ids(connection: Connection) -> dict[str, set[int]]:
 def load_keyframes(connection: Connection, flight_id: str | None) -> list[StoredKeyframe]:
     """Keyframes of complete runs by flight rank and index, of one flight when its id is given."""
     query = schema.of_complete_runs(schema.keyframes, flight_id)
-    rows = connection.execute(query.order_by(schema.keyframes.c.frame_index))
+    rows = schema.checked_rows(
+        connection, schema.keyframes, query.order_by(schema.keyframes.c.frame_index)
+    )
     return [_keyframe_of(row) for row in rows]
+
+
+def file_hashes(connection: Connection) -> dict[str, str]:
+    """SHA-256 of the site's files, keyframes and tiles apart, by path."""
+    return {row.path: row.sha256 for row in connection.execute(select(schema.files))}
+
+
+def file_hash(connection: Connection, path: str) -> str:
+    """SHA-256 of one of the site's files; "" where it is not known."""
+    query = select(schema.files.c.sha256).where(schema.files.c.path == path)
+    return connection.execute(query).scalar_one_or_none() or ""
+
+
+def forget_files(connection: Connection, paths: Collection[str]) -> None:
+    """Forget the SHA-256 of these files, and of all in these folders."""
+    path = schema.files.c.path
+    inside = (path.startswith(f"{each}/", autoescape=True) for each in paths)
+    connection.execute(delete(schema.files).where(or_(path.in_(paths), *inside)))
+
+
+def note_files(connection: Connection, hashes: Mapping[str, str]) -> None:
+    """Note the SHA-256 of files, by path, that have none."""
+    if hashes:
+        rows = [{"path": path, "sha256": sha256} for path, sha256 in hashes.items()]
+        connection.execute(insert(schema.files), rows)
 
 
 @dataclass(frozen=True)
@@ -582,10 +627,13 @@ def _inserted(connection: Connection, table: Table, values: Mapping[str, Any]) -
 def _row_of(keyframe: StoredKeyframe, run_id: int) -> dict[str, Any]:
     camera, pose = asdict(keyframe.camera), keyframe.site_from_camera
     del camera["distortion"]
-    alike = ("name", "time_ns", "status", "image_path", "site_from_image", "gains", "vignette")
+    alike = ("name", "time_ns", "status", "image_path", "sha256", "site_from_image", "gains")
     return {
         **plain_json(
-            {name: getattr(keyframe, name) for name in (*alike, "sigma_m", "residual_px")}
+            {
+                name: getattr(keyframe, name)
+                for name in (*alike, "vignette", "sigma_m", "residual_px")
+            }
         ),
         "run_id": run_id,
         "frame_index": keyframe.index,
@@ -596,19 +644,19 @@ def _row_of(keyframe: StoredKeyframe, run_id: int) -> dict[str, Any]:
 
 
 def _keyframe_of(row: Row[Any]) -> StoredKeyframe:
-    with reading_rows("keyframe"):
-        return StoredKeyframe(
-            row.flight_id,
-            row.frame_index,
-            row.name,
-            row.time_ns,
-            Status(row.status),
-            checked_image_path(row.image_path, row.flight_id),
-            Camera(**row.camera),
-            np.array(row.site_from_image, np.float64).reshape(3, 3),
-            Pose(row.rotation, row.translation_m) if row.rotation else None,
-            np.array(row.gains, np.float64),
-            np.nan if row.sigma_m is None else row.sigma_m,
-            np.nan if row.residual_px is None else row.residual_px,
-            np.array(row.vignette, np.float64),
-        )
+    return StoredKeyframe(
+        row.flight_id,
+        row.frame_index,
+        row.name,
+        row.time_ns,
+        Status(row.status),
+        checked_image_path(row.image_path, row.flight_id),
+        checked_sha256(row.sha256),
+        Camera(**row.camera),
+        np.array(row.site_from_image, np.float64).reshape(3, 3),
+        Pose(row.rotation, row.translation_m) if row.rotation else None,
+        np.array(row.gains, np.float64),
+        np.nan if row.sigma_m is None else row.sigma_m,
+        np.nan if row.residual_px is None else row.residual_px,
+        np.array(row.vignette, np.float64),
+    )

@@ -6,13 +6,13 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, Row, delete, func, insert, select
+from sqlalchemy import Connection, Row, delete, func, select
 
 from sorvolo.errors import StoreError
 from sorvolo.geometry.arrays import Floats, PointsM, frozen
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.site import schema
-from sorvolo.store.site.catalogue import reading_rows, utc_now
+from sorvolo.store.site.catalogue import utc_now
 from sorvolo.store.site.names import checked_name, is_plain_name
 from sorvolo.survey.findings import Change, ChangeFacts, ChangeKind, HeightChange, Verdict
 
@@ -106,11 +106,9 @@ def add_comparison(
             f"another flight of this site has a change {min(taken)!r} already; ids must differ"
         )
     kinds = {kind.value: sum(each.kind is kind for each in changes) for kind in ChangeKind}
-    connection.execute(
-        insert(schema.comparisons).values(version_id=version_id, run_id=run_id, kinds=kinds)
-    )
-    if changes:
-        connection.execute(insert(schema.changes), [_row_of(each, run_id) for each in changes])
+    row = {"version_id": version_id, "run_id": run_id, "kinds": kinds}
+    schema.add_rows(connection, schema.comparisons, [row])
+    schema.add_rows(connection, schema.changes, [_row_of(each, run_id) for each in changes])
 
 
 def known_ids(connection: Connection, ids: Iterable[str]) -> set[str]:
@@ -134,27 +132,26 @@ def load_changes(connection: Connection, flight_id: str | None = None) -> list[S
     query = schema.of_complete_runs(schema.changes, flight_id)
     query = query.order_by(schema.changes.c.number, schema.changes.c.id)
     reviews = {review.change_id: review for review in load_reviews(connection)}
-    return [_change_of(row, reviews.get(row.id)) for row in connection.execute(query)]
+    rows = schema.checked_rows(connection, schema.changes, query)
+    return [_change_of(row, reviews.get(row.id)) for row in rows]
 
 
 def load_reviews(connection: Connection) -> list[StoredReview]:
     """All reviews, oldest first."""
-    rows = connection.execute(
-        select(schema.reviews).order_by(schema.reviews.c.at_utc, schema.reviews.c.change_id)
-    )
-    with reading_rows("review"):
-        return [
-            StoredReview(
-                row.change_id,
-                row.flight_id,
-                Verdict(row.verdict),
-                row.at_utc,
-                row.note,
-                ChangeKind(row.kind),
-                _outline(row.outline_m),
-            )
-            for row in rows
-        ]
+    reviews = schema.reviews
+    query = select(reviews).order_by(reviews.c.at_utc, reviews.c.change_id)
+    return [
+        StoredReview(
+            row.change_id,
+            row.flight_id,
+            Verdict(row.verdict),
+            row.at_utc,
+            row.note,
+            ChangeKind(row.kind),
+            _outline(row.outline_m),
+        )
+        for row in schema.checked_rows(connection, reviews, query)
+    ]
 
 
 def put_reviews(
@@ -162,19 +159,20 @@ def put_reviews(
 ) -> None:
     """Give each of these changes the same verdict; an earlier one is replaced."""
     now = utc_now()
-    for each in changes:
-        connection.execute(delete(schema.reviews).where(schema.reviews.c.change_id == each.id))
-        connection.execute(
-            insert(schema.reviews).values(
-                change_id=each.id,
-                flight_id=each.flight_id,
-                verdict=verdict.value,
-                at_utc=now,
-                note=note,
-                kind=each.kind.value,
-                outline_m=each.outline_m.tolist(),
-            )
-        )
+    drop_reviews(connection, changes)
+    rows = [
+        {
+            "change_id": each.id,
+            "flight_id": each.flight_id,
+            "verdict": verdict.value,
+            "at_utc": now,
+            "note": note,
+            "kind": each.kind.value,
+            "outline_m": each.outline_m.tolist(),
+        }
+        for each in changes
+    ]
+    schema.add_rows(connection, schema.reviews, rows)
 
 
 def drop_reviews(connection: Connection, changes: Sequence[StoredChange]) -> None:
@@ -185,7 +183,10 @@ def drop_reviews(connection: Connection, changes: Sequence[StoredChange]) -> Non
 
 def compared_versions(connection: Connection) -> dict[int, Mapping[str, int]]:
     """The versions that comparisons made: the number of changes of each kind."""
-    return {row.version_id: row.kinds for row in connection.execute(select(schema.comparisons))}
+    table = schema.comparisons
+    return {
+        row.version_id: row.kinds for row in schema.checked_rows(connection, table, select(table))
+    }
 
 
 def is_compared(connection: Connection, run_id: int) -> bool:
@@ -240,30 +241,29 @@ def _row_of(change: StoredChange, run_id: int) -> dict[str, Any]:
 
 
 def _change_of(row: Row[Any], review: StoredReview | None) -> StoredChange:
-    with reading_rows("change"):
-        values, crop = row.properties, CropPlace(**row.properties["crop"])
-        outline_m = _outline(values["outline_m"])
-        if not len(outline_m) or not crop.m_per_px > 0:
-            raise ValueError("no outline, or a picture without a scale")
-        sizes = ("area_m2", "length_m", "sigma_m", "sigma_in_map_m")
-        risen = values["height_change"]
-        is_reviewed = review is not None and outlines_meet(outline_m, review.outline_m)
-        return StoredChange(
-            **{
-                **values,
-                **{name: np.nan if values[name] is None else values[name] for name in sizes},
-                "id": checked_name(row.id, "change"),
-                "kind": ChangeKind(row.kind),
-                "outline_m": outline_m,
-                "velocity_m_s": frozen(values["velocity_m_s"]),
-                "height_change": None if risen is None else HeightChange(**risen),
-                "crop": crop,
-            },
-            flight_id=row.flight_id,
-            number=row.number,
-            verdict=review.verdict if review is not None and is_reviewed else None,
-            note=review.note if review is not None and is_reviewed else "",
-        )
+    values, crop = row.properties, CropPlace(**row.properties["crop"])
+    outline_m = _outline(values["outline_m"])
+    if not len(outline_m) or not crop.m_per_px > 0:
+        raise ValueError("no outline, or a picture without a scale")
+    sizes = ("area_m2", "length_m", "sigma_m", "sigma_in_map_m")
+    risen = values["height_change"]
+    is_reviewed = review is not None and outlines_meet(outline_m, review.outline_m)
+    return StoredChange(
+        **{
+            **values,
+            **{name: np.nan if values[name] is None else values[name] for name in sizes},
+            "id": checked_name(row.id, "change"),
+            "kind": ChangeKind(row.kind),
+            "outline_m": outline_m,
+            "velocity_m_s": frozen(values["velocity_m_s"]),
+            "height_change": None if risen is None else HeightChange(**risen),
+            "crop": crop,
+        },
+        flight_id=row.flight_id,
+        number=row.number,
+        verdict=review.verdict if review is not None and is_reviewed else None,
+        note=review.note if review is not None and is_reviewed else "",
+    )
 
 
 def _outline(rows: Any) -> PointsM:

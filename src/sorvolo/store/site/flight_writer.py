@@ -5,7 +5,7 @@ import shutil
 from collections.abc import Mapping, MutableMapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -30,7 +30,6 @@ from sorvolo.store.rasters.geotiff import parse_crs
 from sorvolo.store.site import catalogue as records
 from sorvolo.store.site import change_records, object_records
 from sorvolo.store.site.catalogue import StoredKeyframe
-from sorvolo.store.site.files import SiteFolder
 from sorvolo.store.site.tiles import GrowingTiles
 from sorvolo.store.site.upkeep import (
     STAGED_FOLDERS,
@@ -43,6 +42,9 @@ from sorvolo.survey.findings import Change
 from sorvolo.survey.map_objects import ObjectSearch
 from sorvolo.survey.mosaic import PlacedFrame, Status
 
+if TYPE_CHECKING:
+    from sorvolo.store.site.archive import Archive
+
 
 class FlightWriter:
     """A flight on its way into the site; a context manager. Without `commit` the site stays as it was.
@@ -54,7 +56,7 @@ class FlightWriter:
 
     def __init__(
         self,
-        files: SiteFolder,
+        files: "Archive",
         flight_id: str,
         run_id: int,
         version_id: int,
@@ -66,9 +68,7 @@ class FlightWriter:
         self._flight_id, self._run_id, self._version_id = flight_id, run_id, version_id
         self._sizes: dict[str, tuple[int, int]] = {}  # path of each saved image: width, height
         self._sha256: dict[int, str] = {}  # of each saved image, by frame index
-        self._cache = ImageCache(
-            lambda index: files.stored_image(flight_id, self._image_path(index)), cache_bytes
-        )
+        self._cache = ImageCache(lambda index: self.small_image(index, 1), cache_bytes)
         self._boxes: dict[str, list[list[int]]] = {}  # of each mask saved
         self._is_open = True
 
@@ -144,6 +144,7 @@ class FlightWriter:
             frame.time_ns,
             frame.status,
             image_path,
+            self._sha256[frame.index],
             camera.resized(width_px, height_px),
             frame.site_from_image @ frame_from_stored,
             frame.site_from_camera,
@@ -188,7 +189,11 @@ class FlightWriter:
 
     def small_image(self, index: int, step: int) -> ImageRGB:
         """A keyframe saved earlier at a `step`-th (1, 2, 4, 8) of its size, rounded up."""
-        return self._files.stored_image(self._flight_id, self._image_path(index), step)
+        if index not in self._sha256:
+            raise StoreError(f"no image of frame {index} was saved; save it first")
+        return self._files.stored_image(
+            self._flight_id, self._image_path(index), self._sha256[index], step
+        )
 
     def save_masks(self, frame_name: str, changed: ImageGray, valid: Mask, boxes: Boxes) -> None:
         """Store one view's mask and boxes (N, 4), to appear as masks/<frame>.png and in masks/boxes.json on commit.

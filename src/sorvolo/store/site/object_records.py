@@ -5,11 +5,10 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, insert, select
+from sqlalchemy import Connection, select
 
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.site import schema
-from sorvolo.store.site.catalogue import reading_rows
 from sorvolo.store.site.names import checked_name
 from sorvolo.survey.map_objects import MapObject, ObjectSearch, SearchedFrames, looked_at
 
@@ -40,39 +39,40 @@ class StoredObject:
 def add_search(connection: Connection, run_id: int, search: ObjectSearch) -> None:
     """Note that this run's frames were searched for objects, and what was found."""
     searched_for = search.frames.searched_for
-    connection.execute(
-        insert(schema.searches).values(
-            run_id=run_id,
-            model=search.model,
-            outlines_m=np.round(search.frames.outlines_m, 3).tolist(),
-            searched_for=None
-            if searched_for is None
-            else {name: np.asarray(rows, int).tolist() for name, rows in searched_for.items()},
-        )
-    )
-    if search.objects:
-        connection.execute(
-            insert(schema.objects),
-            [
-                {"run_id": run_id, "number": number, "id": each.id, "properties": _properties(each)}
-                for number, each in enumerate(search.objects, start=1)
-            ],
-        )
+    row = {
+        "run_id": run_id,
+        "model": search.model,
+        "outlines_m": np.round(search.frames.outlines_m, 3).tolist(),
+        "searched_for": None
+        if searched_for is None
+        else {name: np.asarray(rows, int).tolist() for name, rows in searched_for.items()},
+    }
+    schema.add_rows(connection, schema.searches, [row])
+    names = [each.name for each in fields(MapObject) if each.name not in ("id", "crop_jpeg")]
+    rows = [
+        {
+            "run_id": run_id,
+            "number": number,
+            "id": each.id,
+            "properties": plain_json({name: getattr(each, name) for name in names}),
+        }
+        for number, each in enumerate(search.objects, start=1)
+    ]
+    schema.add_rows(connection, schema.objects, rows)
 
 
 def load_searches(connection: Connection) -> list[StoredSearch]:
     """The searches of complete runs, by flight rank."""
-    rows = connection.execute(schema.of_complete_runs(schema.searches))
-    with reading_rows("search"):
-        return [
-            StoredSearch(
-                row.flight_id,
-                row.rank,
-                row.model,
-                _frames_of(row.outlines_m, row.searched_for),
-            )
-            for row in rows
-        ]
+    query = schema.of_complete_runs(schema.searches)
+    return [
+        StoredSearch(
+            row.flight_id,
+            row.rank,
+            row.model,
+            _frames_of(row.outlines_m, row.searched_for),
+        )
+        for row in schema.checked_rows(connection, schema.searches, query)
+    ]
 
 
 def load_objects(connection: Connection, flight_id: str | None = None) -> list[StoredObject]:
@@ -80,7 +80,7 @@ def load_objects(connection: Connection, flight_id: str | None = None) -> list[S
     query = schema.of_complete_runs(schema.objects, flight_id).order_by(schema.objects.c.number)
     return [
         StoredObject(row.flight_id, row.rank, _object_of(row.id, row.properties), (row.flight_id,))
-        for row in connection.execute(query)
+        for row in schema.checked_rows(connection, schema.objects, query)
     ]
 
 
@@ -132,16 +132,9 @@ def _since(found: StoredObject, before: Sequence[StoredObject]) -> StoredObject:
     return found
 
 
-def _properties(thing: MapObject) -> dict[str, Any]:
-    names = (each.name for each in fields(MapObject) if each.name not in ("id", "crop_jpeg"))
-    properties: dict[str, Any] = plain_json({name: getattr(thing, name) for name in names})
-    return properties
-
-
 def _object_of(object_id: str, values: dict[str, Any]) -> MapObject:
-    with reading_rows("object"):
-        lengths = {
-            name: np.nan if values[name] is None else values[name]
-            for name in ("sigma_m", "length_m", "width_m")
-        }
-        return MapObject(checked_name(object_id, "object"), **{**values, **lengths})
+    lengths = {
+        name: np.nan if values[name] is None else values[name]
+        for name in ("sigma_m", "length_m", "width_m")
+    }
+    return MapObject(checked_name(object_id, "object"), **{**values, **lengths})

@@ -1,6 +1,8 @@
 """The tables of the catalogue, the same in SQLite and in PostgreSQL, and the number of its format."""
 
-from collections.abc import Sequence
+import json
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from sqlalchemy import (
@@ -15,13 +17,16 @@ from sqlalchemy import (
     Integer,
     LargeBinary,
     MetaData,
+    Row,
+    RowMapping,
+    Select,
     Table,
     insert,
     select,
 )
 from sqlalchemy import String as AnyString
 
-FORMAT = 1
+FORMAT = 2
 """A catalogue of another format is refused."""
 
 # ordered by bytes, as SQLite does
@@ -45,6 +50,11 @@ def number(name: str = "id") -> Column[Any]:
     return Column(name, Integer, primary_key=True, autoincrement=False)
 
 
+def sealed() -> Column[Any]:
+    """A checksum of the row, by which a damaged one is known."""
+    return known("seal", BigInteger)
+
+
 def owner(name: str, target: str, **options: Any) -> Column[Any]:
     """A reference to the row that this one goes with."""
     return Column(name, ForeignKey(target, ondelete="CASCADE"), **options)
@@ -65,6 +75,7 @@ site = Table(
     known("is_local", Boolean),
     text("created_utc"),
     known("derived_version", Integer),  # the version in mosaic.tif and its kin; 0: none
+    sealed(),
 )
 flights = Table(
     "flights",
@@ -96,6 +107,7 @@ keyframes = Table(
     known("time_ns", Nanoseconds),
     text("status"),
     text("image_path"),
+    text("sha256"),  # of the image's bytes
     known("camera", JSON),  # width_px, height_px, fx_px, fy_px, cx_px, cy_px
     known("site_from_image", JSON),  # (3, 3)
     known("rotation", JSON),  # (3, 3) site_from_camera, [] when unknown
@@ -104,6 +116,7 @@ keyframes = Table(
     known("vignette", JSON),
     Column("sigma_m", Float),  # NULL when unknown
     Column("residual_px", Float),
+    sealed(),
 )
 documents = Table(
     "documents",
@@ -111,6 +124,12 @@ documents = Table(
     owner("run_id", "runs.id", primary_key=True),
     Column("name", String, primary_key=True),
     known("content", LargeBinary),  # b"": the file is on the disk
+)
+files = Table(
+    "files",
+    metadata,  # the other files of the site, less those that are being written
+    Column("path", String, primary_key=True),
+    text("sha256"),
 )
 leftovers = Table(
     "leftovers",
@@ -136,6 +155,7 @@ version_tiles = Table(
     Column("tile_column", Integer, primary_key=True),
     Column("tile_row", Integer, primary_key=True),
     text("sha256"),
+    sealed(),
 )
 Index("version_tiles_by_content", version_tiles.c.sha256)
 comparisons = Table(
@@ -144,6 +164,7 @@ comparisons = Table(
     owner("version_id", "versions.id", primary_key=True),
     known("run_id", Integer),
     known("kinds", JSON),  # kind -> number of changes
+    sealed(),
 )
 changes = Table(
     "changes",
@@ -153,6 +174,7 @@ changes = Table(
     known("number", Integer),
     text("kind"),
     known("properties", JSON),
+    sealed(),
 )
 Index("changes_by_run", changes.c.run_id)
 reviews = Table(
@@ -165,6 +187,7 @@ reviews = Table(
     text("note"),
     text("kind"),
     known("outline_m", JSON),
+    sealed(),
 )
 searches = Table(
     "searches",
@@ -173,6 +196,7 @@ searches = Table(
     text("model"),
     known("outlines_m", JSON),  # (N, 4, 2) of the frames that were looked at
     Column("searched_for", JSON),  # class -> (N,) 0 or 1; null: each frame for every class
+    sealed(),
 )
 objects = Table(
     "objects",
@@ -181,6 +205,7 @@ objects = Table(
     Column("number", Integer, primary_key=True),
     text("id"),
     known("properties", JSON),
+    sealed(),
 )
 flown = Table(
     "flown",
@@ -188,6 +213,7 @@ flown = Table(
     owner("version_id", "versions.id", primary_key=True),
     known("first_ns", Nanoseconds),  # UTC; from 1970 on where no clock has a date
     known("last_ns", Nanoseconds),
+    sealed(),
 )
 numbers_metadata = MetaData()
 numbers = Table(
@@ -199,6 +225,34 @@ numbers = Table(
 )
 NUMBERED = ("runs", "versions")
 WRITES = "writes"
+# of a row with a seal: a version's tiles are copied for the next one, and the map's files follow its newest version
+_UNSEALED = ("seal", "version_id", "derived_version")
+
+
+def add_rows(connection: Connection, table: Table, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Insert rows, each with its seal."""
+    if rows:
+        connection.execute(insert(table), [{**row, "seal": seal_of(table, row)} for row in rows])
+
+
+def checked_rows(connection: Connection, table: Table, query: Select[Any]) -> Iterator[Row[Any]]:
+    """Yield the rows of a query that selects all columns of `table`. Raises ValueError for one that is damaged."""
+    for row in connection.execute(query):
+        if "seal" in table.c and row.seal != seal_of(table, row._mapping):
+            raise ValueError(f"a row of {table.name!r} is not as it was written")
+        yield row
+
+
+def seal_of(table: Table, row: Mapping[str, Any] | RowMapping) -> int:
+    """Return the checksum of a row's values."""
+    values = [
+        float(row[column.name])
+        if isinstance(column.type, Float) and row[column.name] is not None
+        else row[column.name]
+        for column in table.columns
+        if column.name not in _UNSEALED
+    ]
+    return zlib.crc32(json.dumps(values, sort_keys=True).encode())
 
 
 def make_tables(connection: Connection) -> None:

@@ -2,11 +2,13 @@
 
 import os
 import shutil
+import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from sorvolo.errors import SorvoloWarning
 from sorvolo.geometry.arrays import ImageRGBA
 from sorvolo.geometry.grid import TileIndex
 from sorvolo.store.atomic import (
@@ -17,27 +19,31 @@ from sorvolo.store.atomic import (
     writing,
 )
 from sorvolo.store.exports.change_files import change_placemarks, changes_geojson, crop_names
+from sorvolo.store.exports.ground_files import COVERAGE
 from sorvolo.store.exports.map_pictures import Picture, pictures, small_map_of, write_small_maps
 from sorvolo.store.exports.object_files import CROPS, OBJECTS, object_placemarks, objects_geojson
 from sorvolo.store.exports.placemarks import Placemark, gpx_bytes, kml_bytes
 from sorvolo.store.exports.plain import features_name, features_path, geojson_bytes
 from sorvolo.store.images import rgba_from_png
-from sorvolo.store.nofollow import read_below
 from sorvolo.store.pages.changes import changes_page
 from sorvolo.store.rasters.geotiff import write_cog
 from sorvolo.store.site import catalogue as records
 from sorvolo.store.site import change_records, object_records
 from sorvolo.store.site.catalogue import OwedFiles, VersionEntry
-from sorvolo.store.site.files import JOURNAL, STAGED, SiteFolder
+from sorvolo.store.site.files import JOURNAL, STAGED, DamagedError
 from sorvolo.store.site.journal import is_journal_after
-from sorvolo.store.site.object_records import StoredObject, StoredSearch
+from sorvolo.store.site.object_records import StoredObject
+
+if TYPE_CHECKING:
+    from sorvolo.store.site.archive import Archive
 
 STAGED_FOLDERS = ("changes", "masks", CROPS)
 # of the map in changes.html; daily flights without change should cost little
 _PICTURE_PX, _UNCHANGED_PX = 1600, 800
+_ENDINGS = (".geojson", ".json", ".kml", ".gpx")  # of lists of places
 
 
-def repair(files: SiteFolder) -> None:
+def repair(files: "Archive") -> None:
     """Write the derived files that a killed process had not yet written, and those of the map that were deleted.
 
     Raises StoreError on a full disk; what the catalogue holds stays true.
@@ -49,12 +55,15 @@ def repair(files: SiteFolder) -> None:
     with ThreadPoolExecutor(1, thread_name_prefix="map files") as other:
         waiting: list[Future[None]] = []
         if newest is not None and not _is_shown(files, newest, shown):
-            waiting.append(other.submit(write_map_files, files, newest))
+            waiting.append(other.submit(_write_map_files, files, newest))
         for each in owed:
             _write_flight_files(files, each)
         searches = files.catalogue_rows(object_records.load_searches)
         if owed or bool(searches) != features_path(files.folder, OBJECTS).is_file():
-            _write_site_objects(files, searches)
+            # the newest of each place; none where no flight was ever searched
+            newest_of_each = object_records.newest_objects(files.objects(), searches)
+            with files.replacing(*(f"{OBJECTS}{ending}" for ending in _ENDINGS)):
+                _write_objects(files, files.folder, newest_of_each if searches else None)
         for written in waiting:
             written.result()
     if newest is None:
@@ -63,7 +72,7 @@ def repair(files: SiteFolder) -> None:
         records.mark_written(connection, [each.run_id for each in owed], newest.id)
 
 
-def _is_shown(files: SiteFolder, newest: VersionEntry, shown: int) -> bool:
+def _is_shown(files: "Archive", newest: VersionEntry, shown: int) -> bool:
     """Whether the map's files are there and are those of the newest version, or would be the same."""
     if newest.id != shown:
         written_as = {each.id: (each.export_crs, each.compress) for each in files.versions()}
@@ -73,10 +82,10 @@ def _is_shown(files: SiteFolder, newest: VersionEntry, shown: int) -> bool:
             return False
     paths = [files.preview_path, files.mosaic_path]
     paths += [] if files.site().is_local else [files.kmz_path]
-    return not newest.tiles or all(path.is_file() for path in paths)
+    return not newest.tiles or all(path.is_file() and files.is_sound(path.name) for path in paths)
 
 
-def forget_unfinished(files: SiteFolder) -> None:
+def forget_unfinished(files: "Archive") -> None:
     """Drop runs that never committed, then every file that nothing refers to.
 
     The journal of a run that was killed stays, and its pictures, as long as the map is the one that it began over.
@@ -91,7 +100,7 @@ def forget_unfinished(files: SiteFolder) -> None:
     remove_unused(files)
 
 
-def remove_unused(files: SiteFolder) -> None:
+def remove_unused(files: "Archive") -> None:
     """Delete tiles and pictures that nothing in the catalogue refers to, and what killed processes left."""
     with files.catalogue.reading() as connection:
         runs, used = records.run_ids(connection), records.used_hashes(connection)
@@ -110,14 +119,14 @@ def remove_unused(files: SiteFolder) -> None:
         _remove_unused_pictures(flight, {str(run_id) for run_id in runs.get(flight.name, set())})
 
 
-def forget_journals(files: SiteFolder, kept: Path | None = None) -> None:
+def forget_journals(files: "Archive", kept: Path | None = None) -> None:
     """Delete the journals of runs that were killed, all but `kept`, which continues: the site changes."""
     for flight in files.flight_folders():
         if flight / JOURNAL != kept:
             (flight / JOURNAL).unlink(missing_ok=True)
 
 
-def stopped_flights(files: SiteFolder) -> list[str]:
+def stopped_flights(files: "Archive") -> list[str]:
     """The flights whose runs were stopped before they were complete."""
     return [each.name for each in files.flight_folders() if (each / JOURNAL).is_file()]
 
@@ -132,30 +141,40 @@ def _remove_unused_pictures(flight: Path, known_runs: set[str]) -> None:
             emptied.rmdir()
 
 
-def _write_flight_files(files: SiteFolder, owed: OwedFiles) -> None:
+def _write_flight_files(files: "Archive", owed: OwedFiles) -> None:
     folder = files.flight_folder(owed.flight_id)
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    for name, content in owed.documents.items():
-        if content:
-            atomic_write_bytes(files.document_path(owed.flight_id, name), content)
-    for name in owed.leftovers:
-        files.document_path(owed.flight_id, name).unlink(missing_ok=True)
-    take_staged(folder, owed.run_id)
+    contents = {name: content for name, content in owed.documents.items() if content}
+    for name in (*contents, *owed.leftovers):
+        files.document_path(owed.flight_id, name)  # refuses one that could lie elsewhere
     with files.catalogue.reading() as connection:
         is_compared = change_records.is_compared(connection, owed.run_id)
         is_searched = object_records.is_searched(connection, owed.run_id)
-    version = next(
-        (each for each in files.versions() if each.run_id == owed.run_id and is_compared), None
-    )
-    write_change_files(files, owed.flight_id, version)
-    found = (
-        files.catalogue_rows(object_records.load_objects, owed.flight_id) if is_searched else None
-    )
-    _write_objects(files, folder, found)
+    staged = folder / STAGED / str(owed.run_id)
+    lists = (f"{name}{ending}" for name in ("changes", OBJECTS) for ending in _ENDINGS)
+    pictures = (name for name in STAGED_FOLDERS if (staged / name).is_dir())
+    names = (*contents, *owed.leftovers, *lists, "changes.html", *pictures)
+    with files.replacing(*(f"flights/{owed.flight_id}/{name}" for name in names)):
+        for name, content in contents.items():
+            atomic_write_bytes(folder / name, content)
+        for name in owed.leftovers:
+            (folder / name).unlink(missing_ok=True)
+        take_staged(folder, owed.run_id)
+        version = next(
+            (each for each in files.versions() if each.run_id == owed.run_id and is_compared), None
+        )
+        write_change_files(files, owed.flight_id, version)
+        _write_objects(files, folder, files.objects(owed.flight_id) if is_searched else None)
 
 
-def write_map_files(files: SiteFolder, version: VersionEntry) -> None:
+def _write_map_files(files: "Archive", version: VersionEntry) -> None:
+    paths = (files.preview_path, files.mosaic_path, files.kmz_path)
+    with files.replacing(*(path.name for path in paths)):
+        write_map_files(files, version)
+
+
+def write_map_files(files: "Archive", version: VersionEntry) -> None:
     """Write mosaic.tif, preview.png and mosaic.kmz of a version; remove them when it has no tiles."""
     tiles = files.version_tiles(version.id)
     if not tiles:
@@ -216,7 +235,7 @@ def take_staged(flight_folder: Path, run_id: int) -> None:
     shutil.rmtree(flight_folder / STAGED, ignore_errors=True)
 
 
-def write_change_files(files: SiteFolder, flight_id: str, version: VersionEntry | None) -> None:
+def write_change_files(files: "Archive", flight_id: str, version: VersionEntry | None) -> None:
     """Write changes.geojson and changes.html of a flight; remove them when `version` is None: it was not compared.
 
     `version` is the map that the comparison made. The page shows what report.json in the flight's folder holds.
@@ -246,21 +265,14 @@ def write_change_files(files: SiteFolder, flight_id: str, version: VersionEntry 
         after,
         site,
         crops,
-        coverage=files.coverage(flight_id),
+        coverage=files.features(f"flights/{flight_id}", COVERAGE),
         before_words=_words_of(made.get(version.parent_id)),
         after_words=_words_of(version),
     )
     atomic_write_bytes(folder / "changes.html", page.encode())
 
 
-def _write_site_objects(files: SiteFolder, searches: Sequence[StoredSearch]) -> None:
-    """Write objects.geojson of the site, the newest of each place; remove it when no flight was ever searched."""
-    found = files.catalogue_rows(object_records.load_objects)
-    newest = object_records.newest_objects(found, searches) if searches else None
-    _write_objects(files, files.folder, newest)
-
-
-def _write_objects(files: SiteFolder, folder: Path, found: Sequence[StoredObject] | None) -> None:
+def _write_objects(files: "Archive", folder: Path, found: Sequence[StoredObject] | None) -> None:
     """Write objects.geojson of a flight's folder or the site's; remove it where nothing was searched for."""
     if found is None:
         _remove_list(folder, OBJECTS)
@@ -288,17 +300,13 @@ def _write_list(
 
 
 def _remove_list(folder: Path, name: str, but: str = "") -> None:
-    for file in (
-        f"{name}.geojson",
-        f"{name}.json",
-        *((f"{name}.kml", f"{name}.gpx") if not but else ()),
-    ):
-        if file != but:
+    for ending in _ENDINGS[: 2 if but else None]:
+        if (file := f"{name}{ending}") != but:
             (folder / file).unlink(missing_ok=True)
 
 
 def _before_and_after(
-    files: SiteFolder, version: VersionEntry, most_px: int
+    files: "Archive", version: VersionEntry, most_px: int
 ) -> tuple[Picture | None, Picture | None]:
     """The map before the version and with it, on the same ground; None where neither has a tile."""
     maps = [files.version_tiles(version.parent_id), files.version_tiles(version.id)]
@@ -322,9 +330,12 @@ def _words_of(version: VersionEntry | None) -> tuple[str, str]:
     return f"version {version.id}: flight {version.flight_id},", date
 
 
-def _crop(files: SiteFolder, name: str) -> ImageRGBA | None:
-    """One picture of a change; None for one that is gone."""
+def _crop(files: "Archive", name: str) -> ImageRGBA | None:
+    """One picture of a change; None for one that is gone or damaged."""
     try:
-        return rgba_from_png(read_below(files.folder, name), str(files.folder / name))
+        return rgba_from_png(files.read_file(name), str(files.folder / name))
     except FileNotFoundError:
+        return None
+    except DamagedError as error:
+        warnings.warn(f"{error}; it is left out", SorvoloWarning, stacklevel=2)
         return None
