@@ -1,6 +1,7 @@
 """`sorvolo reproduce`: the experiments of the thesis's chapter 4, on the UMCD dataset or a simulated one."""
 
 import json
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,6 +24,14 @@ if TYPE_CHECKING:
 
 _DEFAULT_OUT = Path("reproduction")
 
+
+class Schedule(StrEnum):
+    """How the networks of Table 4.6 learn."""
+
+    JOINT = "joint"
+    FOUR_STEPS = "four-steps"
+
+
 Dataset = Annotated[
     Path | None, typer.Argument(help="The UMCD dataset's folder, in the thesis's layout.")
 ]
@@ -44,6 +53,9 @@ TrainSteps = Annotated[int, typer.Option(help="Steps of each network of Table 4.
 NetworkPreset = Annotated[
     Preset, typer.Option(help="Network of Table 4.6: fast, accurate, or the thesis's own.")
 ]
+NetworkSchedule = Annotated[
+    Schedule, typer.Option(help="How Table 4.6 is trained: joint, or the thesis's four steps.")
+]
 
 
 def reproduce(
@@ -56,6 +68,7 @@ def reproduce(
     npu: Npu = None,
     train_steps: TrainSteps = 400,
     preset: NetworkPreset = Preset.FAST,
+    schedule: NetworkSchedule = Schedule.JOINT,
     as_json: AsJson = False,
 ) -> None:
     """Repeat the thesis's experiments of chapter 4: Tables 4.1, 4.3 to 4.6 and the figures, beside the printed ones.
@@ -75,7 +88,9 @@ def reproduce(
     )
     from sorvolo.lab.thesis.settings import quick as quick_sizes
 
-    settings = ReproductionSettings(videos, detector=DetectorSettings(train_steps, preset.value))
+    settings = ReproductionSettings(
+        videos, detector=DetectorSettings(train_steps, preset.value, schedule=schedule.value)
+    )
     simulation = SimulatedSize()
     if quick:
         settings, simulation = quick_sizes(settings, simulation)

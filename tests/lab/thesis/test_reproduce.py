@@ -16,7 +16,9 @@ from sorvolo.errors import InputError, SettingsError
 from sorvolo.lab.evaluation.change_metrics import Counts
 from sorvolo.lab.evaluation.mask_folders import frames_against_times
 from sorvolo.lab.simulation.flight_files import write_mask
-from sorvolo.lab.thesis.published import TABLE_4_3
+from sorvolo.lab.thesis.comparisons import TABLE, _judged, _times_of
+from sorvolo.lab.thesis.detectors import okutama_labels
+from sorvolo.lab.thesis.published import APPEARANCES, TABLE_4_3
 from sorvolo.lab.thesis.report import MARKDOWN, NUMBERS, PAGE, write_reproduction
 from sorvolo.lab.thesis.rows import Row
 from sorvolo.lab.thesis.run import ReproductionUpdate, _Work, reproduce
@@ -30,7 +32,8 @@ from sorvolo.lab.thesis.sheets import reproduction_sheets
 from sorvolo.lab.thesis.simulated import simulated_dataset
 from sorvolo.lab.thesis.tables import tables_of
 from sorvolo.lab.thesis.umcd import read_umcd_metadata
-from sorvolo.lab.thesis.umcd_folder import CHANGES, MOSAICKING, WITH, read_umcd_folder
+from sorvolo.lab.thesis.umcd_folder import CHANGES, MOSAICKING, WITH, UmcdVideo, read_umcd_folder
+from sorvolo.lab.thesis.video_input import VideoInput
 
 SETTINGS, SIZE = quick(
     ReproductionSettings(views_per_second=2.5, detector=DetectorSettings(steps=0)),
@@ -227,6 +230,44 @@ def test_times_of_appearance_judge_frames_where_there_are_no_masks(
     write_mask(masks / f"{frame}.png", np.full((4, 6), changed, np.uint8))
     (judged,) = frames_against_times(masks, stated.shows_object)
     assert judged.frame == Counts(**{counted: 1})
+
+
+def test_metadata_without_times_is_judged_by_table_2_4_where_the_video_is_its(
+    tmp_path: Path,
+) -> None:
+    """The metadata has what chapter 2 lists, no more."""
+    metadata = tmp_path / "path2.txt"
+    metadata.write_text(
+        "Object 1\nType: Suitcase\nShape: rectangular\nDimension: 50\nColor: same\n"
+    )
+    truth = UmcdVideo("Countryside", "path2", tmp_path / "path2.mp4", metadata=metadata)
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    write_mask(masks / "550.png", np.full((4, 6), 255, np.uint8))  # at 22 s: object 2
+    write_mask(masks / "375.png", np.full((4, 6), 255, np.uint8))  # at 15 s: none
+    own, another = (
+        VideoInput(truth.video, None, None, 25.0, length_s, (640, 480)) for length_s in (47.2, 60.0)
+    )
+    judged_by, judged = _judged(masks, truth, _times_of(truth, own), own.fps)
+    assert (judged_by, sum((each.frame for each in judged), Counts())) == (
+        TABLE,
+        Counts(tp=1, fp=1),
+    )
+    with pytest.raises(InputError, match="states for no compared frame"):
+        _judged(masks, truth, _times_of(truth, another), another.fps)
+    frames = sum(each[0] for each in APPEARANCES.values())
+    assert (len(APPEARANCES), frames) == (11, 585)
+
+
+def test_okutama_is_split_by_its_own_folders_where_it_has_them(tmp_path: Path) -> None:
+    assert okutama_labels(tmp_path).split == "20% held out"
+    for name in ("TrainSetFrames", "TestSetFrames"):
+        (tmp_path / name).mkdir()
+    labels = okutama_labels(tmp_path)
+    assert (labels.place.name, labels.split) == (
+        "TrainSetFrames",
+        "the publisher's test folder (TestSetFrames)",
+    )
 
 
 def test_missing_and_broken_files_cost_their_rows_alone(dataset: Path, tmp_path: Path) -> None:

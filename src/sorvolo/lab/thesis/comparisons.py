@@ -4,7 +4,7 @@ import math
 import os
 import shutil
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -22,8 +22,9 @@ from sorvolo.lab.evaluation.mask_folders import (
     frames_against_times,
 )
 from sorvolo.lab.thesis.changes import compare_thesis
+from sorvolo.lab.thesis.published import APPEARANCES
 from sorvolo.lab.thesis.settings import COMPARISONS, FIGURE_PX
-from sorvolo.lab.thesis.umcd import read_umcd_metadata
+from sorvolo.lab.thesis.umcd import UmcdMetadata, read_umcd_metadata
 from sorvolo.lab.thesis.umcd_folder import UmcdVideo
 from sorvolo.lab.thesis.video_input import VideoInput
 from sorvolo.missions.compare.flights import compare_flights
@@ -34,8 +35,10 @@ from sorvolo.store.images import jpeg_from_image
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.flight import Frame
 
-MASKS, TIMES = "change masks", "times of appearance"
-"""What a comparison is judged by: pixels and frames, or frames alone."""
+MASKS, TIMES, TABLE = "change masks", "times of appearance", "times of Table 2.4"
+"""What a comparison is judged by: pixels and frames, or frames alone, by the metadata or by the thesis."""
+
+_LENGTH_S = 1.5  # a video's length may differ from Table 2.4's, which has whole seconds
 
 
 def compare_video(
@@ -51,7 +54,7 @@ def compare_video(
     The map stays as it is: a copy in `scratch` is compared with. Raises InputError and StoreError as `compare_flights`,
     InputError where nothing states which frames show a change.
     """
-    _demand_truth(truth)
+    times = _times_of(truth, later)
     with writing(scratch):
         shutil.rmtree(scratch, ignore_errors=True)
         shutil.copytree(site, scratch)
@@ -66,7 +69,7 @@ def compare_video(
     updates = list(compare_flights([later.video], scratch, settings, **later.options))
     cpu_s = time.process_time() - started_cpu_s
     (masks,) = (scratch / "flights").glob("*/masks")
-    judged_by, judged = _judged(masks, truth, later.fps)
+    judged_by, judged = _judged(masks, truth, times, later.fps)
     values = {
         "judged_by": judged_by,
         "views": updates[-1].views,
@@ -122,27 +125,44 @@ def rates(counts: Counts) -> dict[str, float | None]:
     return {name: None if math.isnan(rate) else round(rate, 4) for name, rate in named.items()}
 
 
-def _demand_truth(truth: UmcdVideo) -> None:
-    if truth.masks is None and truth.metadata is None:
+def _times_of(truth: UmcdVideo, later: VideoInput) -> dict[str, UmcdMetadata]:
+    """When objects are in view, by what states it, the metadata first.
+
+    Raises InputError where there are no change masks either.
+    """
+    found = {} if truth.metadata is None else {TIMES: read_umcd_metadata(truth.metadata)}
+    length_s, in_view_s = APPEARANCES.get(truth.key, (0, ()))
+    if abs(later.length_s - length_s) <= _LENGTH_S:
+        found[TABLE] = UmcdMetadata(later.fps, in_view_s, frozenset())
+    if truth.masks is None and not found:
         raise InputError(
             f"{truth.video}: neither a folder of change masks ({truth.name}_masks) nor a metadata file lies beside it, "
-            "so what it shows cannot be judged"
+            f"and no video of its name and length ({later.length_s:.0f} s) is in the thesis's Table 2.4, so what it "
+            "shows cannot be judged"
         )
+    return found
 
 
-def _judged(masks: Path, truth: UmcdVideo, fps: float) -> tuple[str, Sequence[ComparedMask]]:
+def _judged(
+    masks: Path, truth: UmcdVideo, times: Mapping[str, UmcdMetadata], fps: float
+) -> tuple[str, Sequence[ComparedMask]]:
     if truth.masks is not None:
         return MASKS, list(compared_masks(masks, truth.masks))
-    assert truth.metadata is not None
-    stated = read_umcd_metadata(truth.metadata)
-    rate_hz = stated.fps or fps
-    judged = list(frames_against_times(masks, lambda index: stated.shows_object(index / rate_hz)))
-    if not any(each.frame != Counts(unknown=1) for each in judged):
-        raise InputError(
-            f"{truth.metadata}: states for no compared frame whether an object is in view (Appearance: 09 to 18), and "
-            f"there are no change masks ({truth.name}_masks)"
-        )
-    return TIMES, judged
+    for judged_by, stated in times.items():
+        rate_hz = stated.fps or fps
+
+        def shows_object(
+            index: int, stated: UmcdMetadata = stated, rate: float = rate_hz
+        ) -> bool | None:
+            return stated.shows_object(index / rate)
+
+        judged = list(frames_against_times(masks, shows_object))
+        if any(each.frame != Counts(unknown=1) for each in judged):
+            return judged_by, judged
+    raise InputError(
+        f"{truth.metadata or truth.video}: states for no compared frame whether an object is in view "
+        f"(Appearance: 09 to 18), and there are no change masks ({truth.name}_masks)"
+    )
 
 
 def _sum(counts: Iterable[Counts]) -> Counts:

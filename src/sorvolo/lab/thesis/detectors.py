@@ -33,11 +33,34 @@ _DRAWS = 200  # resamplings: the tables show no intervals
 
 @dataclass(frozen=True)
 class Labels:
-    """A labelled set: the thesis's name for it, where it lies, and its form as `read_dataset` names it."""
+    """A labelled set: the thesis's name for it, where it lies, and its form as `read_dataset` names it.
+
+    `test` is where the publisher put what is tested on; None: a share is held out.
+    """
 
     name: str
     place: Path
     form: str
+    test: Path | None = None
+
+    @property
+    def split(self) -> str:
+        """What is tested on, in words."""
+        if self.test is not None:
+            return f"the publisher's test folder ({self.test.name})"
+        return f"{HELD_OUT:.0%} held out"
+
+
+def okutama_labels(place: Path) -> Labels:
+    """Okutama-Action with its own train and test folders, where `place` has one of each (TrainSet..., TestSet...)."""
+    folders = sorted(each for each in place.iterdir() if each.is_dir()) if place.is_dir() else []
+    train, test = (
+        [each for each in folders if each.name.lower().startswith(name)]
+        for name in ("train", "test")
+    )
+    if len(train) == len(test) == 1:
+        return Labels("Okutama Action", train[0], "okutama", test[0])
+    return Labels("Okutama Action", place, "okutama")
 
 
 def extract_frames(videos: Sequence[UmcdVideo], folder: Path, views_per_second: float) -> int:
@@ -75,6 +98,7 @@ def train_network(
     wanted = TrainSettings(
         settings.preset,
         "extended" if rpn == "extended" else "standard",
+        settings.schedule,
         weights=settings.weights,
         steps=settings.steps,
         side_px=settings.side_px,
@@ -83,15 +107,17 @@ def train_network(
     )
     with writing(out):
         shutil.rmtree(out, ignore_errors=True)
-    options = DataOptions(val=str(HELD_OUT), form=labels.form)
+    options = DataOptions(val=str(labels.test or HELD_OUT), form=labels.form)
     for _ in train_detector([labels.place], out, wanted, options, device=settings.device):
         pass
     return str(out / MODEL)
 
 
 def held_out(labels: Labels, seed: int) -> LabelledSet:
-    """The pictures that a training with this seed holds out. Raises InputError where they cannot be used."""
-    (labelled,) = read_sets([labels.place], form=labels.form, held_out=HELD_OUT, seed=seed)
+    """The pictures that a training with this seed is tested on. Raises InputError where they cannot be used."""
+    share = HELD_OUT if labels.test is None else 0.0
+    place = labels.test or labels.place
+    (labelled,) = read_sets([place], form=labels.form, held_out=share, seed=seed)
     return labelled
 
 

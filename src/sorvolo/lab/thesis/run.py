@@ -343,7 +343,7 @@ class _Work:
         return self._measured(detectors.Labels("UMCD", frames, "umcd"), model)
 
     def _detect_okutama(self, place: Path, model: str) -> _Made:
-        return self._measured(detectors.Labels("Okutama Action", place, "okutama"), model)
+        return self._measured(detectors.okutama_labels(place), model)
 
     def _measured(self, labels: detectors.Labels, model: str) -> _Made:
         """Train the model, unless it is the packaged one, measure it on what is held out, and show it at work."""
@@ -353,10 +353,16 @@ class _Work:
         if model != "packaged":
             out = self._out / "models" / f"{labels.form}-{model}"
             file = detectors.train_network(labels, out, model, wanted, seed)
-            trained = {"preset": wanted.preset, "steps": wanted.steps}
+            trained = {
+                "preset": wanted.preset,
+                "steps": wanted.steps,
+                "schedule": wanted.schedule,
+                "side_px": wanted.side_px,
+            }
         values = {
             "dataset": labels.name,
             "model": model,
+            "split": labels.split,
             **trained,
             **detectors.measure_model(file, tested),
         }

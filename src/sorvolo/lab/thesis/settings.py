@@ -32,11 +32,16 @@ class DetectorSettings:
     preset: Literal["fast", "accurate", "thesis"] = "fast"
     weights: str = "auto"  # the thesis, too, begins with ImageNet's
     device: str = "auto"
-    side_px: int = 256  # of the training samples
+    side_px: int = 416  # of the training samples, as `sorvolo train` cuts them
+    schedule: Literal["joint", "four-steps"] = "joint"  # four-steps is the thesis's
 
     def __post_init__(self) -> None:
         if not 0 <= self.steps <= 10**8:
             raise SettingsError(f"--train-steps must lie in 0 to 100000000, got {self.steps}")
+        if self.schedule == "four-steps" and 0 < self.steps < 4:
+            raise SettingsError(
+                f"--schedule four-steps needs at least 4 --train-steps, got {self.steps}"
+            )
 
 
 @dataclass(frozen=True)

@@ -257,7 +257,14 @@ def _seconds(table: Mapping[str, Any]) -> Sheet:
 
 def _precisions(table: Mapping[str, Any]) -> Sheet:
     printed = [
-        (f"{model} Faster R-CNN, printed", dataset, "2000 epochs", "-", percent(score), "-")
+        (
+            f"{model} Faster R-CNN, printed",
+            dataset,
+            "four steps, 2000 epochs",
+            "-",
+            percent(score),
+            "-",
+        )
         for model, scores in table["published"].items()
         for dataset, score in scores.items()
     ]
@@ -265,10 +272,10 @@ def _precisions(table: Mapping[str, Any]) -> Sheet:
         (
             f"{each['model']}, here",
             each["dataset"],
-            f"{each['steps']} steps of preset {each['preset']}"
+            f"{each['schedule']}, {each['steps']} steps of preset {each['preset']} at {each['side_px']} px"
             if "steps" in each
             else "as packaged",
-            f"{each['pictures']} of {counted_videos(each['videos'])}",
+            f"{each['pictures']} of {counted_videos(each['videos'])}: {each['split']}",
             percent(each["thesis_map"]),
             percent(each["ap50"]),
         )

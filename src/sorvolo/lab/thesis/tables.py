@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from sorvolo.lab.evaluation.change_metrics import Counts
-from sorvolo.lab.thesis.comparisons import MASKS, TIMES, rates
+from sorvolo.lab.thesis.comparisons import MASKS, TABLE, TIMES, rates
 from sorvolo.lab.thesis.npu_folder import ENVIRONMENT
 from sorvolo.lab.thesis.published import (
     DIFFERENCES,
@@ -114,7 +114,7 @@ def _pooled(rows: Iterable[Row], kind: str) -> list[dict[str, Any]]:
     ]
     result = []
     for title in COMPARISONS:
-        for judged_by in (MASKS, TIMES):
+        for judged_by in (MASKS, TIMES, TABLE):
             parts = [
                 each
                 for each in compared

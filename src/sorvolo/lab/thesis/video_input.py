@@ -19,6 +19,7 @@ class VideoInput:
     telemetry: Path | None
     camera: Path | None
     fps: float
+    length_s: float
     size_px: tuple[int, int]
 
     @property
@@ -44,6 +45,7 @@ def video_input(each: UmcdVideo, camera: Path | None) -> VideoInput:
         telemetry,
         _fitting(camera, info.width_px, info.height_px),
         info.frame_rate_hz,
+        info.duration_s,
         (info.width_px, info.height_px),
     )
 
