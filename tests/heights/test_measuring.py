@@ -7,7 +7,7 @@ from sorvolo.errors import GeometryError, InputError
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.heights.field import HeightField, along
-from sorvolo.heights.lattice import MOST_SIDE, CellSettings, Lattice
+from sorvolo.heights.lattice import MOST_SIDE, Lattice
 from sorvolo.heights.volumes import (
     VolumeSettings,
     above_rim,
@@ -127,7 +127,7 @@ def test_contours_of_a_cone_are_closed_circles() -> None:
 def test_a_long_corridor_has_cells_that_its_raster_can_hold() -> None:
     """A power line of 6 km mapped at 2 cm: OpenCV resamples no picture of more than 32,766 pixels a side."""
     corridor = np.array([[-3000.0, -20], [3000, 20]])
-    cell_m = Lattice.cell_for(corridor, 0.02, CellSettings())
+    cell_m = Lattice.cell_for(corridor, 0.02)
     lattice = Lattice.over(
         corridor, SiteGrid.at(Geodetic(46.0, -91.0, 100.0), cell_m, "EPSG:32615")
     )

@@ -20,7 +20,7 @@ from sorvolo.heights.figures import (
 from sorvolo.heights.free_space import IslandSettings, seen_through
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.obstacles import Obstacles
-from sorvolo.heights.orthophoto import OrthophotoSettings, choose_photos, paint_orthophoto, visible
+from sorvolo.heights.orthophoto import choose_photos, paint_orthophoto, visible
 from sorvolo.heights.smooth_sigma import SmoothSigma
 from sorvolo.heights.surface import Surface, SurfaceSettings, sweep_surface
 from sorvolo.heights.sweep import SmoothingSettings, SweepSettings, choose_views, smoothed
@@ -133,7 +133,7 @@ def test_a_wall_hides_the_ground_behind_it() -> None:
     x, y = points[..., 0], points[..., 1]
     eye = view.site_from_camera.translation_m
     up_m[(x > 5) & (x < 6) & (np.abs(y) < 3)] = 6.0
-    seen = visible(lattice, up_m, view, OrthophotoSettings())
+    seen = visible(lattice, up_m, view)
     # the shadow of the wall's far edge, seen from the eye, reaches to 6 + 6 (6 - eye) / (eye up - 6)
     reach = 6 + 6 * (6 - eye[0]) / (eye[2] - 6)
     behind = (x > 6.3) & (x < reach - 0.8) & (np.abs(y) < 2)
@@ -287,9 +287,7 @@ def test_photos_that_see_the_ground_beside_a_house_are_chosen(survey) -> None:
 def test_photos_are_chosen_from_above(survey) -> None:
     views, _, _ = survey
     lattice = Lattice.over(np.array([[-12.0, -10], [12, 11]]), SiteGrid.at(ORIGIN, 0.2, CRS))
-    labels = choose_photos(
-        lattice, np.zeros(lattice.shape, np.float32), views, OrthophotoSettings()
-    )
+    labels = choose_photos(lattice, np.zeros(lattice.shape, np.float32), views)
     eyes = np.array([view.site_from_camera.translation_m[:2] for view in views])
     away = np.linalg.norm(lattice.points_m()[:, :, None] - eyes, axis=3)
     chosen = np.take_along_axis(away, np.maximum(labels, 0)[..., None].astype(int), axis=2)[..., 0]

@@ -1,7 +1,7 @@
 """Telemetry against the cameras that the pictures gave: how wrong it was, and the whole flight corrected by it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import inf
 
 import numpy as np
@@ -21,20 +21,14 @@ _FAR_SIGMAS = 6.0  # from its fix: of thousands of frames chance leaves none the
 _UNKNOWN = Bias(float("nan"), float("nan"), float("nan"))
 
 
-@dataclass(frozen=True)
-class CompassSettings:
-    """Which frames' angles are off alike, and how many must be before a compass's error can be stated."""
-
-    outlying_deg: float = 15.0  # beside the flight's usual error: a map does not use angles that are so far off, either
-    agreeing: float = 2 / 3  # share of the frames that must be off alike; by choice
+_COMPASS_OUTLYING_DEG = (
+    15.0  # beside the flight's usual error: a map does not use angles that are so far off, either
+)
+_COMPASS_AGREEING = 2 / 3  # share of the frames that must be off alike; by choice
 
 
-@dataclass(frozen=True)
-class CourseSettings:
-    """How a course over ground is taken from a path; both by choice."""
-
-    around_s: float = 1.0  # to both sides of a moment: over them a course is taken
-    hovering_m_s: float = 0.5  # below, a course is that of the gusts
+_COURSE_AROUND_S = 1.0  # to both sides of a moment: over them a course is taken
+_COURSE_HOVERING_M_S = 0.5  # below, a course is that of the gusts
 
 
 def path_fit(priors: Sequence[CameraPrior], poses: Sequence[Pose], clock_sigma_s: float) -> PathFit:
@@ -95,7 +89,6 @@ def telemetry_faults(
     path: PathFit,
     *,
     knows_height: bool,
-    settings: CompassSettings = CompassSettings(),
 ) -> TelemetryFaults:
     """How far telemetry's cameras, at the corrected clock, were off from the solved ones of the same frames.
 
@@ -113,8 +106,8 @@ def telemetry_faults(
         [prior.position_m - pose.translation_m for prior, pose in zip(priors, poses)]
     ).reshape(-1, 3)
     scatter_m = _together([_bias(moved[placed, k]) for k in range(2)]).scatter / float(np.sqrt(2))
-    beside_deg = _beside_usual(off_deg, settings.outlying_deg)
-    near = beside_deg <= settings.outlying_deg
+    beside_deg = _beside_usual(off_deg, _COMPASS_OUTLYING_DEG)
+    near = beside_deg <= _COMPASS_OUTLYING_DEG
     turned = np.zeros(len(priors), bool)
     turned[knows_heading] = ~near
     apart_m = _apart_m(priors, moved)
@@ -124,8 +117,8 @@ def telemetry_faults(
     tilt_deg = _together([_bias(off_deg[near, k]) for k in (1, 2)])
     return TelemetryFaults(
         clock_s,
-        _heading(off_deg[:, 0], near, path, settings),
-        tilt_deg if _agree(near, settings) else replace(tilt_deg, sigma=inf),
+        _heading(off_deg[:, 0], near, path),
+        tilt_deg if _agree(near) else replace(tilt_deg, sigma=inf),
         _height(moved[placed, 2], poses, path.scale) if knows_height else _UNKNOWN,
         Bias(0.0, float("nan"), scatter_m),
         path,
@@ -181,7 +174,6 @@ def headings_deg(
     compass: Bias,
     times_s: Sequence[float],
     poses: Sequence[Pose],
-    settings: CourseSettings = CourseSettings(),
 ) -> list[float]:
     """The aircraft's heading at these moments, clockwise from north: as stated, (N,), less what the compass was surely
     off; NaN there: the course over ground, that of the nearest moment where it hovers.
@@ -194,7 +186,7 @@ def headings_deg(
         pointing = np.exp(1j * np.radians(stated_deg[known] - error_deg))
     else:
         path_m = np.array([each.translation_m[:2] for each in poses])
-        pointing, known = _courses(np.asarray(times_s), path_m, settings)
+        pointing, known = _courses(np.asarray(times_s), path_m)
     if not known.any():
         known = np.ones(len(poses), bool)
         pointing = np.array([-each.rotation[1, 1] - 1j * each.rotation[0, 1] for each in poses])
@@ -239,18 +231,16 @@ def _moving(key_s: Sequence[float], places_m: PointsM, times_s: Sequence[float])
     return np.column_stack([np.interp(times_s, key_s, places_m[:, k]) for k in range(3)])
 
 
-def _courses(
-    times_s: Floats, path_m: PointsM, settings: CourseSettings
-) -> tuple[NDArray[np.complex128], Mask]:
+def _courses(times_s: Floats, path_m: PointsM) -> tuple[NDArray[np.complex128], Mask]:
     """The velocity over ground, north and east as a complex number, m/s, at those moments of a path, (N, 2), where the
     aircraft moves; and which these are, (N,)."""
     before, after = (
-        np.searchsorted(times_s, times_s + side * settings.around_s) for side in (-1, 1)
+        np.searchsorted(times_s, times_s + side * _COURSE_AROUND_S) for side in (-1, 1)
     )
     after = np.minimum(after, len(times_s) - 1)
     passed_s = np.maximum(times_s[after] - times_s[before], 1e-6)
     velocity = (path_m[after] - path_m[before]) @ np.array([1j, 1]) / passed_s
-    moves = np.abs(velocity) >= settings.hovering_m_s
+    moves = np.abs(velocity) >= _COURSE_HOVERING_M_S
     return velocity[moves], moves
 
 
@@ -358,21 +348,21 @@ def _apart_m(priors: Sequence[CameraPrior], moved_m: PointsM) -> Floats:
     return np.where(far, np.linalg.norm(beside_m, axis=1), 0.0)
 
 
-def _agree(near: Mask, settings: CompassSettings) -> bool:
+def _agree(near: Mask) -> bool:
     """Whether so many frames' angles are off alike that one error can be stated for all."""
-    return bool(len(near)) and float(near.mean()) >= settings.agreeing
+    return bool(len(near)) and float(near.mean()) >= _COMPASS_AGREEING
 
 
-def _heading(off_deg: Floats, near: Mask, path: PathFit, settings: CompassSettings) -> Bias:
+def _heading(off_deg: Floats, near: Mask, path: PathFit) -> Bias:
     """The compass's error by those frames that agree; its sigma is infinite where too few do, or fixes are too few."""
     if not len(off_deg):
         return _UNKNOWN
-    usual_deg = _usual_angle(off_deg, settings.outlying_deg)
+    usual_deg = _usual_angle(off_deg, _COMPASS_OUTLYING_DEG)
     found = _bias(_wrapped(off_deg[near] - usual_deg))
     value_deg, sigma_deg = usual_deg + found.value, inf
     if np.isfinite(path.turn_deg.value):
         value_deg += path.turn_deg.value - path.sure_turn_deg
-        if _agree(near, settings):
+        if _agree(near):
             sigma_deg = float(np.hypot(found.sigma, path.turn_deg.sigma))
     return Bias(float(_wrapped(np.asarray(value_deg))), sigma_deg, found.scatter)
 

@@ -29,23 +29,19 @@ _WAYS = tuple(  # to the eight neighbours, down and right, and what a tie to eac
 )
 
 
-@dataclass(frozen=True)
-class BorderSettings:
-    """How the border of what stands is found."""
-
-    step_cells: float = 8.0  # a height so far above one nearby, in cells, stands on the ground
-    reach_cells: int = (
-        9  # nearby: more than half of a patch of 15 cells, and the blur of its contrast
-    )
-    window_cells: int = 3  # side of the patches that decide
-    views: int = 6  # compared at a place
-    pair_share: float = 0.2  # of their pairs, the most alike: the others may be hidden from it
-    evidence: float = 2.0  # what a likeness weighs against a border of one cell
-    stays: float = 0.05  # likeness in favour of the height that was found
-    edge_levels: float = (
-        8.0  # gray levels between neighbours, at which a border costs 0.6 of its price
-    )
-    apron_cells: int = 24  # beyond a tile, so that neighbouring tiles agree
+_BORDER_STEP_CELLS = 8.0  # a height so far above one nearby, in cells, stands on the ground
+_BORDER_REACH_CELLS = (
+    9  # nearby: more than half of a patch of 15 cells, and the blur of its contrast
+)
+_BORDER_WINDOW_CELLS = 3  # side of the patches that decide
+_BORDER_VIEWS = 6  # compared at a place
+_BORDER_PAIR_SHARE = 0.2  # of their pairs, the most alike: the others may be hidden from it
+_BORDER_EVIDENCE = 2.0  # what a likeness weighs against a border of one cell
+_BORDER_STAYS = 0.05  # likeness in favour of the height that was found
+_BORDER_EDGE_LEVELS = (
+    8.0  # gray levels between neighbours, at which a border costs 0.6 of its price
+)
+_BORDER_APRON_CELLS = 24  # beyond a tile, so that neighbouring tiles agree
 
 
 def beyond_borders(
@@ -55,7 +51,6 @@ def beyond_borders(
     pictures: Callable[[int], ImageGray],
     tile_cells: int,
     sweep: SweepSettings,
-    settings: BorderSettings = BorderSettings(),
 ) -> Floats32:
     """(H, W) the ground's height at the cells that patches gave to what stands beside them; NaN at all others.
 
@@ -63,18 +58,16 @@ def beyond_borders(
     compared as `sweep` has it, in tiles of so many cells.
     """
     found = np.full(up_m.shape, np.nan, np.float32)
-    small = replace(sweep, window_cells=(settings.window_cells, settings.window_cells))
+    small = replace(sweep, window_cells=(_BORDER_WINDOW_CELLS, _BORDER_WINDOW_CELLS))
     for x0, y0, x1, y1 in lattice.windows(tile_cells):
-        apron = settings.apron_cells
+        apron = _BORDER_APRON_CELLS
         left, top = max(0, x0 - apron), max(0, y0 - apron)
         right, below = min(lattice.width, x1 + apron), min(lattice.height, y1 + apron)
         part = up_m[top:below, left:right]
-        standing = _standing(part, lattice.cell_m, settings)
+        standing = _standing(part, lattice.cell_m)
         if standing is None:
             continue
-        moved = ~_kept(
-            lattice.window(left, top, right, below), standing, views, pictures, small, settings
-        )
+        moved = ~_kept(lattice.window(left, top, right, below), standing, views, pictures, small)
         inner = slice(y0 - top, y1 - top), slice(x0 - left, x1 - left)
         found[y0:y1, x0:x1][moved[inner]] = standing.ground_m[inner][moved[inner]]
     return found
@@ -90,13 +83,13 @@ class _Standing:
     step_m: float
 
 
-def _standing(up_m: Floats32, cell_m: float, settings: BorderSettings) -> _Standing | None:
+def _standing(up_m: Floats32, cell_m: float) -> _Standing | None:
     """What stands near ground in a piece of a height model; None where nothing does."""
     known = np.isfinite(up_m)
     if not known.any():
         return None
     whole = filled(up_m, known)
-    side, step_m = 2 * settings.reach_cells + 1, settings.step_cells * cell_m
+    side, step_m = 2 * _BORDER_REACH_CELLS + 1, _BORDER_STEP_CELLS * cell_m
     nearby = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
     calm = cv2.medianBlur(whole, 5)
     near = known & (whole - cv2.erode(calm, nearby) > step_m)
@@ -119,21 +112,19 @@ def _kept(
     views: Sequence[View],
     pictures: Callable[[int], ImageGray],
     sweep: SweepSettings,
-    settings: BorderSettings,
 ) -> Mask:
     """(H, W) which cells keep their height."""
     own_m = standing.up_m
     ground_m = np.where(standing.near, standing.ground_m, own_m)
-    chosen = choose_views(lattice, views, float(np.median(own_m)), settings.views)
+    chosen = choose_views(lattice, views, float(np.median(own_m)), _BORDER_VIEWS)
     own, ground = (
-        _alike(lattice, views, pictures, up_m, chosen, sweep, settings)
-        for up_m in (own_m, ground_m)
+        _alike(lattice, views, pictures, up_m, chosen, sweep) for up_m in (own_m, ground_m)
     )
     if own is None or ground is None:
         return np.ones(own_m.shape, bool)
     picture = _mean_picture(lattice, views, pictures, own_m, chosen)
     calm = np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.7), np.float32)
-    return _cut(standing, settings.evidence * (own - ground) + settings.stays, calm, settings)
+    return _cut(standing, _BORDER_EVIDENCE * (own - ground) + _BORDER_STAYS, calm)
 
 
 def _alike(
@@ -143,13 +134,12 @@ def _alike(
     up_m: Floats32,
     chosen: Sequence[int],
     sweep: SweepSettings,
-    settings: BorderSettings,
 ) -> Floats32 | None:
     """(H, W) how alike photos are on heights, the mean over their most alike pairs; None without any pair."""
     alike = [each for _, _, each in likeness_on(lattice, views, pictures, up_m, chosen, sweep)]
     if not alike:
         return None
-    wanted = int(np.ceil(settings.pair_share * len(alike)))
+    wanted = int(np.ceil(_BORDER_PAIR_SHARE * len(alike)))
     return np.asarray(
         np.partition(np.stack(alike), -wanted, axis=0)[-wanted:].mean(axis=0), np.float32
     )
@@ -201,7 +191,7 @@ class _Ties:
         return np.asarray(reached)
 
 
-def _cut(standing: _Standing, gain: Floats32, picture: Floats32, settings: BorderSettings) -> Mask:
+def _cut(standing: _Standing, gain: Floats32, picture: Floats32) -> Mask:
     """(H, W) the cells that keep their height: the cheapest border between those that should and those that should not.
 
     `gain` (H, W) is what keeping its height gains at a cell; a border costs less where the picture has an edge.
@@ -218,7 +208,7 @@ def _cut(standing: _Standing, gain: Floats32, picture: Floats32, settings: Borde
         lies = (y >= 0) & (y < height) & (x >= 0) & (x < width)
         here, y, x, own_y, own_x = nodes[lies], y[lies], x[lies], rows[lies], columns[lies]
         apart = picture[y, x] - picture[own_y, own_x]
-        price = weight * np.exp(-(apart**2) / (2 * settings.edge_levels**2))
+        price = weight * np.exp(-(apart**2) / (2 * _BORDER_EDGE_LEVELS**2))
         there = number[y, x]
         ties.add(here[there >= 0], there[there >= 0], price[there >= 0])
         # a neighbour with nothing lower nearby is the middle of a roof, or the ground

@@ -91,17 +91,13 @@ def _factor(off_m: Floats, match_m: Floats, point_m: Floats) -> float:
     return factor
 
 
-@dataclass(frozen=True)
-class WarningSettings:
-    """What of a flight makes its heights weak."""
-
-    oblique_deg: float = 25.0  # off the vertical, the median photo
-    one_strip: float = (
-        0.08  # how wide a path is, as a share of its length, below which it is one strip
-    )
-    most_holes: float = 0.1  # share of the ground that two photos see
-    bad_fit_px: float = 0.45  # rms, of pictures no larger than `fit_side_px`: level and hilly flights have 0.1 to 0.3
-    fit_side_px: int = TrackSettings.side_px  # larger ones are matched at this size
+_WARN_OBLIQUE_DEG = 25.0  # off the vertical, the median photo
+_WARN_ONE_STRIP = 0.08  # how wide a path is, as a share of its length, below which it is one strip
+_WARN_MOST_HOLES = 0.1  # share of the ground that two photos see
+_WARN_BAD_FIT_PX = (
+    0.45  # rms, of pictures no larger than `fit_side_px`: level and hilly flights have 0.1 to 0.3
+)
+_WARN_FIT_SIDE_PX = TrackSettings.side_px  # larger ones are matched at this size
 
 
 def camera_figures(solved: Cameras3D) -> Mapping[str, Any]:
@@ -158,7 +154,7 @@ def surface_figures(
     }
 
 
-def camera_warnings(solved: Cameras3D, settings: WarningSettings = WarningSettings()) -> list[str]:
+def camera_warnings(solved: Cameras3D) -> list[str]:
     """What in the flight makes its heights weak."""
     remarks = []
     if solved.lost:
@@ -168,7 +164,7 @@ def camera_warnings(solved: Cameras3D, settings: WarningSettings = WarningSettin
         )
     places = np.array([view.site_from_camera.translation_m for view in solved.views])
     spread = np.linalg.svd(places[:, :2] - places[:, :2].mean(axis=0), compute_uv=False)
-    if spread[1] < settings.one_strip * spread[0]:
+    if spread[1] < _WARN_ONE_STRIP * spread[0]:
         remarks.append(
             "the photos lie along one strip: the tilt of the ground across it is known from the drone's attitude "
             "alone (about 3 degrees); fly at least two strips, or one across, for heights"
@@ -176,16 +172,16 @@ def camera_warnings(solved: Cameras3D, settings: WarningSettings = WarningSettin
     tilt = np.degrees(
         np.arccos(np.clip([-view.site_from_camera.rotation[2, 2] for view in solved.views], -1, 1))
     )
-    if np.median(tilt) > settings.oblique_deg:
+    if np.median(tilt) > _WARN_OBLIQUE_DEG:
         remarks.append(
             f"the photos look {np.median(tilt):.0f} degrees off the vertical: walls and what lies behind things have "
             "heights of their surroundings"
         )
     camera = solved.views[0].camera
     fit_px = solved.residual_px * min(
-        1.0, settings.fit_side_px / max(camera.width_px, camera.height_px)
+        1.0, _WARN_FIT_SIDE_PX / max(camera.width_px, camera.height_px)
     )
-    if fit_px > settings.bad_fit_px:
+    if fit_px > _WARN_BAD_FIT_PX:
         remarks.append(
             f"the photos fit each other in space to {solved.residual_px:.2f} px only: a rolling shutter, blur, things "
             "that move or a zoomed lens; the heights may be off by several times their stated error"
@@ -195,11 +191,11 @@ def camera_warnings(solved: Cameras3D, settings: WarningSettings = WarningSettin
     return remarks
 
 
-def surface_warnings(surface: Surface, settings: WarningSettings = WarningSettings()) -> list[str]:
+def surface_warnings(surface: Surface) -> list[str]:
     """What in the height model is weak."""
     covered = max(int(surface.covered.sum()), 1)
     holes = 1 - np.isfinite(surface.up_m).sum() / covered
-    if holes > settings.most_holes:
+    if holes > _WARN_MOST_HOLES:
         return [
             f"{holes:.0%} of the ground that two photos see has no height: water, bare ground without texture, or "
             "things that move"

@@ -74,21 +74,15 @@ def pieces(up_m: Floats32, step_m: float) -> Rows:
     return np.asarray(piece.reshape(up_m.shape), np.int64)
 
 
-@dataclass(frozen=True)
-class FreeSpaceSettings:
-    """When photos see through a height model."""
-
-    views: int = 6  # compared with each other at a place
-    agrees: float = (
-        0.3  # likeness of two photos, 0 to 1, by which they agree: by chance it is below 0.15
-    )
-    margin_cells: float = (
-        1.5  # what a photo shows, less than that beside a cell's height, is the cell
-    )
-    share: float = 0.5  # of a piece: seen through so many times, of the times that it is seen
-    step_cells: float = 2.0  # a height this much beside its neighbour's, in cells, is another piece
-    window_cells: int = 1000  # whose pieces are worked on at a time
-    apron_cells: int = 5  # beyond a tile: more than half a patch
+_SEEN_VIEWS = 6  # compared with each other at a place
+_SEEN_AGREES = (
+    0.3  # likeness of two photos, 0 to 1, by which they agree: by chance it is below 0.15
+)
+_SEEN_MARGIN_CELLS = 1.5  # what a photo shows, less than that beside a cell's height, is the cell
+_SEEN_SHARE = 0.5  # of a piece: seen through so many times, of the times that it is seen
+_SEEN_STEP_CELLS = 2.0  # a height this much beside its neighbour's, in cells, is another piece
+_SEEN_WINDOW_CELLS = 1000  # whose pieces are worked on at a time
+_SEEN_APRON_CELLS = 5  # beyond a tile: more than half a patch
 
 
 def seen_through(
@@ -98,7 +92,6 @@ def seen_through(
     pictures: Callable[[int], ImageGray],
     tile_cells: int,
     sweep: SweepSettings,
-    settings: FreeSpaceSettings = FreeSpaceSettings(),
 ) -> Mask:
     """(H, W) the cells of a height model, NaN in holes, that as many photos see through as see them, and some pieces.
 
@@ -110,23 +103,19 @@ def seen_through(
         return known
     ground = filled(up_m, known)
     through, shown = np.zeros(up_m.shape, np.uint8), np.zeros(up_m.shape, np.uint8)
-    for number, places in _compared(
-        lattice, ground, known, views, pictures, tile_cells, sweep, settings
-    ):
-        lower, itself = _seen_at(lattice, ground, views[number], places, settings)
+    for number, places in _compared(lattice, ground, known, views, pictures, tile_cells, sweep):
+        lower, itself = _seen_at(lattice, ground, views[number], places)
         through.ravel()[places.cell[lower]] += 1
         shown.ravel()[places.cell[itself]] += 1
     found = known & (through > 0) & (through >= shown)
-    for x0, y0, x1, y1 in lattice.windows(settings.window_cells):
+    for x0, y0, x1, y1 in lattice.windows(_SEEN_WINDOW_CELLS):
         here = slice(y0, y1), slice(x0, x1)
         rest = np.where(found[here], np.float32(np.nan), up_m[here])
         for model in (
             up_m[here],
             rest,
         ):  # a plate beside a wall is apart from it once its own cells are gone
-            found[here] |= known[here] & _mostly(
-                model, through[here], shown[here], lattice.cell_m, settings
-            )
+            found[here] |= known[here] & _mostly(model, through[here], shown[here], lattice.cell_m)
     return found
 
 
@@ -146,18 +135,17 @@ def _compared(
     pictures: Callable[[int], ImageGray],
     tile_cells: int,
     sweep: SweepSettings,
-    settings: FreeSpaceSettings,
 ) -> Iterator[tuple[int, _Places]]:
     """Of each view, by number, the places at which it can be compared with another one."""
     found: dict[int, list[_Places]] = {}
-    apron = settings.apron_cells
+    apron = _SEEN_APRON_CELLS
     for x0, y0, x1, y1 in lattice.windows(tile_cells):
         left, top = max(0, x0 - apron), max(0, y0 - apron)
         right, below = min(lattice.width, x1 + apron), min(lattice.height, y1 + apron)
         up_m = np.ascontiguousarray(ground[top:below, left:right])
         window = lattice.window(left, top, right, below)
         best: dict[int, Floats32] = {}
-        chosen = choose_views(window, views, float(np.median(up_m)), settings.views)
+        chosen = choose_views(window, views, float(np.median(up_m)), _SEEN_VIEWS)
         for i, j, alike in likeness_on(window, views, pictures, up_m, chosen, sweep):
             for number in (i, j):
                 best[number] = np.maximum(best[number], alike) if number in best else alike
@@ -176,9 +164,7 @@ def _compared(
             yield number, places
 
 
-def _seen_at(
-    lattice: Lattice, ground: Floats32, view: View, places: _Places, settings: FreeSpaceSettings
-) -> tuple[Mask, Mask]:
+def _seen_at(lattice: Lattice, ground: Floats32, view: View, places: _Places) -> tuple[Mask, Mask]:
     """(N,) at which places a view's pixel shows another one, which lies lower, and at which the place itself."""
     rows, columns = np.divmod(places.cell, lattice.width)
     up_m = ground.ravel()[places.cell]
@@ -198,15 +184,13 @@ def _seen_at(
         places.alike[order],
         up_m[order],
     )  # of several the last is the most alike
-    agrees, above_m = alike[at] > settings.agrees, up_m - shows_m[at]
-    margin_m = settings.margin_cells * lattice.cell_m
+    agrees, above_m = alike[at] > _SEEN_AGREES, up_m - shows_m[at]
+    margin_m = _SEEN_MARGIN_CELLS * lattice.cell_m
     return agrees & (above_m > margin_m), agrees & (np.abs(above_m) <= margin_m)
 
 
-def _mostly(
-    up_m: Floats32, through: ImageGray, shown: ImageGray, cell_m: float, settings: FreeSpaceSettings
-) -> Mask:
+def _mostly(up_m: Floats32, through: ImageGray, shown: ImageGray, cell_m: float) -> Mask:
     """(H, W) the cells of pieces that are seen through often, of the times that they are seen."""
-    piece = pieces(up_m, settings.step_cells * cell_m)
+    piece = pieces(up_m, _SEEN_STEP_CELLS * cell_m)
     often, seen = (np.bincount(piece.ravel(), each.ravel()) for each in (through, shown))
-    return np.asarray(((often > 0) & (often >= settings.share * seen))[piece])
+    return np.asarray(((often > 0) & (often >= _SEEN_SHARE * seen))[piece])

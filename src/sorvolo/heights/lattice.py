@@ -15,15 +15,13 @@ MOST_SIDE = 32_766
 """The most rows or columns of a height model: OpenCV resamples no larger picture."""
 
 
-@dataclass(frozen=True)
-class CellSettings:
-    """How large cells are: `fine_px` pixels of the map, up to `coarse_px` above `few_cells` of them."""
-
-    fine_px: float = 3.0
-    coarse_px: float = 6.0
-    few_cells: float = 2e6
-    most_cells: float = 60e6  # bounds the memory: larger sites get larger cells still
-    most_side: int = 30_000  # of the box's longer side; the raster, north up, may be a little longer (`MOST_SIDE`)
+_FINE_PX = 3.0
+_COARSE_PX = 6.0
+_FEW_CELLS = 2e6
+_MOST_CELLS = 60e6  # bounds the memory: larger sites get larger cells still
+_MOST_SIDE = (
+    30_000  # of the box's longer side; the raster, north up, may be a little longer (`MOST_SIDE`)
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,13 +79,13 @@ class Lattice:
         return cls(np.linalg.inv(grid_from_site) @ shift, width, height, grid.m_per_px, first)
 
     @staticmethod
-    def cell_for(points_m: PointsM, pixel_m: float, settings: "CellSettings") -> float:
+    def cell_for(points_m: PointsM, pixel_m: float) -> float:
         """The cells' side over the box of these points: fine on small sites, coarser on larger ones."""
         sides_m = points_m.max(axis=0) - points_m.min(axis=0)
         side_m = float(np.sqrt(np.prod(sides_m)))
-        few_m, most_m = side_m / np.sqrt(settings.few_cells), side_m / np.sqrt(settings.most_cells)
-        longest_m = float(sides_m.max()) / settings.most_side
-        wanted_m = np.clip(few_m, settings.fine_px * pixel_m, settings.coarse_px * pixel_m)
+        few_m, most_m = side_m / np.sqrt(_FEW_CELLS), side_m / np.sqrt(_MOST_CELLS)
+        longest_m = float(sides_m.max()) / _MOST_SIDE
+        wanted_m = np.clip(few_m, _FINE_PX * pixel_m, _COARSE_PX * pixel_m)
         return float(f"{max(wanted_m, most_m, longest_m):.3g}")
 
     @property

@@ -14,13 +14,9 @@ _TIMES = 2  # as coarse as the cells that are asked about
 _SAMPLES = 16  # to a side of a window
 
 
-@dataclass(frozen=True)
-class ObstacleSettings:
-    """When something is in the way."""
-
-    margin_cells: float = 1.5  # below the line of sight, down to which a place is seen all the same
-    least_cells: float = 4.0  # from lowest to highest: less than that hides nothing
-    around_cells: int = 40  # about a window, within which things are looked for
+_MARGIN_CELLS = 1.5  # below the line of sight, down to which a place is seen all the same
+_LEAST_CELLS = 4.0  # from lowest to highest: less than that hides nothing
+_AROUND_CELLS = 40  # about a window, within which things are looked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +25,6 @@ class Obstacles:
 
     lattice: Lattice
     up_m: Floats32
-    settings: ObstacleSettings = ObstacleSettings()
 
     @classmethod
     def surely(cls, lattice: Lattice, up_m: Floats32, patch_cells: int) -> "Obstacles":
@@ -94,7 +89,7 @@ class Obstacles:
             np.float32(eye_m[2]),
         )
         reach = float(far.max()) * min((high_m - low_m) / max(float(eye_up_m) - high_m, 1e-3), 1.0)
-        step = self.settings.margin_cells
+        step = _MARGIN_CELLS
         while step < reach:
             stands = cv2.remap(
                 self.up_m,
@@ -109,7 +104,7 @@ class Obstacles:
             )
             np.maximum(lowest, behind, out=lowest, where=far > step)
             step = max(step + 1.0, step * 1.06)
-        lowest -= np.float32(self.settings.margin_cells * self.lattice.cell_m)
+        lowest -= np.float32(_MARGIN_CELLS * self.lattice.cell_m)
         return lowest
 
     def _on(self, window: Lattice) -> Floats32:
@@ -132,9 +127,7 @@ class Obstacles:
             [[0, window.width] * 2, [0, 0, window.height, window.height], [1] * 4]
         )
         cells = self.lattice.cells_from_site(ends[:2].T)
-        low = np.maximum(np.floor(cells.min(axis=0)).astype(int) - self.settings.around_cells, 0)
-        high = np.maximum(np.ceil(cells.max(axis=0)).astype(int) + self.settings.around_cells, 0)
+        low = np.maximum(np.floor(cells.min(axis=0)).astype(int) - _AROUND_CELLS, 0)
+        high = np.maximum(np.ceil(cells.max(axis=0)).astype(int) + _AROUND_CELLS, 0)
         part = self.up_m[low[1] : high[1], low[0] : high[0]]
-        return (
-            part.size > 0 and float(np.ptp(part)) > self.settings.least_cells * self.lattice.cell_m
-        )
+        return part.size > 0 and float(np.ptp(part)) > _LEAST_CELLS * self.lattice.cell_m

@@ -1,7 +1,6 @@
 """The true orthophoto: each piece of ground seen by a photo that nothing hides it from, on its own height."""
 
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -22,21 +21,12 @@ from sorvolo.mosaic.blending import (
     winners_from_shares,
 )
 
-
-@dataclass(frozen=True)
-class OrthophotoSettings:
-    """Which photo shows a piece of ground."""
-
-    hidden_cells: float = (
-        3.0  # a height this much above the line of sight, in cells, hides what is behind
-    )
-    hidden_merit: float = 0.02  # of a photo that does not see the ground, against one that does
-    block_tiles: int = (
-        2  # painted together, to a side: what is painted around them is a smaller share
-    )
-    strip_blocks: int = (
-        2  # high, painted to and fro: blocks that follow each other show the same few photos
-    )
+_HIDDEN_CELLS = 3.0  # a height this much above the line of sight, in cells, hides what is behind
+_HIDDEN_MERIT = 0.02  # of a photo that does not see the ground, against one that does
+_BLOCK_TILES = 2  # painted together, to a side: what is painted around them is a smaller share
+_STRIP_BLOCKS = (
+    2  # high, painted to and fro: blocks that follow each other show the same few photos
+)
 
 
 def paint_orthophoto(
@@ -44,7 +34,6 @@ def paint_orthophoto(
     site_grid: SiteGrid,
     views: Sequence[View],
     pictures: Callable[[int], ImageRGB],
-    settings: OrthophotoSettings = OrthophotoSettings(),
 ) -> Iterator[tuple[TileIndex, ImageRGBA, float]]:
     """The tiles of the true orthophoto, block by block, each with the share that is done; those unseen are left out.
 
@@ -55,14 +44,14 @@ def paint_orthophoto(
     painter = _Painter(
         surface.lattice,
         ground,
-        choose_photos(surface.lattice, ground, views, settings),
+        choose_photos(surface.lattice, ground, views),
         site_grid,
         views,
         pictures,
     )
-    count, side = settings.block_tiles, site_grid.grid.tile_px
+    count, side = _BLOCK_TILES, site_grid.grid.tile_px
     blocks = _to_and_fro(
-        {(row // count, column // count) for column, row in painter.tiles()}, settings.strip_blocks
+        {(row // count, column // count) for column, row in painter.tiles()}, _STRIP_BLOCKS
     )
     for number, (down, across) in enumerate(blocks, start=1):
         first = across * count, down * count
@@ -85,9 +74,7 @@ def _to_and_fro(blocks: Collection[tuple[int, int]], rows: int) -> list[tuple[in
     return sorted(blocks, key=place)
 
 
-def choose_photos(
-    lattice: Lattice, up_m: Floats32, views: Sequence[View], settings: OrthophotoSettings
-) -> Winners:
+def choose_photos(lattice: Lattice, up_m: Floats32, views: Sequence[View]) -> Winners:
     """(H, W) which view shows each cell of a height model without holes best; -1 where none does."""
     labels = np.full(lattice.shape, -1, np.int16)
     best = np.zeros(lattice.shape, np.float32)
@@ -98,15 +85,15 @@ def choose_photos(
         here = slice(y0, y1), slice(x0, x1)
         window = lattice.window(x0, y0, x1, y1)
         heights: Floats32 = np.ascontiguousarray(up_m[here])
-        seen = cv2.medianBlur(visible(window, heights, view, settings).view(np.uint8), 5) > 0
-        merit = _merit(window, heights, view) * np.where(seen, 1.0, settings.hidden_merit)
+        seen = cv2.medianBlur(visible(window, heights, view).view(np.uint8), 5) > 0
+        merit = _merit(window, heights, view) * np.where(seen, 1.0, _HIDDEN_MERIT)
         wins = merit > best[here]
         labels[here][wins] = number
         best[here][wins] = merit[wins]
     return labels
 
 
-def visible(lattice: Lattice, up_m: Floats32, view: View, settings: OrthophotoSettings) -> Mask:
+def visible(lattice: Lattice, up_m: Floats32, view: View) -> Mask:
     """(H, W) which cells of a height model without holes nothing of it hides from a view."""
     eye = view.site_from_camera.translation_m
     at = lattice.cells_from_site(eye[None, :2])[0]
@@ -118,7 +105,7 @@ def visible(lattice: Lattice, up_m: Floats32, view: View, settings: OrthophotoSe
     dx, dy = dx / far, dy / far
     climb = (np.float32(eye[2]) - up_m) / far  # metres a cell on the way to the camera
     highest = float(up_m.max())
-    margin = settings.hidden_cells * lattice.cell_m
+    margin = _HIDDEN_CELLS * lattice.cell_m
     steepest = float(np.min(climb))
     reach = min((highest - float(up_m.min())) / max(steepest, 1e-3), float(far.max()))
     hidden = np.zeros(up_m.shape, bool)

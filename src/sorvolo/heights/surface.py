@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 
 from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, Mask, PointsM
-from sorvolo.heights.borders import BorderSettings, beyond_borders
-from sorvolo.heights.free_space import FreeSpaceSettings, IslandSettings, islands, seen_through
+from sorvolo.heights.borders import beyond_borders
+from sorvolo.heights.free_space import IslandSettings, islands, seen_through
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.obstacles import Obstacles
 from sorvolo.heights.smooth_sigma import SmoothSigma
@@ -39,8 +39,6 @@ class SurfaceSettings:
     )
     unsure_cells: float = 3.0  # how far off heights are that are likely as well, beyond which one pair decides nothing
     islands: IslandSettings = field(default_factory=IslandSettings)
-    borders: BorderSettings = field(default_factory=BorderSettings)
-    free_space: FreeSpaceSettings = field(default_factory=FreeSpaceSettings)
     match_cells: float = 0.12  # sigma of a match where photos agree perfectly, in cells of parallax
     relief_share: float = (
         0.25  # of the heights' spread around a cell: at an edge it is not known which is right
@@ -126,7 +124,6 @@ def sweep_surface(
         lambda i: pictures(i, lattice.cell_m),
         side,
         settings.sweep,
-        settings.borders,
     )
     given = np.isfinite(ground_m)
     sigma_m[given] = np.hypot(
@@ -155,7 +152,6 @@ def _seen_through(
         lambda i: pictures(i, coarse.cell_m),
         _tile_cells(coarse.cell_m, views, settings),
         settings.coarse,
-        settings.free_space,
     )
     return np.repeat(np.repeat(found, times, axis=0), times, axis=1)[
         : lattice.height, : lattice.width

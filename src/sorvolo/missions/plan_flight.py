@@ -36,16 +36,12 @@ DEFAULT_SIZE_PX = (1920, 1080)
 """Frame size where neither the user nor a preset names one."""
 
 
-@dataclass(frozen=True)
-class ReflySettings:
-    """How holes in a flight are flown over again."""
-
-    speed_m_s: float = 3.0  # slowly: they are small, and a second hole would cost another battery
-    forward_overlap: float = 0.7  # as `sorvolo map` selects frames
-    beside: float = 0.2  # of the height: how far the passes reach into what was seen
-    most_holes: int = 60  # the largest: more waypoints than drones take, and hours of flight
-    least_m2: float = 20.0  # of a hole in a search
-    lowest_m: float = 10.0  # above ground, where a search's pictures were too coarse
+_REFLY_SPEED_M_S = 3.0  # slowly: they are small, and a second hole would cost another battery
+_REFLY_FORWARD_OVERLAP = 0.7  # as `sorvolo map` selects frames
+REFLY_BESIDE = 0.2  # of the height: how far the passes reach into what was seen
+REFLY_MOST_HOLES = 60  # the largest: more waypoints than drones take, and hours of flight
+REFLY_LEAST_M2 = 20.0  # of a hole in a search
+REFLY_LOWEST_M = 10.0  # above ground, where a search's pictures were too coarse
 
 
 @dataclass(frozen=True)
@@ -181,14 +177,13 @@ def fly_again(
     files: Sequence[Path],
     *,
     dji_drone: str = "fly",
-    settings: ReflySettings = ReflySettings(),
 ) -> FlightPlan:
     """Slow passes over what a flight with this camera did not see, written to the files; as high as it was flown."""
     wishes = PlanSettings(
         height_m=min(height_m, LEGAL_CEILING_M),
         model="none",
-        speed_m_s=settings.speed_m_s,
-        forward_overlap=settings.forward_overlap,
+        speed_m_s=_REFLY_SPEED_M_S,
+        forward_overlap=_REFLY_FORWARD_OVERLAP,
     )
     plan = plan_over(
         area, answer_questions(CameraModel(camera, "the mapped flight's", 0.01), wishes), wishes

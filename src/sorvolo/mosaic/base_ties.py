@@ -17,18 +17,13 @@ from sorvolo.registration.features import gray_from_rgb
 from sorvolo.registration.place_search import find_place, scale_steps
 from sorvolo.survey.flight import CameraPrior
 
-
-@dataclass(frozen=True)
-class BaseTieSettings:
-    """Which keyframes are sought on a base map, and how one that was found ties the map to it."""
-
-    most_frames: int = 150  # looked for on the base map
-    lowest_m: float = 8.0  # heights of flights that state none: from here ...
-    highest_m: float = 250.0  # ... to here
-    points: tuple[int, int] = (4, 3)  # across and down: they stand for a frame
-    independent: float = 3.0  # of them: they err together
-    wild: float = 6.0  # times as far off as most: a frame that was laid on other ground
-    rounds: int = 3  # of leaving wild ones out
+_MOST_FRAMES = 150  # looked for on the base map
+_LOWEST_M = 8.0  # heights of flights that state none: from here ...
+_HIGHEST_M = 250.0  # ... to here
+_POINTS = (4, 3)  # across and down: they stand for a frame
+_INDEPENDENT = 3.0  # of them: they err together
+_WILD = 6.0  # times as far off as most: a frame that was laid on other ground
+_ROUNDS = 3  # of leaving wild ones out
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,12 +58,10 @@ class BaseReport:
     moved_m: float
 
 
-def sought_keyframes(
-    mapper: PlanarMapper, settings: BaseTieSettings = BaseTieSettings()
-) -> list[int]:
+def sought_keyframes(mapper: PlanarMapper) -> list[int]:
     """The keyframes to look for: all, or some evenly spread."""
     placed = mapper.placed()
-    return placed[:: -(-len(placed) // settings.most_frames)]
+    return placed[:: -(-len(placed) // _MOST_FRAMES)]
 
 
 def prior_on_map(mapper: PlanarMapper, keyframe_id: int, sigma_m: float) -> CameraPrior:
@@ -85,13 +78,12 @@ def tie_to_base(
     m_per_px: float,
     *,
     is_datum: bool,
-    settings: BaseTieSettings = BaseTieSettings(),
 ) -> tuple[int, float]:
     """Tie the map to the base map; how many frames were left out as laid on other ground, and the median misfit, m."""
     kept = list(frames)
     misfit: Floats = np.zeros(0)
-    for _ in range(settings.rounds):
-        parts = [_ties(mapper, each, full, m_per_px, settings) for each in kept]
+    for _ in range(_ROUNDS):
+        parts = [_ties(mapper, each, full, m_per_px) for each in kept]
         mapper.tie_to_ground(_joined(parts), is_datum=is_datum)
         misfit = np.array(
             [
@@ -101,7 +93,7 @@ def tie_to_base(
                 for each in parts
             ]
         )
-        good = misfit <= max(settings.wild * float(np.median(misfit)), 3 * m_per_px)
+        good = misfit <= max(_WILD * float(np.median(misfit)), 3 * m_per_px)
         if good.all():
             break
         kept = [each for each, is_good in zip(kept, good, strict=True) if is_good]
@@ -113,19 +105,18 @@ def _ties(
     frame: FoundFrame,
     full: Camera,
     m_per_px: float,
-    settings: BaseTieSettings,
 ) -> GroundTies:
     camera = frame.camera
     x, y = (
         np.linspace(0.12, 0.88, count) * size
-        for count, size in zip(settings.points, (camera.width_px, camera.height_px), strict=True)
+        for count, size in zip(_POINTS, (camera.width_px, camera.height_px), strict=True)
     )
     pixels = np.column_stack([each.ravel() for each in np.meshgrid(x, y)])
     ground_m = apply_homography(frame.site_from_image, pixels)
     seen = np.isfinite(ground_m).all(axis=1)
     count = int(seen.sum())
     scale = mapper.registration_scale(frame.keyframe_id, full)
-    sigma_m = np.hypot(m_per_px, frame.residual_m) * np.sqrt(count / settings.independent)
+    sigma_m = np.hypot(m_per_px, frame.residual_m) * np.sqrt(count / _INDEPENDENT)
     return GroundTies(
         np.full(count, frame.keyframe_id),
         (pixels[seen] - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px],
@@ -156,11 +147,10 @@ def find_flight(
     overview: Overview,
     ground: Overview,
     full: Camera,
-    settings: BaseTieSettings = BaseTieSettings(),
 ) -> bool:
     """Bring a flight of unknown place, scale and north to where its overview lies on the base map's; whether it is."""
     unit = overview.unit_per_px / ground.unit_per_px / full.fx_px
-    scales = scale_steps(unit * settings.lowest_m, unit * settings.highest_m)
+    scales = scale_steps(unit * _LOWEST_M, unit * _HIGHEST_M)
     found = find_place((overview.gray, overview.known), (ground.gray, ground.known), scales)
     if found is None:
         return False

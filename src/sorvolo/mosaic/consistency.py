@@ -12,25 +12,20 @@ from sorvolo.mosaic.graph_report import GraphReport
 from sorvolo.survey.mosaic import PlacedFrame, Status
 from sorvolo.survey.wording import counted
 
-
-@dataclass(frozen=True)
-class ConsistencySettings:
-    """When a map contradicts itself. A consumer receiver errs by metres, a poor one by 20 m (real flights: 14 m)."""
-
-    least_frames: int = 4  # of a piece, for its scale to be known
-    most_scale: float = 0.2  # relative, between pieces or between a piece and GPS ...
-    scale_sigmas: float = 4.0  # ... and so many times what the fixes leave open
-    most_rms_m: float = 25.0  # of cameras from their fixes ...
-    rms_sigmas: float = 8.0  # ... or so many stated sigmas
-    most_off_m: float = 5.0  # median, if it is also a quarter of how far the flight reaches
-    off_share: float = 0.25
-    least_alike: float = 0.6  # rms misfit over the fixes' spread: more, and the path is another one
-    most_uneven: float = (
-        0.35  # of the height above ground: heights of frames that scatter so against telemetry's
-    )
-    least_uneven_m: float = 8.0
-    heights_differ: float = 0.15  # of the stated height: more is reported ...
-    heights_differ_m: float = 4.0  # ... if it is so many metres as well
+_LEAST_FRAMES = 4  # of a piece, for its scale to be known
+_MOST_SCALE = 0.2  # relative, between pieces or between a piece and GPS ...
+_SCALE_SIGMAS = 4.0  # ... and so many times what the fixes leave open
+_MOST_RMS_M = 25.0  # of cameras from their fixes ...
+_RMS_SIGMAS = 8.0  # ... or so many stated sigmas
+_MOST_OFF_M = 5.0  # median, if it is also a quarter of how far the flight reaches
+_OFF_SHARE = 0.25
+_LEAST_ALIKE = 0.6  # rms misfit over the fixes' spread: more, and the path is another one
+_MOST_UNEVEN = (
+    0.35  # of the height above ground: heights of frames that scatter so against telemetry's
+)
+_LEAST_UNEVEN_M = 8.0
+_HEIGHTS_DIFFER = 0.15  # of the stated height: more is reported ...
+_HEIGHTS_DIFFER_M = 4.0  # ... if it is so many metres as well
 
 
 @dataclass(frozen=True)
@@ -75,7 +70,6 @@ def consistency(
     figures: FlightFigures,
     stated: Stated,
     graph: GraphReport | None = None,
-    settings: ConsistencySettings = ConsistencySettings(),
 ) -> Consistency:
     """Hold a map against itself and against telemetry. `pieces` are the frames, by index, that links tie together."""
     by_index = {each.index: each for each in placed if each.status is not Status.REJECTED}
@@ -87,18 +81,16 @@ def consistency(
     known = tuple(each for each in found if each is not None)
     frames = list(by_index.values())
     faults = [
-        *_scale_faults(known, settings),
-        *_gps_faults(frames, figures, stated, settings),
-        *_height_faults(frames, figures, settings),
+        *_scale_faults(known),
+        *_gps_faults(frames, figures, stated),
+        *_height_faults(frames, figures),
     ]
     steps = [
         *_steps(groups[: len(known)], figures),
-        *(_gps_doubts(figures, settings) if not faults else []),
+        *(_gps_doubts(figures) if not faults else []),
         *_relief_doubts(figures, graph),
     ]
-    return Consistency(
-        known, tuple(faults), tuple(steps), tuple(_height_remarks(figures, stated, settings))
-    )
+    return Consistency(known, tuple(faults), tuple(steps), tuple(_height_remarks(figures, stated)))
 
 
 def _steps(groups: Sequence[Sequence[PlacedFrame]], figures: FlightFigures) -> list[str]:
@@ -150,7 +142,7 @@ def _piece(frames: Sequence[PlacedFrame], stated: Stated) -> Piece | None:
     ]
     scale = sigma = float("nan")
     spread_m = float(np.linalg.norm(fixes_m.std(axis=0))) if len(fixes_m) else 0.0
-    if len(fixes_m) >= ConsistencySettings.least_frames and spread_m > 2 * stated.position_sigma_m:
+    if len(fixes_m) >= _LEAST_FRAMES and spread_m > 2 * stated.position_sigma_m:
         change = fit_similarity(fixes_m, centres_m)
         scale = float(1 / max(np.hypot(change[0, 0], change[1, 0]), 1e-9))
         miss_m = np.linalg.norm(apply_homography(change, centres_m) - fixes_m, axis=1)
@@ -171,20 +163,18 @@ def _centres_and_fixes(frames: Sequence[PlacedFrame]) -> tuple[PointsM, PointsM]
     return centres_m, centres_m - off_m
 
 
-def _scale_faults(pieces: Sequence[Piece], settings: ConsistencySettings) -> list[str]:
+def _scale_faults(pieces: Sequence[Piece]) -> list[str]:
     known = [each for each in pieces if np.isfinite(each.scale)]
     faults = []
     for piece in known[:1]:
-        if abs(np.log(piece.scale)) > max(
-            settings.most_scale, settings.scale_sigmas * piece.scale_sigma
-        ):
+        if abs(np.log(piece.scale)) > max(_MOST_SCALE, _SCALE_SIGMAS * piece.scale_sigma):
             faults.append(
                 f"the map is {piece.scale:.2f} times as large as its GPS track (frames {piece.first} to {piece.last})"
             )
     for piece in known[1:]:
         apart = abs(np.log(piece.scale / known[0].scale))
         sigma = np.hypot(piece.scale_sigma, known[0].scale_sigma)
-        if apart > max(settings.most_scale, settings.scale_sigmas * sigma):
+        if apart > max(_MOST_SCALE, _SCALE_SIGMAS * sigma):
             faults.append(
                 f"its pieces differ in scale: {counted(piece.frames, 'frame')} from {piece.first} to {piece.last} by "
                 f"{piece.scale / known[0].scale:.2f} against {counted(known[0].frames, 'frame')} from {known[0].first}"
@@ -196,15 +186,14 @@ def _gps_faults(
     frames: Sequence[PlacedFrame],
     figures: FlightFigures,
     stated: Stated,
-    settings: ConsistencySettings,
 ) -> list[str]:
     rms_m = figures.gps_rms_m
     if rms_m is None or len(frames) <= 3:
         return []
-    doubts = _gps_doubts(figures, settings)
-    if doubts and not _is_alike(frames, settings):
+    doubts = _gps_doubts(figures)
+    if doubts and not _is_alike(frames):
         return doubts
-    if rms_m > max(settings.most_rms_m, settings.rms_sigmas * stated.position_sigma_m):
+    if rms_m > max(_MOST_RMS_M, _RMS_SIGMAS * stated.position_sigma_m):
         return [
             f"the cameras lie {rms_m:.0f} m from their GPS fixes (root mean square), more than a receiver errs: give "
             "control points (--gcp), or photos with more overlap"
@@ -212,11 +201,9 @@ def _gps_faults(
     return []
 
 
-def _gps_doubts(figures: FlightFigures, settings: ConsistencySettings) -> list[str]:
+def _gps_doubts(figures: FlightFigures) -> list[str]:
     median_m = figures.gps_median_m
-    if median_m is None or median_m <= max(
-        settings.off_share * figures.reach_m, settings.most_off_m
-    ):
+    if median_m is None or median_m <= max(_OFF_SHARE * figures.reach_m, _MOST_OFF_M):
         return []
     return [
         f"the pictures' own path and the telemetry disagree by {median_m:.0f} m (median): is this the telemetry of "
@@ -224,19 +211,17 @@ def _gps_doubts(figures: FlightFigures, settings: ConsistencySettings) -> list[s
     ]
 
 
-def _is_alike(frames: Sequence[PlacedFrame], settings: ConsistencySettings) -> bool:
+def _is_alike(frames: Sequence[PlacedFrame]) -> bool:
     """Whether the fixes follow the cameras' path, however badly: a poor receiver's do, another flight's do not."""
     centres_m, fixes_m = _centres_and_fixes(frames)
-    if len(fixes_m) < settings.least_frames or not np.ptp(centres_m, axis=0).any():
+    if len(fixes_m) < _LEAST_FRAMES or not np.ptp(centres_m, axis=0).any():
         return False
     left_m = apply_homography(fit_similarity(fixes_m, centres_m), centres_m) - fixes_m
     spread_m = float(np.linalg.norm(fixes_m.std(axis=0)))
-    return float(np.sqrt((left_m**2).sum(axis=1).mean())) < settings.least_alike * spread_m
+    return float(np.sqrt((left_m**2).sum(axis=1).mean())) < _LEAST_ALIKE * spread_m
 
 
-def _height_faults(
-    frames: Sequence[PlacedFrame], figures: FlightFigures, settings: ConsistencySettings
-) -> list[str]:
+def _height_faults(frames: Sequence[PlacedFrame], figures: FlightFigures) -> list[str]:
     rows = np.array(
         [
             (each.site_from_camera.translation_m[2], each.gps_residual_m[2])
@@ -244,16 +229,14 @@ def _height_faults(
             if each.site_from_camera is not None and np.isfinite(each.gps_residual_m[2])
         ]
     ).reshape(-1, 2)
-    if len(rows) < settings.least_frames or figures.height_m is None:
+    if len(rows) < _LEAST_FRAMES or figures.height_m is None:
         return []
     up_m, off_m = rows.T
     uneven_m = _uneven_m(off_m)
     telemetry_drifts = _uneven_m(up_m) < _uneven_m(
         up_m - off_m
     )  # a barometer or a poor receiver, not the map
-    if telemetry_drifts or uneven_m <= max(
-        settings.most_uneven * figures.height_m, settings.least_uneven_m
-    ):
+    if telemetry_drifts or uneven_m <= max(_MOST_UNEVEN * figures.height_m, _LEAST_UNEVEN_M):
         return []
     return [
         f"the pictures put frames {uneven_m:.0f} m higher or lower than telemetry, at {figures.height_m:.0f} m above "
@@ -266,15 +249,11 @@ def _uneven_m(values_m: Floats) -> float:
     return float(np.percentile(np.abs(values_m - np.median(values_m)), 75))
 
 
-def _height_remarks(
-    figures: FlightFigures, stated: Stated, settings: ConsistencySettings
-) -> list[str]:
+def _height_remarks(figures: FlightFigures, stated: Stated) -> list[str]:
     found_m, stated_m = figures.height_m, stated.height_m
     if found_m is None or not np.isfinite(stated_m):
         return []
-    if abs(found_m - stated_m) <= max(
-        settings.heights_differ * abs(stated_m), settings.heights_differ_m
-    ):
+    if abs(found_m - stated_m) <= max(_HEIGHTS_DIFFER * abs(stated_m), _HEIGHTS_DIFFER_M):
         return []
     return [
         f"{stated.source} give {stated_m:.0f} m above the ground, the pictures and GPS {found_m:.0f} m: the ground "

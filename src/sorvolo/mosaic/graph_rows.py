@@ -235,55 +235,42 @@ def _ideal(camera: Camera, points_px: Floats) -> Floats:
     return (points_px - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
 
 
-@dataclass(frozen=True)
-class AlignmentSettings:
-    """When a map is moved as a whole; a smaller change is the solve's, which knows more than a similarity."""
-
-    rounds: int = 3  # trimmed: a few wild fixes must not turn the map
-    wild: float = 3.0  # times the median miss: such a fix is left out
-    most_uncertain: float = (
-        0.15  # relative, of scale and turn by these fixes: beyond, they leave them open
-    )
-    least_sigmas: float = 3.0  # of scale or turn, or ...
-    least_scale: float = 0.02  # ... relative, ...
-    least_turn_rad: float = 0.03  # 1.7 degrees
-    times_nearer: float = 3.0  # known ground: the places have to come so much nearer
+_ROUNDS = 3  # trimmed: a few wild fixes must not turn the map
+_WILD = 3.0  # times the median miss: such a fix is left out
+_MOST_UNCERTAIN = 0.15  # relative, of scale and turn by these fixes: beyond, they leave them open
+_LEAST_SIGMAS = 3.0  # of scale or turn, or ...
+_LEAST_SCALE = 0.02  # ... relative, ...
+_LEAST_TURN_RAD = 0.03  # 1.7 degrees
+_TIMES_NEARER = 3.0  # known ground: the places have to come so much nearer
 
 
 def change_to_fixes(
     places_m: PointsM,
     fixes_m: PointsM,
     sigma_m: Floats,
-    settings: AlignmentSettings = AlignmentSettings(),
 ) -> Matrix3 | None:
     """The similarity (3, 3) of the ground that brings cameras, (N, 2), to their fixes, (N, 2), of sigmas (N,).
 
     None where the fixes leave it open, or it would change next to nothing.
     """
-    for _ in range(settings.rounds):
+    for _ in range(_ROUNDS):
         spread_m = float(np.sqrt(((fixes_m - fixes_m.mean(0)) ** 2).sum(1).mean()))
         uncertainty = float(np.median(sigma_m)) / (np.sqrt(len(fixes_m)) * max(spread_m, 1e-9))
-        if (
-            len(fixes_m) < 3
-            or uncertainty > settings.most_uncertain
-            or np.ptp(places_m, axis=0).max() <= 0
-        ):
+        if len(fixes_m) < 3 or uncertainty > _MOST_UNCERTAIN or np.ptp(places_m, axis=0).max() <= 0:
             return None
         change = fit_similarity(fixes_m, places_m)
         miss_m = np.linalg.norm(places_m @ change[:2, :2].T + change[:2, 2] - fixes_m, axis=1)
-        keep = miss_m <= max(settings.wild * float(np.median(miss_m)), 1e-6)
+        keep = miss_m <= max(_WILD * float(np.median(miss_m)), 1e-6)
         if keep.all():
             break
         fixes_m, places_m = fixes_m[keep], places_m[keep]
     scale, turn = _scale_and_turn(change)
-    least = settings.least_sigmas * uncertainty
-    keeps_scale = abs(np.log(scale)) < max(least, settings.least_scale)
-    return None if keeps_scale and abs(turn) < max(least, settings.least_turn_rad) else change
+    least = _LEAST_SIGMAS * uncertainty
+    keeps_scale = abs(np.log(scale)) < max(least, _LEAST_SCALE)
+    return None if keeps_scale and abs(turn) < max(least, _LEAST_TURN_RAD) else change
 
 
-def change_to_ground(
-    places_m: PointsM, known_m: PointsM, settings: AlignmentSettings = AlignmentSettings()
-) -> Matrix3 | None:
+def change_to_ground(places_m: PointsM, known_m: PointsM) -> Matrix3 | None:
     """The similarity (3, 3) that brings places of the map, (N, 2), to where they are known to lie, wild ones left out.
 
     None where they leave it open, or it would bring them little nearer.
@@ -293,7 +280,7 @@ def change_to_ground(
         return None
     before_m = np.median(np.linalg.norm(places_m - known_m, axis=1))
     after_m = np.median(np.linalg.norm(apply_homography(change, places_m) - known_m, axis=1))
-    return change if before_m > settings.times_nearer * after_m else None
+    return change if before_m > _TIMES_NEARER * after_m else None
 
 
 def move_all(rows: NodeRows, change: Matrix3) -> None:

@@ -11,21 +11,18 @@ from sorvolo.geometry.arrays import Floats, Mask, PointsM
 from sorvolo.geometry.polygons import points_inside, union_of_boxes
 from sorvolo.survey.coverage import SeenGround
 
-
-@dataclass(frozen=True)
-class SeenSettings:
-    """The cells in which ground is counted, and what counts as a hole."""
-
-    cells_across: int = 24  # of a picture's shorter side on the ground
-    most_cells: int = 1500  # along a side of the whole flight: then they are larger
-    steps: tuple[int, ...] = (
-        1,
-        2,
-        3,
-        5,
-    )  # numbers of pictures that are distinguished: heights need 3, better 5
-    bridged: float = 1.0  # of a picture's shorter side: gaps between strips up to this wide are amid what was seen
-    least_hole: float = 0.05  # of a picture's area: notches at its corners are smaller
+_CELLS_ACROSS = 24  # of a picture's shorter side on the ground
+_MOST_CELLS = 1500  # along a side of the whole flight: then they are larger
+_STEPS = (
+    1,
+    2,
+    3,
+    5,
+)  # numbers of pictures that are distinguished: heights need 3, better 5
+_BRIDGED = (
+    1.0  # of a picture's shorter side: gaps between strips up to this wide are amid what was seen
+)
+_LEAST_HOLE = 0.05  # of a picture's area: notches at its corners are smaller
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +36,6 @@ class PictureOnGround:
 def seen_ground(
     pictures: Sequence[PictureOnGround],
     area_m: Sequence[Sequence[PointsM]] = (),
-    settings: SeenSettings = SeenSettings(),
 ) -> list[SeenGround]:
     """The ground in parts by the number of pictures that show it, then the holes, each in its own part.
 
@@ -48,15 +44,15 @@ def seen_ground(
     """
     if not pictures:
         return []
-    raster = _Raster(pictures, area_m, settings)
+    raster = _Raster(pictures, area_m)
     views, finest = raster.count(pictures)
     parts = []
-    for least, below in zip(settings.steps, (*settings.steps[1:], np.iinfo(np.int32).max)):
+    for least, below in zip(_STEPS, (*_STEPS[1:], np.iinfo(np.int32).max)):
         part = (views >= least) & (views < below)
         if part.any():
             parts.append(raster.part(part, least, float(np.median(finest[part]))))
     wanted = raster.inside(area_m) if area_m else raster.amid(views > 0)
-    least_cells = settings.least_hole * raster.picture_m2 / raster.cell_m**2
+    least_cells = _LEAST_HOLE * raster.picture_m2 / raster.cell_m**2
     for hole in _regions(wanted & (views == 0), least_cells):
         parts.append(raster.part(hole, 0, float("nan")))
     return parts
@@ -90,7 +86,6 @@ class _Raster:
         self,
         pictures: Sequence[PictureOnGround],
         area_m: Sequence[Sequence[PointsM]],
-        settings: SeenSettings,
     ) -> None:
         sides_m = np.array(
             [
@@ -105,11 +100,11 @@ class _Raster:
             *(ring for rings in area_m for ring in rings),
         ]
         corners = np.concatenate(outlines)
-        self._reach_m = settings.bridged * self._side_m / 2
+        self._reach_m = _BRIDGED * self._side_m / 2
         low, high = corners.min(axis=0) - 2 * self._reach_m, corners.max(axis=0) + 2 * self._reach_m
         self.cell_m = max(
-            self._side_m / settings.cells_across,
-            float((high - low).max()) / settings.most_cells,
+            self._side_m / _CELLS_ACROSS,
+            float((high - low).max()) / _MOST_CELLS,
             1e-3,
         )
         self._west_m, self._north_m = float(low[0]), float(high[1])

@@ -41,14 +41,10 @@ class SelectionSettings:
             )
 
 
-@dataclass(frozen=True)
-class CandidateSettings:
-    """Which frames are looked at where telemetry does not show how fast the flight is."""
-
-    step_s: float = 0.2  # five a second: the pictures decide
-    live_speed_m_s: float = (
-        5.0  # at least, of a live flight that has just begun: a drone's usual speed over a survey
-    )
+_STEP_S = 0.2  # five a second: the pictures decide
+_LIVE_SPEED_M_S = (
+    5.0  # at least, of a live flight that has just begun: a drone's usual speed over a survey
+)
 
 
 @dataclass(frozen=True)
@@ -77,11 +73,9 @@ def interval_s(camera: Camera, height_m: float, speed_m_s: float, overlap: float
     return float(np.clip(length_m * (1 - overlap) / max(speed_m_s, 0.1), 0.02, 10.0))
 
 
-def untimed_plan(
-    *, is_video: bool, expected: int, settings: CandidateSettings = CandidateSettings()
-) -> FramePlan:
+def untimed_plan(*, is_video: bool, expected: int) -> FramePlan:
     """The plan of a flight of unknown speed: a video's pictures are asked five times a second, photos are all taken."""
-    step_s = settings.step_s if is_video else 0.0
+    step_s = _STEP_S if is_video else 0.0
     return FramePlan(step_s, 0.0, expected)
 
 
@@ -92,11 +86,10 @@ def live_plan(
     overlap: float,
     *,
     by_pictures: bool,
-    settings: CandidateSettings = CandidateSettings(),
 ) -> FramePlan:
     """The plan of a video that has just begun and does not show yet how fast it will be."""
-    keyframe_s = interval_s(camera, height_m, max(speed_m_s, settings.live_speed_m_s), overlap)
-    step_s = settings.step_s if by_pictures else min(keyframe_s, 2.0)
+    keyframe_s = interval_s(camera, height_m, max(speed_m_s, _LIVE_SPEED_M_S), overlap)
+    step_s = _STEP_S if by_pictures else min(keyframe_s, 2.0)
     return FramePlan(step_s, 0.5 * keyframe_s if by_pictures else 0.0, 2)
 
 

@@ -23,18 +23,10 @@ STAMP_JUMP_NS = 10 * SECOND_NS
 """By which a stream's time stamps may step forward; further, its sender began anew or set its clock."""
 
 
-@dataclass(frozen=True)
-class BacklogSettings:
-    """When decoding has fallen behind, and when nothing more waits to be read. By choice; none is fitted."""
-
-    most_behind_s: float = 1.5  # so much more than lately: from there on packets are left out
-    lately_s: float = 30.0  # the least delay of this time is what the stream itself takes
-    looked_at_s: float = (
-        0.5  # of packets that are left out: so long their stamps are held against the clock
-    )
-    live_rate: float = (
-        1.5  # stamps that run no faster than that come from the sender, not from what waited
-    )
+_MOST_BEHIND_S = 1.5  # so much more than lately: from there on packets are left out
+_LATELY_S = 30.0  # the least delay of this time is what the stream itself takes
+_LOOKED_AT_S = 0.5  # of packets that are left out: so long their stamps are held against the clock
+_LIVE_RATE = 1.5  # stamps that run no faster than that come from the sender, not from what waited
 
 
 class Backlog:
@@ -45,8 +37,8 @@ class Backlog:
     Decoding goes on with the key frame after that, since the pictures before it depend on what was left out.
     """
 
-    def __init__(self, settings: BacklogSettings = BacklogSettings()) -> None:
-        self._settings = settings
+    def __init__(self) -> None:
+
         self._delays_s: deque[tuple[float, float]] = (
             deque()
         )  # when, and how much: ever more, so the first is the least
@@ -66,11 +58,11 @@ class Backlog:
         while self._delays_s and self._delays_s[-1][1] >= delay_s:
             self._delays_s.pop()
         self._delays_s.append((now_s, delay_s))
-        while self._delays_s[0][0] < now_s - self._settings.lately_s:
+        while self._delays_s[0][0] < now_s - _LATELY_S:
             self._delays_s.popleft()
         behind_s = delay_s - self._delays_s[0][1]
         if self._leaves_out_since is None:
-            if behind_s > self._settings.most_behind_s:
+            if behind_s > _MOST_BEHIND_S:
                 self._leaves_out_since = now_s, stamp_s
         elif self._catches_up(now_s, stamp_s) and is_key:
             self._begin_anew()
@@ -83,8 +75,8 @@ class Backlog:
     def _catches_up(self, now_s: float, stamp_s: float) -> bool:
         assert self._leaves_out_since is not None
         began_s, first_s = self._leaves_out_since
-        if now_s - began_s >= self._settings.looked_at_s:
-            self._has_caught_up |= stamp_s - first_s <= self._settings.live_rate * (now_s - began_s)
+        if now_s - began_s >= _LOOKED_AT_S:
+            self._has_caught_up |= stamp_s - first_s <= _LIVE_RATE * (now_s - began_s)
             self._leaves_out_since = now_s, stamp_s
         return self._has_caught_up
 

@@ -22,8 +22,8 @@ from sorvolo.heights.figures import (
     surface_figures,
     surface_warnings,
 )
-from sorvolo.heights.lattice import CellSettings, Lattice
-from sorvolo.heights.orthophoto import OrthophotoSettings, paint_orthophoto
+from sorvolo.heights.lattice import Lattice
+from sorvolo.heights.orthophoto import paint_orthophoto
 from sorvolo.heights.surface import Surface, SurfaceSettings, sweep_surface
 from sorvolo.heights.terrain import TerrainSettings, terrain
 from sorvolo.heights.views import View, fix_from_residual, ground_outlines_m, pixels_wide
@@ -177,14 +177,12 @@ def _bytes(pictures: dict[int, ImageGray]) -> int:
 class HeightSettings:
     """What a person may choose, and the settings of the stages."""
 
-    cell_m: float | None = None  # of the height model; None: by `cells`
-    cells: CellSettings = field(default_factory=CellSettings)
+    cell_m: float | None = None  # of the height model; None: by the photos' pixels
     has_orthophoto: bool = True
     cameras: CameraSettings = field(default_factory=CameraSettings)
     surface: SurfaceSettings = field(default_factory=SurfaceSettings)
     own_points: OwnPointSettings = field(default_factory=OwnPointSettings)
     terrain: TerrainSettings = field(default_factory=TerrainSettings)
-    orthophoto: OrthophotoSettings = field(default_factory=OrthophotoSettings)
 
     def __post_init__(self) -> None:
         if self.cell_m is not None and not 0.001 <= self.cell_m <= 100:
@@ -320,7 +318,7 @@ def _sweep(
 def _lattice(site: Site, views: Sequence[View], settings: HeightSettings) -> Lattice:
     """The cells over the ground that the views show. Raises GeometryError for more of them than can be handled."""
     outlines_m = ground_outlines_m(views)
-    cell_m = settings.cell_m or Lattice.cell_for(outlines_m, site.m_per_px, settings.cells)
+    cell_m = settings.cell_m or Lattice.cell_for(outlines_m, site.m_per_px)
     return Lattice.over(outlines_m, height_grid(site, cell_m))
 
 
@@ -358,9 +356,7 @@ def _paint(
     folder, site_grid = archive.flight_folder(flight_id), archive.site_grid()
     with scratch_folder(folder) as scratch:
         tiles = TileFolder(scratch)
-        painting = paint_orthophoto(
-            surface, site_grid, solved.views, pictures.colour, settings.orthophoto
-        )
+        painting = paint_orthophoto(surface, site_grid, solved.views, pictures.colour)
         for index, rgba, share in painting:
             tiles.save(index, rgba)
             yield HeightsUpdate(flight_id, "orthophoto", share)

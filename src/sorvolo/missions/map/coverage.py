@@ -9,7 +9,7 @@ from typing import Any
 from sorvolo.errors import GeometryError
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.map.painting import REST
-from sorvolo.missions.plan_flight import ReflySettings, fly_again
+from sorvolo.missions.plan_flight import REFLY_BESIDE, REFLY_MOST_HOLES, fly_again
 from sorvolo.mosaic.seen_ground import PictureOnGround, coverage_figures, seen_ground
 from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.store.exports.ground_files import COVERAGE, holes_lonlat, seen_geojson
@@ -34,9 +34,8 @@ class FlightCoverage:
         area: Area | None,
         refly: Sequence[Path],
         live_s: float,
-        settings: ReflySettings = ReflySettings(),
     ) -> None:
-        self._settings = settings
+
         self._setup, self._archive, self._refly, self._live_s = setup, archive, tuple(refly), live_s
         is_known = area is not None and setup.telemetry is not None
         self._area_m = area.polygons_m(setup.frame) if area is not None and is_known else ()
@@ -73,7 +72,7 @@ class FlightCoverage:
         self, ground: Sequence[SeenGround], placed: Sequence[PictureOnGround]
     ) -> tuple[Path, ...]:
         """Write the waypoints over the holes; the files, none where there are no holes or no place on Earth."""
-        holes = [each for each in ground if not each.views][: self._settings.most_holes]
+        holes = [each for each in ground if not each.views][:REFLY_MOST_HOLES]
         site = self._archive.site()
         if not self._refly or site.is_local:
             return ()
@@ -84,9 +83,9 @@ class FlightCoverage:
         camera = self._setup.source.camera.camera
         height_m = median(each.m_per_px for each in placed) * camera.fx_px
         try:
-            rings = holes_lonlat(holes, site, self._settings.beside * height_m)
+            rings = holes_lonlat(holes, site, REFLY_BESIDE * height_m)
             area = Area(rings, f"holes of {self._setup.source.name}")
-            fly_again(area, camera, height_m, self._refly, settings=self._settings)
+            fly_again(area, camera, height_m, self._refly)
         except GeometryError:
             return ()  # too small or too odd to be flown over; they stay in the file of the coverage
         self._is_planned = True

@@ -14,7 +14,7 @@ from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.geometry.planning import BOTTOM_CRITICAL_M
 from sorvolo.geometry.summary import calibration_bins, median_of_known, wilson
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
-from sorvolo.missions.plan_flight import ReflySettings, fly_again
+from sorvolo.missions.plan_flight import REFLY_LEAST_M2, REFLY_LOWEST_M, REFLY_MOST_HOLES, fly_again
 from sorvolo.missions.search.measure import MeasuredClass, MeasuredFlight, SearchFrame
 from sorvolo.missions.search.settings import FIGURES, SearchOutputs, SearchSettings
 from sorvolo.search.cells import Cells
@@ -374,16 +374,15 @@ def write_refly(
 
     It is flown as high as the first flights, lower where their pictures were too coarse for the detector.
     """
-    pace = ReflySettings()
-    large = [each for each in again if each.area_m2 >= pace.least_m2][: pace.most_holes]
+    large = [each for each in again if each.area_m2 >= REFLY_LEAST_M2][:REFLY_MOST_HOLES]
     if not large:
         return None
     area = Area(tuple(_rings(large, grid)), "holes of the search")
     camera, height_m = searched.camera, searched.height_m
     if is_coarse(searched, settings, info):
         needed = needed_m_per_px(searched.labels[0], info)
-        height_m = max(pace.lowest_m, min(height_m, 0.9 * needed * camera.fx_px))
-    plan = fly_again(area, camera, height_m, files, dji_drone=dji_drone, settings=pace)
+        height_m = max(REFLY_LOWEST_M, min(height_m, 0.9 * needed * camera.fx_px))
+    plan = fly_again(area, camera, height_m, files, dji_drone=dji_drone)
     return Refly(
         len(large),
         sum(each.area_m2 for each in large),
@@ -503,7 +502,7 @@ def _without_waypoints(
     removed = f"; earlier ones were taken away: {', '.join(old)}" if old else ""
     beside = " and that flights before it do not show" if leaves_earlier else ""
     return [
-        f"no waypoints were written: no hole of {ReflySettings().least_m2:g} m2 or more is left that another flight "
+        f"no waypoints were written: no hole of {REFLY_LEAST_M2:g} m2 or more is left that another flight "
         f"may see{beside}{removed}"
     ]
 
