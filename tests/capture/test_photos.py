@@ -448,14 +448,7 @@ def test_stated_errors_become_the_priors_own(tmp_path: Path) -> None:
     xmp = XMP.format(prefix="Camera", address="http://pix4d.com/camera/1.0", body=body)
     write_photo(tmp_path / "a.jpg", xmp=xmp, utc="2021:06:01 10:00:00")
     source = open_photos(tmp_path / "a.jpg")
-    clock = tie_clocks(
-        source.telemetry,
-        kind="photos",
-        start_ns=source.start_ns,
-        duration_s=0,
-        offset_given=False,
-        strict=False,
-    )
+    clock = tie_clocks(source.telemetry, np.zeros(1), kind="photos", start_ns=source.start_ns)
     frame = LocalFrame(Geodetic(46.5, -92.25))
     prior = track_from_telemetry(source.telemetry, clock, frame)[0].prior(0.0)
     assert prior.attitude_sigma_deg == pytest.approx([0.4, 0.4, 1.5])

@@ -1,5 +1,6 @@
 """Clocks and tracks: interpolation by eq. 3.18, what lies outside is unknown, and offsets that motion shows."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +21,7 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.geometry.pose import gimbal_angles_from_rotation, site_from_gimbal_rotation
 from sorvolo.survey.flight import Telemetry
+from sorvolo.survey.wording import span_words
 
 FRAME = LocalFrame(Geodetic(41.9, 12.6, 0.0))
 START_NS = 1_778_576_400 * 10**9
@@ -113,34 +115,61 @@ def test_a_sample_without_a_fix_is_no_fix():
     assert site_origin(Telemetry("test", samples.time_ns, {})) is None
 
 
+def own_fixes(times_s) -> Telemetry:
+    return replace(straight(times_s), is_per_photo=True)
+
+
+def tied_photos(samples: Telemetry, times_s, **options) -> Clock:
+    options = {"start_ns": START_NS, **options}
+    return tie_clocks(samples, np.asarray(times_s, float), kind="photos", **options)
+
+
 def test_photos_carry_their_own_fixes():
     times_s = np.array([0.0, 4.0, 60.0, 300.0])
-    clock = tie_clocks(
-        straight(times_s),
-        kind="photos",
-        start_ns=START_NS,
-        duration_s=300,
-        offset_given=False,
-        strict=True,
-    )
+    clock = tied_photos(own_fixes(times_s), times_s)
     assert clock.is_per_photo
-    track, _ = track_from_telemetry(straight(times_s), clock, FRAME)
+    track, _ = track_from_telemetry(own_fixes(times_s), clock, FRAME)
     for time_s in times_s:
         assert np.allclose(track.prior(time_s).position_m[:2], [4 * time_s, time_s], atol=1e-3)
+    with pytest.raises(InputError, match=r"own fix.*--offset 7200.*leave --offset out"):
+        tied_photos(own_fixes(times_s), times_s, offset_s=7200.0)
 
 
-def test_a_lag_moves_a_photos_fix_along_its_velocity_and_doubts_it_in_a_turn():
-    times_s = np.arange(0, 50, 10.0)
-    turning = straight(times_s)
+@pytest.mark.parametrize("kind", ["photos", "video"])
+@pytest.mark.parametrize("offset_s", [0.0, -7200.0, 7.5])
+def test_a_log_is_interpolated_at_the_pictures_own_times_and_ends_where_it_ends(kind, offset_s):
+    taken_s = np.array([0.0, 3.3, 9.1, 19.9])
     clock = tie_clocks(
-        turning, kind="photos", start_ns=START_NS, duration_s=40, offset_given=False, strict=True
+        straight(ONE_HZ),
+        taken_s,
+        kind=kind,
+        start_ns=START_NS - round(offset_s * 1e9),
+        offset_s=offset_s,
     )
-    track, _ = track_from_telemetry(turning, clock, FRAME)
+    assert clock.first_frame_utc_ns == START_NS
+    track, _ = track_from_telemetry(straight(ONE_HZ), clock, FRAME)
+    for time_s in taken_s:
+        assert np.allclose(track.prior(time_s).position_m[:2], [4 * time_s, time_s], atol=1e-3)
+    assert not track.prior(25.0).knows_place and not track.prior(-5.0).knows_place
+
+
+def test_a_log_tells_photos_without_a_time_nothing():
+    with pytest.raises(InputError, match="photos state no time"):
+        tied_photos(straight(ONE_HZ), [0.0, 1.0], start_ns=0)
+
+
+def test_a_late_fix_lies_ahead_on_the_path_of_all_fixes_and_is_doubted_where_that_bends():
+    times_s = np.arange(0, 50, 10.0)
+    turning = own_fixes(times_s)
+    track, _ = track_from_telemetry(turning, tied_photos(turning, times_s), FRAME)
     east_m = track.east_north_m.copy()
     east_m[3:, 0] = east_m[2, 0]  # 4 m/s east until the third photo, none after it
-    moved = shifted(replace(track, east_north_m=east_m), 0.5)
-    assert np.allclose((moved.east_north_m - east_m)[:, 0], [2, 2, 1, 0, 0], atol=1e-3)
+    bent = replace(track, east_north_m=east_m)
+    moved = shifted(bent, 0.5)
+    assert np.allclose((moved.east_north_m - east_m)[:, 0], [2, 2, 0, 0, 0], atol=1e-3)
     assert np.allclose((moved.east_north_m - east_m)[:, 1], 0.5, atol=1e-3)
+    back = shifted(bent, -0.5)
+    assert np.allclose((back.east_north_m - east_m)[:, 0], [-2, -2, -2, 0, 0], atol=1e-3)
     assert np.allclose(moved.horizontal_sigma_m[[0, 1, 3, 4]], track.horizontal_sigma_m[0])
     assert moved.horizontal_sigma_m[2] == pytest.approx(
         np.hypot(track.horizontal_sigma_m[0], 1.0), abs=1e-3
@@ -158,14 +187,9 @@ def test_a_slow_fix_repeated_at_frame_rate_is_a_slow_fix():
 # ---- clocks ---------------------------------------------------------------------------------------------------
 
 
-def tied(samples: Telemetry, start_ns: int, *, strict=True, offset_given=False) -> Clock:
+def tied(samples: Telemetry, start_ns: int, *, offset_s: float | None = None) -> Clock:
     return tie_clocks(
-        samples,
-        kind="video",
-        start_ns=start_ns,
-        duration_s=20.0,
-        offset_given=offset_given,
-        strict=strict,
+        samples, np.arange(21.0), kind="video", start_ns=start_ns, offset_s=offset_s, name="f"
     )
 
 
@@ -182,13 +206,42 @@ def test_subtitles_count_from_the_first_frame():
     assert clock.first_frame_utc_ns == START_NS
 
 
-@pytest.mark.parametrize("hours", [1, 2, -9, 14])
-def test_clocks_some_hours_apart_are_tied_by_their_starts_and_reported(hours):
-    clock = tied(straight(ONE_HZ), START_NS + hours * 3600 * 10**9)
-    assert clock.sample_s[0] == 0.0
-    assert [each.code for each in clock.notices] == ["clocks_apart"]
-    assert f"{abs(hours)}.0 h" in clock.notices[0].text
-    assert clock.first_frame_utc_ns == START_NS
+@pytest.mark.parametrize("kind", ["video", "photos"])
+@pytest.mark.parametrize(
+    "ahead_s", [3600, 7202, -9 * 3600, 19800, -14 * 3600 + 3, 500, 3 * 86400, -40 * 86400]
+)
+def test_without_time_in_common_the_offset_that_would_tie_them_is_named_with_its_sign(
+    kind, ahead_s
+):
+    """The pictures' clock is so far ahead. The number that the message gives puts the cameras where they were."""
+    start_ns, taken_s = START_NS + ahead_s * 10**9, np.linspace(0, 20, 9)
+
+    def clock(offset_s: float | None) -> Clock:
+        return tie_clocks(
+            straight(ONE_HZ), taken_s, kind=kind, start_ns=start_ns, offset_s=offset_s, name="f"
+        )
+
+    with pytest.raises(InputError, match="no time in common") as refused:
+        clock(None)
+    words = str(refused.value)
+    assert f"begins {span_words(abs(ahead_s))} {'before' if ahead_s > 0 else 'after'}" in words
+    offset_s = float(re.search(r"--offset (-?[\d.]+)", words)[1])
+    assert offset_s == pytest.approx(-ahead_s, abs=3)
+    track, _ = track_from_telemetry(straight(ONE_HZ), clock(offset_s), FRAME)
+    for time_s in taken_s[1:-1]:
+        east_m = track.prior(time_s).position_m[0]
+        assert east_m == pytest.approx(4 * (time_s + ahead_s + offset_s), abs=1e-3)
+
+
+def test_the_wrong_sign_is_refused_and_names_the_right_one():
+    with pytest.raises(InputError, match=r"--offset -7200 .*2 h ahead of"):
+        tied(straight(ONE_HZ), START_NS + 7200 * 10**9, offset_s=7200.0)
+
+
+def test_frames_beyond_the_log_are_counted():
+    clock = tied(straight(ONE_HZ), START_NS + 10 * 10**9)
+    assert [each.code for each in clock.notices] == ["partly_covered"]
+    assert "covers 62 %" in clock.notices[0].text
 
 
 def test_a_video_that_does_not_know_its_time_is_tied_by_starts():
@@ -203,16 +256,6 @@ def test_a_log_without_a_date_is_dated_by_the_video(counts_from_first_frame):
         time_ns=np.round(ONE_HZ * 1e9).astype(np.int64),
     )
     assert tied(undated, START_NS).first_frame_utc_ns == START_NS
-
-
-@pytest.mark.parametrize("days", [3, -40])
-def test_telemetry_of_another_day_is_an_error(days):
-    start_ns = START_NS + days * 86400 * 10**9
-    with pytest.raises(InputError, match=r"another flight.*days.*--offset"):
-        tied(straight(ONE_HZ), start_ns)
-    # found beside the video rather than named, or with a word from the user, it is taken
-    assert tied(straight(ONE_HZ), start_ns, strict=False).sample_s[0] == 0.0
-    assert tied(straight(ONE_HZ), start_ns, offset_given=True).sample_s[0] == 0.0
 
 
 # ---- the offset that motion shows -----------------------------------------------------------------------------

@@ -179,7 +179,7 @@ def test_nothing_is_left_of_a_map_that_could_not_begin(
     ("option", "value", "words"),
     [
         ("--gsd", "-1", "(--gsd) must lie in 1e-4 to 100 m, got -1.0"),
-        ("--offset", "1e9", "(--offset) must be a year of seconds at most, got 1000000000.0"),
+        ("--offset", "1e9", "(--offset) must be 20 years of seconds at most, got 1000000000.0"),
     ],
 )
 def test_settings_out_of_range_are_errors(

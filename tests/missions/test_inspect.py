@@ -164,7 +164,8 @@ def test_a_video_with_subtitles_is_tied_to_them(tmp_path: Path) -> None:
     found = one(video)
     assert found.telemetry.samples == 5 and found.telemetry.rate_hz == 1
     assert (
-        found.telemetry.tie == "by time since the video's start" and found.telemetry.covered_s == 4
+        found.telemetry.tie == "telemetry counts from the video's first frame"
+        and found.telemetry.covered_s == 4
     )
     assert found.flight.speed_m_s == pytest.approx(10, rel=0.02) and found.flight.height_m == 20
     assert found.frames.codec == "h264" and found.frames.rate_hz == 10
@@ -206,12 +207,16 @@ def write_gpx(path: Path, start: str) -> Path:
 def test_telemetry_of_another_hour_or_another_day(tmp_path: Path) -> None:
     video = write_video(tmp_path / "a.mp4", {"creation_time": "2021-06-01T10:00:05Z"})
     fits = one(video, telemetry=write_gpx(tmp_path / "fits.gpx", "2021-06-01T10:00:00"))
-    assert fits.telemetry.tie == "by UTC" and fits.telemetry.covered_s == pytest.approx(4, abs=0.2)
+    assert fits.telemetry.tie == "both carry UTC" and fits.telemetry.covered_s == pytest.approx(
+        4, abs=0.2
+    )
     assert not texts(fits, Level.PROBLEM)
     zone = one(video, telemetry=write_gpx(tmp_path / "zone.gpx", "2021-06-01T12:00:00"))
-    assert "2 h behind the telemetry's: a time zone?" in texts(zone, Level.PROBLEM)
+    assert "no time in common" in texts(zone, Level.PROBLEM)
+    (advice,) = [each.advice for each in zone.findings if each.level == Level.PROBLEM]
+    assert "--offset 7200 if the camera's clock is 2 h behind" in advice
     day = one(video, telemetry=write_gpx(tmp_path / "day.gpx", "2021-07-09T10:00:00"))
-    assert "of another time" in texts(day, Level.PROBLEM)
+    assert "begins 37 d 23 h 59 min 55 s after" in texts(day, Level.PROBLEM)
 
 
 def test_a_hovering_drone_is_no_flight(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sorvolo.capture.clock_offset import OffsetEstimate, estimate_offset
+from sorvolo.capture.photos import PhotoSource
 from sorvolo.capture.source import LiveSource, Source
 from sorvolo.capture.sync import (
     Clock,
@@ -33,12 +34,11 @@ _LARGELY = 0.5  # share of samples that have a height: then it is the one that t
 
 @dataclass(frozen=True)
 class TelemetryWishes:
-    """The user's options for a flight's telemetry: seconds to add to the video's time (None: not given), the ground's
-    height in telemetry's own reference (None: not given), whether the file was named by hand."""
+    """The user's options for a flight's telemetry: seconds to add to the frames' time (None: not given), the ground's
+    height in telemetry's own reference (None: not given)."""
 
     offset_s: float | None = None
     ground_elevation_m: float | None = None
-    is_named: bool = False
 
 
 class FlightTelemetry:
@@ -53,28 +53,13 @@ class FlightTelemetry:
         self, source: Source, samples: Telemetry, frame: LocalFrame, wishes: TelemetryWishes
     ) -> None:
         self._source, self._frame = source, frame
-        self.samples, self.offset_s = samples, wishes.offset_s or 0.0
+        self.samples, self._offset_s = samples, wishes.offset_s
         self.version = source.telemetry_version if isinstance(source, LiveSource) else 0
         self._ground_m = wishes.ground_elevation_m
         if self._ground_m is None and np.isfinite(source.ground_elevation_m):
             self._ground_m = source.ground_elevation_m
-        self.clock = (
-            _live_clock(source, samples)
-            if isinstance(source, LiveSource)
-            else tie_clocks(
-                samples,
-                kind=source.kind,
-                start_ns=source.start_ns,
-                duration_s=duration_s(source),
-                offset_given=wishes.offset_s is not None,
-                strict=wishes.is_named,
-            )
-        )
-        self.track, notices = track_from_telemetry(
-            samples, self.clock, frame, ground_elevation_m=self._ground_m
-        )
-        if wishes.offset_s is not None:
-            self.track = shifted(self.track, wishes.offset_s)
+        self.clock = tied_clock(source, samples, wishes.offset_s)
+        self.track, notices = self._laid(samples, self.clock)
         self.notices: tuple[Notice, ...] = (*self.clock.notices, *notices)
 
     def renew(self, time_ns: int) -> None:
@@ -93,21 +78,8 @@ class FlightTelemetry:
             self.samples = (
                 source.telemetry
             )  # fixes failed for minutes: heights are tied to what was before
-        self.clock = _live_clock(source, self.samples)
-        found, _ = track_from_telemetry(
-            self.samples, self.clock, self._frame, ground_elevation_m=self._ground_m
-        )
-        self.track = _continued(self.track, shifted(found, self.offset_s))
-
-    def covers(self, seconds: float) -> bool:
-        """Whether any fix lies within a video of this many seconds, or nearly."""
-        track, known = self.track, self._known
-        margin_s = 1.5 * track.interval_s + 0.5
-        return bool(
-            (
-                (track.sample_s[known] >= -margin_s) & (track.sample_s[known] <= seconds + margin_s)
-            ).any()
-        )
+        self.clock = tied_clock(source, self.samples, self._offset_s)
+        self.track = _continued(self.track, self._laid(self.samples, self.clock)[0])
 
     @property
     def height_m(self) -> float:
@@ -190,10 +162,16 @@ class FlightTelemetry:
             self.samples
         ):
             return self.track
-        found, _ = track_from_telemetry(
-            samples, _live_clock(source, samples), self._frame, ground_elevation_m=self._ground_m
+        found, _ = self._laid(samples, tied_clock(source, samples, self._offset_s))
+        return _continued(self.track, found)
+
+    def _laid(self, samples: Telemetry, clock: Clock) -> tuple[Track, tuple[Notice, ...]]:
+        """The samples in the site frame; photos' own fixes where they are by the given delay."""
+        track, notices = track_from_telemetry(
+            samples, clock, self._frame, ground_elevation_m=self._ground_m
         )
-        return _continued(self.track, shifted(found, self.offset_s))
+        delay_s = (self._offset_s or 0.0) if clock.is_per_photo else 0.0
+        return (shifted(track, delay_s) if delay_s else track), notices
 
     @property
     def _known(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
@@ -203,6 +181,37 @@ class FlightTelemetry:
 def duration_s(source: Source) -> float:
     """How long a video lasts, s; 0 for photos."""
     return source.frame_count / source.frame_rate_hz if source.frame_rate_hz > 0 else 0.0
+
+
+def frame_times_s(source: Source) -> Floats:
+    """(N,) when photos were taken, or each second of a video and its end, after the first frame."""
+    if isinstance(source, PhotoSource):
+        times_ns = np.array([photo.time_ns for photo in source.album.photos])
+        return (times_ns - times_ns[0]) / 1e9
+    seconds = duration_s(source)
+    return np.append(np.arange(0.0, seconds, 1.0), seconds)
+
+
+def tied_clock(source: Source, samples: Telemetry, offset_s: float | None = None) -> Clock:
+    """How telemetry's samples are tied to a source's frames. See `tie_clocks`; a live source ties its own itself."""
+    if isinstance(source, LiveSource):
+        is_per_photo = source.kind == "photos"
+        shift_s = 0.0 if is_per_photo else offset_s or 0.0
+        return Clock(
+            (samples.time_ns - source.start_ns) / 1e9 - shift_s,
+            source.telemetry_tie,
+            source.telemetry_sigma_s,
+            source.start_ns,
+            is_per_photo=is_per_photo,
+        )
+    return tie_clocks(
+        samples,
+        frame_times_s(source),
+        kind=source.kind,
+        start_ns=source.start_ns,
+        offset_s=offset_s,
+        name=source.name,
+    )
 
 
 def distance_m(track: Track, ground_m: PointsM | None) -> float:
@@ -231,16 +240,6 @@ def _speed_m_s(path_s: Floats, path_m: PointsM) -> float:
     steps = np.column_stack([np.interp(times, path_s, path_m[:, k]) for k in range(2)])
     speeds = np.linalg.norm(np.diff(steps, axis=0), axis=1) / np.diff(times)
     return max(_SLOWEST_M_S, float(np.percentile(speeds, 75)))
-
-
-def _live_clock(source: LiveSource, telemetry: Telemetry) -> Clock:
-    """A live source ties its telemetry to its frames itself."""
-    return Clock(
-        (telemetry.time_ns - source.start_ns) / 1e9,
-        source.telemetry_tie,
-        source.telemetry_sigma_s,
-        source.start_ns,
-    )
 
 
 def _continued(before: Track, now: Track) -> Track:

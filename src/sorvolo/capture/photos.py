@@ -396,7 +396,7 @@ def _telemetry_of(photos: Sequence[Photo]) -> tuple[Telemetry, list[Notice]]:
     )
     if not cleaned.has_fixes:
         return no_telemetry(), [*missing, *cleaned.notices]
-    return replace(cleaned, notices=(*missing, *cleaned.notices)), []
+    return replace(cleaned, notices=(*missing, *cleaned.notices), is_per_photo=True), []
 
 
 def _picture_notices(photos: Sequence[Photo], width_px: int, height_px: int) -> list[Notice]:

@@ -6,10 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sorvolo.capture.flight_telemetry import tied_clock
 from sorvolo.capture.live.stream import LiveStream
 from sorvolo.capture.photos import PhotoSource
 from sorvolo.capture.source import LiveSource, Source
+from sorvolo.capture.sync import STARTS_TIED
 from sorvolo.capture.video import VideoSource
+from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, PointsM
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
@@ -54,7 +57,8 @@ class FrameFacts:
 
 @dataclass(frozen=True)
 class TelemetryFacts:
-    """The telemetry. `tie` states how it belongs to the frames, `covered_s` how long both run, NaN if unknown."""
+    """The telemetry. `tie` states how it belongs to the frames, `covered_s` how long both run, NaN if unknown; `apart`
+    is why they do not belong together, "" where they do."""
 
     format: str
     samples: int
@@ -65,6 +69,7 @@ class TelemetryFacts:
     end_ns: int
     tie: str
     covered_s: float
+    apart: str = ""
 
 
 @dataclass(frozen=True)
@@ -173,7 +178,7 @@ def telemetry_facts(source: Source, frames: FrameFacts) -> TelemetryFacts:
     telemetry = source.telemetry
     placed = telemetry.time_ns[np.isfinite(telemetry["latitude_deg"])]
     steps_s = np.diff(placed) / SECOND_NS
-    tie, covered_s = _tie(source, frames)
+    tie, covered_s, apart = _tie(source, frames)
     return TelemetryFacts(
         telemetry.format,
         len(telemetry),
@@ -184,29 +189,27 @@ def telemetry_facts(source: Source, frames: FrameFacts) -> TelemetryFacts:
         int(telemetry.time_ns[-1]) if len(telemetry) else 0,
         tie,
         covered_s,
+        apart,
     )
 
 
-def _tie(source: Source, frames: FrameFacts) -> tuple[str, float]:
-    """How telemetry and frames belong together, in words, and for how many seconds both run."""
+def _tie(source: Source, frames: FrameFacts) -> tuple[str, float, str]:
+    """How telemetry and frames belong together, for how many seconds both run, and why they do not belong together."""
     telemetry = source.telemetry
-    if not len(telemetry):
-        return "no telemetry", math.nan
-    if isinstance(source, LiveSource):
-        return source.telemetry_tie, frames.duration_s
-    if telemetry.format == "exif":
-        return "in each photo", frames.duration_s
-    tied_ns = telemetry.video_time_ns[telemetry.video_time_ns >= 0]
-    if len(tied_ns) and source.kind == "video":
-        return "by time since the video's start", max(
-            0.0, min(frames.duration_s, tied_ns[-1] / SECOND_NS)
+    if not telemetry.has_fixes:
+        return "no telemetry", math.nan, ""
+    try:
+        clock = tied_clock(source, telemetry)
+    except InputError as error:
+        return "none", 0.0, str(error).removeprefix(f"{source.name}: ")
+    if clock.tie == STARTS_TIED:
+        lack = (
+            "the telemetry has no date"
+            if source.start_ns
+            else "the video does not state when it began"
         )
-    if any(notice.code == "no_date" for notice in telemetry.notices):
-        return "unknown: the telemetry has no date", math.nan
-    if not source.start_ns:
-        return "unknown: the video does not state when it began", math.nan
-    both_ns = common_ns(telemetry, source.start_ns, frames.duration_s)
-    return "by UTC", both_ns / SECOND_NS
+        return f"unknown: {lack}", math.nan, ""
+    return clock.tie, clock.covered_share * frames.duration_s, ""
 
 
 def while_filming(source: Source, frames: FrameFacts) -> Telemetry:
@@ -222,14 +225,6 @@ def while_filming(source: Source, frames: FrameFacts) -> Telemetry:
     columns = {name: values[during] for name, values in telemetry.columns.items()}
     return Telemetry(
         telemetry.format, telemetry.time_ns[during], columns, notices=telemetry.notices
-    )
-
-
-def common_ns(telemetry: Telemetry, start_ns: int, duration_s: float) -> int:
-    """For how long telemetry and frames from `start_ns` on run both."""
-    end_ns = start_ns + round(duration_s * SECOND_NS)
-    return max(
-        0, min(end_ns, int(telemetry.time_ns[-1])) - max(start_ns, int(telemetry.time_ns[0]))
     )
 
 

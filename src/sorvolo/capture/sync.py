@@ -6,6 +6,7 @@ from enum import StrEnum
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, Matrix3, PointsM, Rows, Vector3
@@ -17,17 +18,24 @@ from sorvolo.geometry.pose import (
 )
 from sorvolo.geometry.summary import median_or_nan
 from sorvolo.survey.flight import CameraPrior, Notice, Telemetry
+from sorvolo.survey.wording import span_words
 
 PHOTO_TIE = "each photo carries its own fix"
+UTC_TIE = "both carry UTC"
 FIX_DELAY_S = 0.25
 """How far apart a photo's exposure and the fix that it carries lie, 1 sigma: receivers lag, and shutters wait.
 
 Measured on a senseFly survey of 2013: 0.35 s, which is 3 to 5 m at its speed.
 """
 DEFAULT_HORIZONTAL_SIGMA_M = 1.5  # the thesis's DJI Phantom 3, section 2.2
-_OTHER_FLIGHT_S = (
-    24 * 3600.0
-)  # clocks are set to a wrong zone by up to 14 h; a day apart is another flight
+_LONGEST_DELAY_S = 4 * FIX_DELAY_S  # that a photo's own fix is moved along the flight's path
+STARTS_TIED = "first sample tied to first frame"
+_ZONES_S = (
+    3600,
+    1800,
+    900,
+)  # by which clocks are set to a wrong time zone, the commonest first ...
+_FARTHEST_ZONE_S = 14 * 3600  # ... and by how much at most
 DATED_NS = 3650 * 86_400 * 10**9
 """Ten years after 1970: an earlier clock was never set."""
 
@@ -50,10 +58,10 @@ _HEIGHTS = (
 
 @dataclass(frozen=True)
 class Clock:
-    """How the frames' clock is tied to telemetry's: telemetry time = frame time + `offset_s` (+ the tie itself).
+    """How the frames' clock is tied to telemetry's: telemetry time = frame time + the given offset (+ the tie itself).
 
-    `sample_s` are the samples on the frames' clock (seconds since the first frame) at offset 0; `sigma_s` is how
-    far off the tie may be, which bounds the search for an offset.
+    `sample_s` are the samples on the frames' clock, seconds since the first frame; `sigma_s` is how far off the tie may
+    be. `is_per_photo`: each frame carries its own fix and attitude, so that nothing is interpolated.
     """
 
     sample_s: Floats
@@ -61,68 +69,103 @@ class Clock:
     sigma_s: float
     first_frame_utc_ns: int
     notices: tuple[Notice, ...] = ()
+    is_per_photo: bool = False
+    covered_share: float = 1.0  # of the frames' time, by the fixes
 
     @property
-    def is_per_photo(self) -> bool:
-        """Whether each frame carries its own fix and attitude, so that nothing is interpolated."""
-        return self.tie == PHOTO_TIE
+    def is_of_a_log(self) -> bool:
+        """Whether the frames and a log of its own length are tied by what their clocks say, or by their starts."""
+        return self.tie in (UTC_TIE, STARTS_TIED)
 
 
 def tie_clocks(
     telemetry: Telemetry,
+    frames_s: Floats,
     *,
     kind: str,
     start_ns: int,
-    duration_s: float,
-    offset_given: bool,
-    strict: bool,
+    offset_s: float | None = None,
+    name: str = "",
 ) -> Clock:
-    """Put telemetry's samples on the frames' clock.
+    """Put telemetry's samples on the clock of the frames, which were taken at `frames_s` (N,) after the first one.
 
-    Photos carry UTC themselves. A video's subtitles count from its first frame. Else UTC decides when the video
-    knows its own start and it lies in the telemetry, and the first sample is tied to the first frame when not.
-    `strict`: telemetry that the user named; raises InputError when it is plainly of another flight (more than a
-    day apart) and no `--offset` is given.
+    How a fix belongs to a frame follows from where it comes from. A photo's own fix is that photo's. A video's subtitles
+    count from its first frame. Of a log, UTC decides where frames and log have a date; where one has none, its first
+    sample is tied to the first frame. `offset_s` is telemetry's time less the frames'.
+    Raises InputError where frames and fixes have no time in common, with the offset that would tie them.
     """
-    utc_s = (telemetry.time_ns - telemetry.time_ns[:1]) / 1e9
-    first_ns = int(telemetry.time_ns[0])
-    if kind == "photos":
-        return Clock((telemetry.time_ns - start_ns) / 1e9, PHOTO_TIE, FIX_DELAY_S, start_ns)
-    if (telemetry.video_time_ns >= 0).all():
-        zero_ns = int(np.median(telemetry.time_ns - telemetry.video_time_ns))
-        zero_ns = start_ns if zero_ns < DATED_NS else zero_ns  # without a date, as below
-        return Clock(
-            telemetry.video_time_ns / 1e9,
-            "telemetry counts from the video's first frame",
-            0.5,
-            zero_ns,
-        )
-    dated = min(first_ns, start_ns) > DATED_NS
-    if dated:
-        lead_s = (first_ns - start_ns) / 1e9
-        overlap_s = min(lead_s + float(utc_s[-1]), duration_s) - max(lead_s, 0.0)
-        if overlap_s > 0.3 * min(duration_s, float(utc_s[-1]) + 1.0):
-            return Clock(utc_s + lead_s, "both carry UTC", 2.0, start_ns)
-        apart_s = max(lead_s - duration_s, -lead_s - float(utc_s[-1]))
-        if apart_s > _OTHER_FLIGHT_S and strict and not offset_given:
+    first_ns, given_s = int(telemetry.time_ns[0]), offset_s or 0.0
+    since_start_s, given_ns = (telemetry.time_ns - start_ns) / 1e9, round(given_s * 1e9)
+    if telemetry.is_per_photo:
+        if abs(given_s) > _LONGEST_DELAY_S:
             raise InputError(
-                f"the telemetry is of another flight: it begins {apart_s / 86400:.1f} days from the video's own time; "
-                "give the right file with --telemetry, or --offset 0 to tie their starts all the same"
+                f"{name}: each photo carries its own fix, which --offset {given_s:g} cannot belong to; leave --offset out, "
+                "or give the flight's log with --telemetry"
             )
-        words = f"the video's clock and the telemetry's are {apart_s / 3600:.1f} h apart: their starts were tied"
-        return Clock(
-            utc_s,
-            "first sample tied to first frame",
-            3.0,
-            first_ns,
-            (Notice("clocks_apart", 1, words),),
+        return Clock(since_start_s, PHOTO_TIE, FIX_DELAY_S, start_ns, is_per_photo=True)
+    if kind == "photos" and not start_ns:
+        raise InputError(
+            f"{name}: the photos state no time, so that a log cannot be matched to them; give photos whose EXIF has their "
+            "time"
         )
-    # a log without a date is stamped from 1970: then the video's own start dates it
-    return Clock(
-        utc_s,
-        "first sample tied to first frame",
-        3.0,
-        start_ns if first_ns < DATED_NS else first_ns,
+    if kind == "video" and (telemetry.video_time_ns >= 0).all():
+        zero_ns = int(np.median(telemetry.time_ns - telemetry.video_time_ns)) + given_ns
+        zero_ns = start_ns if zero_ns < DATED_NS else zero_ns  # without a date, as below
+        words = "telemetry counts from the video's first frame"
+        clock = Clock(telemetry.video_time_ns / 1e9 - given_s, words, 0.5, zero_ns)
+    elif min(first_ns, start_ns) > DATED_NS:
+        clock = Clock(since_start_s - given_s, UTC_TIE, 2.0, start_ns + given_ns)
+    else:
+        # a log without a date is stamped from 1970: then the video's own start dates it
+        zero_ns = start_ns if first_ns < DATED_NS else first_ns + given_ns
+        since_first_s = (telemetry.time_ns - first_ns) / 1e9
+        clock = Clock(since_first_s - given_s, STARTS_TIED, 3.0, zero_ns)
+    fix_s = clock.sample_s[np.isfinite(telemetry["latitude_deg"])]
+    covered = _covered(fix_s if len(fix_s) else clock.sample_s, frames_s)
+    if not covered.any():
+        raise InputError(f"{name}: {_no_time_in_common(fix_s, frames_s, given_s)}")
+    share = float(covered.mean())
+    if share > 0.98:
+        return clock
+    text = f"the telemetry covers {100 * share:.0f} % of the frames' time: the others are placed by their overlap alone"
+    notice = Notice("partly_covered", int((~covered).sum()), text)
+    return replace(clock, notices=(notice,), covered_share=share)
+
+
+def _covered(fix_s: Floats, frames_s: Floats) -> NDArray[np.bool_]:
+    """(N,) whether each of N moments is within the M fixes, (M,) s, and in none of their gaps."""
+    interval_s = float(np.median(np.diff(fix_s))) if len(fix_s) > 1 else 1.0
+    after = np.searchsorted(fix_s, frames_s)
+    before, at = np.maximum(after - 1, 0), np.minimum(after, len(fix_s) - 1)
+    gap_s = fix_s[at] - fix_s[before]
+    beyond_s = np.minimum(abs(frames_s - fix_s[before]), abs(frames_s - fix_s[at]))
+    is_inside = (gap_s > 0) & (gap_s <= max(4 * interval_s, 3.0))
+    return np.asarray(is_inside | (beyond_s <= 1.5 * interval_s + 0.5))
+
+
+def _no_time_in_common(fix_s: Floats, frames_s: Floats, given_s: float) -> str:
+    """By how much pictures and log are apart, and the `--offset` that would tie them: a time zone's if one does."""
+    lead_s = float(fix_s[0])
+    way = "after" if lead_s > 0 else "before"
+    under = f" with --offset {given_s:g}" if given_s else ""
+    found = (
+        f"the telemetry and the pictures have no time in common{under}: the log begins {span_words(abs(lead_s))} {way} "
+        "the pictures"
+    )
+    for step_s in _ZONES_S:
+        zones_s = np.arange(-_FARTHEST_ZONE_S, _FARTHEST_ZONE_S + 1, step_s)
+        shares = [float(_covered(fix_s - zone_s, frames_s).mean()) for zone_s in zones_s]
+        best = max(range(len(zones_s)), key=lambda k: (shares[k], -abs(zones_s[k])))
+        if shares[best] > 0.5:
+            tied_s = given_s + float(zones_s[best])
+            side = "behind" if tied_s > 0 else "ahead of"
+            return (
+                f"{found}; give --offset {tied_s:g} if the camera's clock is {span_words(abs(tied_s))} {side} the log's "
+                "(a time zone), or give the log of this flight"
+            )
+    return (
+        f"{found}; give the log of this flight, or --offset {round(given_s + lead_s, 2):.10g} if both began together and a "
+        "clock was wrong"
     )
 
 
@@ -360,28 +403,22 @@ def track_from_telemetry(
 def shifted(track: Track, offset_s: float) -> Track:
     """The track with telemetry time = frame time + offset_s.
 
-    Photos keep their own fixes and attitude: each fix moves by `offset_s` along its own velocity, and is trusted less
-    where the velocity changes, as in a turn.
+    Photos keep their own attitude. Their fixes came late by `offset_s`, about a second at most: each is where the
+    path of all fixes is that much later, and is trusted less where the path bends.
     """
     if track.interval_s:
         return replace(track, sample_s=track.sample_s - offset_s)
-    # Velocity at each fix, (N, 2) m/s, the mean of the legs before and after it; and half their
-    # difference, (N,).
     known = np.flatnonzero(np.isfinite(track.east_north_m[:, 0]))
-    velocities, spread = np.zeros_like(track.east_north_m), np.zeros(len(track.east_north_m))
-    if len(known) >= 2:
-        legs = np.diff(track.east_north_m[known], axis=0) / np.diff(track.sample_s[known])[:, None]
-        before, after = np.vstack([legs[:1], legs]), np.vstack([legs, legs[-1:]])
-        velocities[known], spread[known] = (
-            (before + after) / 2,
-            np.linalg.norm(after - before, axis=1) / 2,
-        )
-    velocities_m_s, spread_m_s = velocities, spread
-    return replace(
-        track,
-        east_north_m=track.east_north_m + offset_s * velocities_m_s,
-        horizontal_sigma_m=np.hypot(track.horizontal_sigma_m, offset_s * spread_m_s),
-    )
+    if len(known) < 2:
+        return track
+    times_s, places_m = track.sample_s[known], track.east_north_m[known]
+    legs_m_s = np.diff(places_m, axis=0) / np.diff(times_s)[:, None]
+    before, after = np.vstack([legs_m_s[:1], legs_m_s]), np.vstack([legs_m_s, legs_m_s[-1:]])
+    moved_m, sigma_m = track.east_north_m.copy(), track.horizontal_sigma_m.copy()
+    moved_m[known] = places_m + offset_s * (after if offset_s > 0 else before)
+    bend_m = offset_s * np.linalg.norm(after - before, axis=1) / 2
+    sigma_m[known] = np.hypot(sigma_m[known], bend_m)
+    return replace(track, east_north_m=moved_m, horizontal_sigma_m=sigma_m)
 
 
 def site_origin(telemetry: Telemetry) -> Geodetic | None:

@@ -35,7 +35,10 @@ Area = Annotated[
 ]
 Offset = Annotated[
     float | None,
-    typer.Option(help="Telemetry time minus video time, s.", show_default="from motion or clocks"),
+    typer.Option(
+        help="Seconds to add to the pictures' time to get the log's: 7200 if the camera's clock is two hours behind.",
+        show_default="from motion or clocks",
+    ),
 ]
 GroundElevation = Annotated[
     float | None,

@@ -11,7 +11,6 @@ from sorvolo.capture.preflight import (
     FlightFacts,
     FrameFacts,
     TelemetryFacts,
-    common_ns,
     flight_facts,
     frame_facts,
     telemetry_facts,
@@ -23,7 +22,6 @@ from sorvolo.missions.flight.sample_frames import sample_frames
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.survey.flight import CameraModel, Notice
 
-_ZONE_NS = 900 * SECOND_NS  # time zones differ by quarters of an hour
 _BLURRED = (
     1.5  # registration.features.sharpness at 960 px falls below this when blurred by two pixels
 )
@@ -219,22 +217,17 @@ def _telemetry_findings(source: Source, frames: FrameFacts, facts: TelemetryFact
                 "give the flight's log with --telemetry, or put it beside the video under the same name",
             )
         ]
-    if math.isnan(facts.covered_s) or not frames.duration_s > 0:
-        if source.kind == "video":
-            return [
-                Finding(
-                    Level.WARNING,
-                    f"how video and telemetry fit in time is {facts.tie}",
-                    "give --offset if you know it; else it is estimated from the motion",
-                )
-            ]
-        return []
-    return _cover_findings(source, frames, facts)
-
-
-def _cover_findings(source: Source, frames: FrameFacts, facts: TelemetryFacts) -> list[Finding]:
-    """Whether the telemetry is of the same time as the frames."""
-    share = facts.covered_s / frames.duration_s
+    if facts.apart:
+        found, _, advice = facts.apart.partition("; ")
+        return [Finding(Level.PROBLEM, found, advice)]
+    if facts.tie.startswith("unknown"):
+        return [
+            Finding(
+                Level.WARNING,
+                f"how the pictures and the telemetry fit in time is {facts.tie}",
+                "give --offset if you know it; else it is estimated from the motion",
+            )
+        ]
     beyond_s = float(source.telemetry.video_time_ns.max(initial=0)) / SECOND_NS - frames.duration_s
     if source.kind == "video" and beyond_s > max(5.0, 0.2 * frames.duration_s):
         return [
@@ -244,35 +237,14 @@ def _cover_findings(source: Source, frames: FrameFacts, facts: TelemetryFacts) -
                 "check that it belongs to this video, and that the video is whole",
             )
         ]
-    if share > 0.98 or facts.format == "exif":
+    share = facts.covered_s / frames.duration_s if frames.duration_s > 0 else 1.0
+    if share > 0.98:
         return []
-    if share > 0:
-        return [
-            Finding(
-                Level.WARNING,
-                f"the telemetry covers {100 * share:.0f} % of the frames' time",
-                "frames outside it are placed by their overlap alone",
-            )
-        ]
-    apart_ns = facts.start_ns - source.start_ns
-    zone_ns = round(apart_ns / _ZONE_NS) * _ZONE_NS
-    if abs(zone_ns) <= 14 * 3600 * SECOND_NS and common_ns(
-        source.telemetry, source.start_ns + zone_ns, frames.duration_s
-    ):
-        hours = abs(zone_ns) / (3600 * SECOND_NS)
-        way = "behind" if zone_ns > 0 else "ahead of"
-        return [
-            Finding(
-                Level.PROBLEM,
-                f"the frames' clock is about {hours:g} h {way} the telemetry's: a time zone?",
-                "give the difference with --offset",
-            )
-        ]
     return [
         Finding(
-            Level.PROBLEM,
-            f"the telemetry is of another time: it begins {apart_ns / SECOND_NS:+.0f} s from the frames",
-            "give the telemetry of this flight, or --offset if a clock was wrong",
+            Level.WARNING,
+            f"the telemetry covers {100 * share:.0f} % of the frames' time",
+            "frames outside it are placed by their overlap alone",
         )
     ]
 

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 
 import av
 
+from sorvolo.capture.flight_telemetry import tied_clock
 from sorvolo.capture.live.addresses import (
     FollowedPath,
     StreamAddress,
@@ -24,7 +25,6 @@ from sorvolo.capture.live.links import LINK_FORMS, NmeaLink, is_link
 from sorvolo.capture.live.reader import REFUSALS
 from sorvolo.capture.live.reconnect import Backoff, LiveSettings, Outages
 from sorvolo.capture.source import Source, open_sources, safe_name
-from sorvolo.capture.sync import tie_clocks
 from sorvolo.capture.telemetry.nmea import Epoch
 from sorvolo.errors import InputError
 from sorvolo.geometry.camera import Camera
@@ -197,14 +197,7 @@ class Recording:
                 _piece(first_us + each, Sample(start_ns + each * 1000, {}, lens))
                 for each in times_us
             ]
-        clock = tie_clocks(
-            telemetry,
-            kind="video",
-            start_ns=source.start_ns,
-            duration_s=duration_s,
-            offset_given=False,
-            strict=False,
-        )
+        clock = tied_clock(source, telemetry)
         found = []
         for row, second in enumerate(clock.sample_s):
             if -1.0 <= second <= duration_s + 1.0:

@@ -52,7 +52,8 @@ class Telemetry:
     """Samples of one flight in order of time, as columns of equal length; NaN where the source states nothing.
 
     `time_ns` is UTC and strictly increasing. `video_time_ns`, where the source is tied to a video (subtitles), is
-    the sample's time since the video's first frame; -1 where unknown. `format` is the reader's name.
+    the sample's time since the video's first frame; -1 where unknown. `format` is the reader's name. `is_per_photo`:
+    each sample is of one photo and at exactly its time, so that no clock ties the two.
     """
 
     format: str
@@ -60,6 +61,7 @@ class Telemetry:
     columns: Mapping[str, Floats]
     video_time_ns: TimesNs = None  # type: ignore[assignment]  # becomes all -1
     notices: tuple[Notice, ...] = ()
+    is_per_photo: bool = False
 
     def __post_init__(self) -> None:
         time_ns = frozen(self.time_ns, np.int64)

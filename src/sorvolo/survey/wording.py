@@ -35,6 +35,15 @@ def most_first(names: Iterable[str]) -> dict[str, int]:
     return dict(sorted(Counter(names).items(), key=lambda each: (-each[1], each[0])))
 
 
+def span_words(seconds: float) -> str:
+    """A time in whole seconds, zeros left out: "1 h 59 min 58 s", "3 d 2 h"."""
+    left, parts = round(seconds), []
+    for unit_s, unit in ((86_400, "d"), (3_600, "h"), (60, "min"), (1, "s")):
+        count, left = divmod(left, unit_s)
+        parts += [f"{count} {unit}"] if count else []
+    return " ".join(parts) or "0 s"
+
+
 def area_text(area_m2: float, *, is_local: bool = False) -> str:
     """Ground in square metres, hectares or square kilometres; in square units of a map without metres."""
     if is_local:

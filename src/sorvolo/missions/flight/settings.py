@@ -50,14 +50,14 @@ def available_bytes() -> int:
     return min(machine, int(limit)) if limit.isdigit() else machine
 
 
-_MOST_OFFSET_S = 86_400 * 365  # a year: a clock that was never set
+_MOST_OFFSET_S = 86_400 * 365 * 20  # a clock that was never set begins with its maker's year
 
 
 def check_offset(offset_s: float | None) -> None:
     """Raise SettingsError for a clock offset, s, that no clock has; None leaves it to the clocks."""
     if offset_s is not None and not abs(offset_s) <= _MOST_OFFSET_S:
         raise SettingsError(
-            f"the clock offset (--offset) must be a year of seconds at most, got {offset_s}"
+            f"the clock offset (--offset) must be 20 years of seconds at most, got {offset_s}"
         )
 
 

@@ -82,7 +82,7 @@ class FlightSetup:
 
     def utc_ns(self, time_ns: int) -> int:
         """A frame's UTC by telemetry's clock, where the source ties the two."""
-        if self.clock is None or self.source.kind == "photos":
+        if self.clock is None:
             return time_ns
         return time_ns - self.source.start_ns + self.clock.first_frame_utc_ns
 
@@ -127,7 +127,7 @@ def prepare(
     (N, 2) are places all over the ground that the site shows, see `known_ground_m`. `finds_itself`: the
     flight's frames are looked for in the site's map, so that they need no GPS. `known_ground` are its control points or
     its base map, which place a flight without GPS. Raises InputError when the flight is of
-    another place than the site, or the telemetry of another flight.
+    another place than the site, or where its pictures and its log have no time in common.
     """
     if isinstance(source, LiveSource):
         source.wait_for_first_fixes()
@@ -143,7 +143,7 @@ def prepare(
         return FlightSetup(source, site.frame, plan, site, (Notice("no_telemetry", 1, text),))
     if not has_fixes:
         return _without_gps(source, settings, site, telemetry_named, known_ground)
-    setup = _with_gps(source, settings, site, telemetry_named, ground_m, founds_site=founds_site)
+    setup = _with_gps(source, settings, site, ground_m, founds_site=founds_site)
     if known_ground is None:
         return setup
     track, frame = setup.track, setup.frame
@@ -207,7 +207,6 @@ def _with_gps(
     source: Source,
     settings: MapSettings,
     site: Site | None,
-    telemetry_named: bool,
     ground_m: PointsM | None,
     *,
     founds_site: bool,
@@ -230,16 +229,11 @@ def _with_gps(
         if not founds_site or (origin.latitude_deg, origin.longitude_deg) != place:
             origin = site.origin
     frame = LocalFrame(origin)
-    wishes = TelemetryWishes(settings.offset_s, settings.ground_elevation_m, telemetry_named)
+    wishes = TelemetryWishes(settings.offset_s, settings.ground_elevation_m)
     telemetry = FlightTelemetry(source, samples, frame, wishes)
     if site is not None:
         check_place(site, telemetry.track, source.name, ground_m)
     seconds, is_live = duration_s(source), isinstance(source, LiveSource)
-    if source.kind == "video" and not is_live and not telemetry.covers(seconds):
-        raise InputError(
-            f"the telemetry ({samples.format}) has no fix during the {seconds:.0f} s of {source.name}; give the "
-            "telemetry of this flight, or another --offset"
-        )
     camera, by_pictures = source.camera.camera, settings.method is None
     moving = camera, telemetry.height_m, telemetry.speed_m_s, settings.overlap
     if source.kind == "photos":

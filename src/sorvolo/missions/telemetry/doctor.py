@@ -129,9 +129,10 @@ def correct_telemetry(
             name = _flight(archive, flight or opened.name)
             _check_same(archive, name, opened, source)
             _check_folder(folder, name, site)
-            setup = prepare(opened, MapSettings(), site, telemetry_named=telemetry is not None)
-            solved = _solved(archive, name, _first_ns(setup))
             mapped = archive.report(name)
+            asked = MapSettings(offset_s=_clock(mapped)[1])
+            setup = prepare(opened, asked, site, telemetry_named=telemetry is not None)
+            solved = _solved(archive, name, _first_ns(setup))
             solved, compared = _compared(setup, solved, mapped)
             return _written(site, name, folder, solved, compared, mapped, cot)
 
@@ -270,7 +271,7 @@ def _compared(
         raise InputError(
             f"{first}: no telemetry with positions was found in it or beside it; give it as --telemetry"
         )
-    clock, applied_s = _clock(report)
+    clock, _, applied_s = _clock(report)
     priors = track.priors([solved[k].seconds for k in seen], applied_s, setup.plan.smooth_s)
     if not any(each.knows_place for each in priors):
         raise InputError(
@@ -333,13 +334,17 @@ def _is_tied(report: Mapping[str, Any]) -> bool:
     )
 
 
-def _clock(report: Mapping[str, Any]) -> tuple[Bias, float]:
-    """The clock offset that the map found, and the one that it applied, s."""
+def _clock(report: Mapping[str, Any]) -> tuple[Bias, float | None, float]:
+    """The clock offset that the map found, the one that it was given (None: none), and the one that it applied beyond
+    that, s."""
     offset = report.get("time_offset") or {}
     value, sigma = (
         nan if offset.get(key) is None else float(offset[key]) for key in ("estimate_s", "sigma_s")
     )
-    return Bias(value, sigma), float(offset.get("applied_s") or 0.0)
+    applied_s = float(offset.get("applied_s") or 0.0)
+    if offset.get("origin") == "given":
+        return Bias(value, sigma), applied_s, 0.0
+    return Bias(value, sigma), None, applied_s
 
 
 def _written(
