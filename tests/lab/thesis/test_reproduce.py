@@ -8,9 +8,12 @@ from functools import reduce
 from operator import xor
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
+from sorvolo.capture.calibration import camera_from_option
+from sorvolo.capture.photo_metadata import read_photo_metadata
 from sorvolo.cli.main import main
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.lab.evaluation.change_metrics import Counts
@@ -18,6 +21,7 @@ from sorvolo.lab.evaluation.mask_folders import frames_against_times
 from sorvolo.lab.simulation.flight_files import write_mask
 from sorvolo.lab.thesis.comparisons import TABLE, _judged, _times_of
 from sorvolo.lab.thesis.detectors import okutama_labels
+from sorvolo.lab.thesis.npu_folder import photos_of_sequence, read_npu_folder
 from sorvolo.lab.thesis.published import APPEARANCES, TABLE_4_3
 from sorvolo.lab.thesis.report import MARKDOWN, NUMBERS, PAGE, write_reproduction
 from sorvolo.lab.thesis.rows import Row
@@ -32,8 +36,17 @@ from sorvolo.lab.thesis.sheets import reproduction_sheets
 from sorvolo.lab.thesis.simulated import simulated_dataset
 from sorvolo.lab.thesis.tables import tables_of
 from sorvolo.lab.thesis.umcd import read_umcd_metadata
-from sorvolo.lab.thesis.umcd_folder import CHANGES, MOSAICKING, WITH, UmcdVideo, read_umcd_folder
-from sorvolo.lab.thesis.video_input import VideoInput
+from sorvolo.lab.thesis.umcd_folder import (
+    BENCHMARK,
+    CHANGES,
+    MOSAICKING,
+    WITH,
+    UmcdVideo,
+    read_umcd_folder,
+)
+from sorvolo.lab.thesis.video_input import VideoInput, video_input
+from sorvolo.store.exports.map_pictures import picture
+from sorvolo.store.site.archive import Archive
 
 SETTINGS, SIZE = quick(
     ReproductionSettings(views_per_second=2.5, detector=DetectorSettings(steps=0)),
@@ -172,7 +185,7 @@ def test_npus_flights_are_mapped_and_compared_with_the_published_mosaics(
         ("npu/phantom3-npu", "guessed")
     ] * 2
     assert rows["published/npu/phantom3-npu/planar"].values["correlation_after_shift"] > 0.5
-    assert "no mosaic (.tif) of Bu et al." in rows["published/npu/phantom3-village/planar"].missing
+    assert "no mosaic of Bu et al." in rows["published/npu/phantom3-village/planar"].missing
     assert "phantom3-village.mp4" in rows["mosaic/without/npu/phantom3-village/planar"].missing
     tables = tables_of([each.row for each in reproduced[1]] + list(rows.values()))
     assert {each["sequence"] for each in tables["table_4_1"]["ours"]} == {
@@ -194,6 +207,70 @@ def test_npus_flights_are_mapped_and_compared_with_the_published_mosaics(
                 own.parent.parent / "out" / "sites" / "npu-phantom3-npu" / "planar" / "flights"
             )
         )
+
+
+def test_the_benchmark_mosaic_of_a_video_is_found_and_correlated(
+    dataset: Path, reproduced: tuple[Path, list[ReproductionUpdate]], tmp_path: Path
+) -> None:
+    """A picture without coordinates, turned and of another size, as the thesis's own mosaics are."""
+    place = copied(dataset, tmp_path / "umcd")
+    own = place / BENCHMARK / "Videos With Telemetry" / "Mosaicking" / "Countryside" / "path1.png"
+    own.parent.mkdir(parents=True)
+    with Archive.open(
+        reproduced[0] / "sites" / "countryside-path1" / "planar", write=False
+    ) as site:
+        rgba = picture(site.tiles(), 2048).rgba
+    turned = cv2.rotate(rgba, cv2.ROTATE_90_CLOCKWISE)
+    turned[turned[..., 3] == 0] = 0
+    shown = cv2.resize(turned[..., :3], None, fx=0.8, fy=0.8, interpolation=cv2.INTER_AREA)
+    cv2.imwrite(str(own), shown[..., ::-1])
+    shutil.copytree(reproduced[0], tmp_path / "out")
+    work = _Work(read_umcd_folder(place), tmp_path / "out", SETTINGS)
+    rows = [work.done(task)[0] for task in work.mosaic_tasks() if task.kind == "benchmark"]
+    assert [row.id for row in rows] == [
+        f"benchmark/with/countryside/path1/{method}" for method in ("thesis", "planar")
+    ]
+    assert all(row.values["correlation"] > 0.7 for row in rows), [row.missing for row in rows]
+    tables = tables_of([each.row for each in reproduced[1]] + rows)
+    assert [each["benchmarks"] for each in tables["section_4_1_1"]["ours"]] == [1, 1]
+
+
+def test_npus_sequences_are_read_as_published(tmp_path: Path) -> None:
+    """Key frames by place and calibration, and all frames with a log of fixes: one a second of them."""
+    jpeg = cv2.imencode(".jpg", np.full((60, 80, 3), 90, np.uint8))[1].tobytes()
+    folder = tmp_path / "phantom3-npu-kfs"
+    (folder / "rgb").mkdir(parents=True)
+    (folder / "config.cfg").write_text(
+        "Plane = 0 0 -100 0 0 0 1\nGPS.Origin = 108.9 34.2 400\n"
+        "Camera.Paraments = [80 60 70 71 40 30 -0.1 0.01 0 0 0]\n"
+    )
+    (folder / "trajectory.txt").write_text("10.5 0 0 20 0 0 0 1\n12.75 30 0 20 0 0 0 1\n")
+    unified = tmp_path / "phantom3-npu-unified"
+    (unified / "rgb").mkdir(parents=True)
+    (unified / "frames.txt").write_text("".join(f"{n / 10} rgb/{n}.jpg\n" for n in range(25)))
+    (unified / "gps.txt").write_text("0 108.9 34.2 400 1\n2 108.9002 34.2 402 1\n")
+    for name in ("10.5", "12.75"):
+        (folder / "rgb" / f"{name}.jpg").write_bytes(jpeg)
+    for n in range(25):
+        (unified / "rgb" / f"{n}.jpg").write_bytes(jpeg)
+    sequences = read_npu_folder(tmp_path)
+    assert [each.video.key for each in sequences] == [
+        "npu/phantom3-npu-kfs",
+        "npu/phantom3-npu-unified",
+    ]
+    kfs, all_frames = (
+        video_input(each.video, None, tmp_path / each.video.name / "made") for each in sequences
+    )
+    assert kfs.camera is not None and camera_from_option(str(kfs.camera), 80, 60).camera.fx_px == 70
+    first, second = (read_photo_metadata(each) for each in sorted(kfs.video.iterdir()))
+    assert second.utc_ns - first.utc_ns == 2_250_000_000
+    assert second.columns["longitude_deg"] - 108.9 == pytest.approx(30 / 92_150, rel=0.01)
+    assert second.columns["height_above_takeoff_m"] == pytest.approx(120)
+    fixes = [read_photo_metadata(each).columns for each in sorted(all_frames.video.iterdir())]
+    assert [each["longitude_deg"] for each in fixes] == pytest.approx([108.9, 108.9001, 108.9002])
+    (folder / "config.cfg").write_text("")
+    with pytest.raises(InputError, match=r"no GPS\.Origin"):
+        photos_of_sequence(folder, tmp_path / "again")
 
 
 def test_a_changed_pair_without_anything_to_judge_it_by_is_named(

@@ -7,23 +7,31 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import cv2
 import numpy as np
 
+from sorvolo.capture.photos import read_picture
+from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats
 from sorvolo.geometry.polygons import signed_area
 from sorvolo.lab.evaluation.frame_deviation import MapDeviation
 from sorvolo.lab.evaluation.frame_rows import map_frames
+from sorvolo.lab.evaluation.map_quality import correlation
 from sorvolo.lab.evaluation.mosaic import evaluate_mosaic
 from sorvolo.lab.thesis.mapping import ThesisMapping
 from sorvolo.lab.thesis.settings import FIGURE_PX
-from sorvolo.lab.thesis.stitching import RoiStitchingSettings
+from sorvolo.lab.thesis.stitching import NotStitched, RoiStitcher, RoiStitchingSettings
 from sorvolo.lab.thesis.video_input import VideoInput
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
+from sorvolo.registration.features import gray_from_rgb
+from sorvolo.registration.lens import at_most
 from sorvolo.store.atomic import writing
 from sorvolo.store.exports.map_pictures import picture
 from sorvolo.store.images import jpeg_from_image, jpeg_from_rgba
 from sorvolo.store.site.archive import Archive
+
+_LAID_OVER_PX = 2048  # longer side at which mosaics without coordinates are compared
 
 
 @dataclass(frozen=True)
@@ -144,10 +152,13 @@ def distortion_of(site: Path) -> dict[str, Any]:
 
 
 def correlation_of(site: Path, mosaic: Path) -> dict[str, Any]:
-    """Eq. 4.1 of a flight's map and another mosaic of it, a GeoTIFF, as they lie and after the shift between them.
+    """Eq. 4.1 of a flight's map and another mosaic of it. A GeoTIFF is compared as it lies and after the shift between
+    them; a picture without coordinates is laid over the map by the thesis's own features.
 
-    Raises InputError as `evaluate_mosaic`.
+    Raises InputError as `evaluate_mosaic`, and where the picture is found nowhere on the map.
     """
+    if mosaic.suffix.lower() not in (".tif", ".tiff"):
+        return _correlation_with_picture(site, mosaic)
     reference = evaluate_mosaic(site, reference=mosaic).reference
     assert reference is not None
     return {
@@ -155,4 +166,30 @@ def correlation_of(site: Path, mosaic: Path) -> dict[str, Any]:
         "correlation_after_shift": reference.correlation_after_shift,
         "m_per_px": reference.m_per_px,
         "area_m2": reference.area_m2,
+    }
+
+
+def _correlation_with_picture(site: Path, mosaic: Path) -> dict[str, Any]:
+    other = at_most(read_picture(mosaic), _LAID_OVER_PX)
+    with Archive.open(site, write=False) as archive:
+        own = picture(archive.tiles(), _LAID_OVER_PX)
+        m_per_px = archive.site().m_per_px * own.step_px
+    stitcher = RoiStitcher(RoiStitchingSettings(ransac_px=10.0))
+    stitcher.add(0, other)
+    found = stitcher.add(1, np.ascontiguousarray(own.rgba[..., :3]))
+    if isinstance(found, NotStitched):
+        raise InputError(f"{mosaic}: was not found on the map ({found.reason})")
+    gray = gray_from_rgb(other)
+    under = np.asarray(
+        cv2.warpPerspective(own.rgba, found.mosaic_from_image, gray.shape[::-1]), np.uint8
+    )
+    # what a mosaic does not show is one colour, black or white
+    known = (under[..., 3] == 255) & (gray > 0) & (gray < 255)
+    value = correlation(gray, gray_from_rgb(np.ascontiguousarray(under[..., :3])), known)
+    scale = float(np.sqrt(abs(np.linalg.det(found.mosaic_from_image[:2, :2]))))
+    return {
+        "correlation": value,
+        "correlation_after_shift": value,
+        "m_per_px": m_per_px / scale,
+        "area_m2": float(known.sum()) * (m_per_px / scale) ** 2,
     }

@@ -15,6 +15,7 @@ from sorvolo.lab.thesis.npu_folder import ENVIRONMENT, read_npu_folder
 from sorvolo.lab.thesis.published import VIDEOS
 from sorvolo.lab.thesis.rows import Row, RowStore
 from sorvolo.lab.thesis.settings import (
+    BENCHMARK,
     COMPARISONS,
     MAP_METHODS,
     PUBLISHED,
@@ -133,6 +134,7 @@ class _Work:
         for each in self._chosen(self._dataset.mosaicking):
             yield from self._tasks_of_map(each)
             yield self._task("correlation", each.key, (each,), partial(self._correlate, each))
+            yield from self._benchmark_tasks(each)
             first = first or each
         if first is not None:
             for transform in ("similarity", "homography"):
@@ -145,6 +147,7 @@ class _Work:
             yield self._task("example", first.key, (first,), partial(self._example, first))
         for each in self._chosen(self._dataset.without_telemetry):
             yield from self._tasks_of_map(each)
+            yield from self._benchmark_tasks(each)
 
     def npu_tasks(self, place: Path | None) -> Iterator[_Task]:
         """Table 4.1 on its own dataset, and the correlation with the mosaics of Bu et al."""
@@ -154,17 +157,30 @@ class _Work:
         for video in self._chosen([each.video for each in sequences.values()]):
             yield from self._tasks_of_map(video)
             mosaic = sequences[video.key].mosaic
-            for method in MAP_METHODS:
-                row_id = f"{PUBLISHED}/{video.key}/{method}"
-                if mosaic is None:
-                    yield _Task(
-                        row_id,
-                        PUBLISHED,
-                        missing=f"{video.video}: no mosaic (.tif) of Bu et al. beside it",
-                    )
-                    continue
+            yield from self._published_tasks(
+                PUBLISHED, video.key, video, mosaic, "mosaic of Bu et al. beside it"
+            )
+
+    def _published_tasks(
+        self, kind: str, name: str, video: UmcdVideo, mosaic: Path | None, wanted: str
+    ) -> Iterator[_Task]:
+        """Eq. 4.1 of each method's map and a published mosaic."""
+        for method in MAP_METHODS:
+            row_id = f"{kind}/{name}/{method}"
+            if mosaic is None:
+                yield _Task(row_id, kind, missing=f"{video.video}: no {wanted}")
+            else:
                 make = partial(self._correlate_published, video, mosaic, method)
-                yield _Task(row_id, PUBLISHED, (*_files_of(video), mosaic), make)
+                yield _Task(row_id, kind, (*_files_of(video), mosaic), make)
+
+    def _benchmark_tasks(self, video: UmcdVideo) -> Iterator[_Task]:
+        """Section 2.4, where the dataset has the folder."""
+        if self._dataset.benchmarks is not None:
+            mosaic = self._dataset.benchmark_of(video)
+            name = f"{'with' if video.has_telemetry else 'without'}/{video.key}"
+            yield from self._published_tasks(
+                BENCHMARK, name, video, mosaic, f"mosaic of it in {self._dataset.benchmarks}"
+            )
 
     def change_tasks(self) -> Iterator[_Task]:
         """Section 4.2: Tables 4.3 to 4.5, the times, Figures 4.4 and 4.5."""
@@ -251,7 +267,7 @@ class _Work:
         camera = (
             None if each.environment == ENVIRONMENT else self._dataset.camera
         )  # another drone flew those
-        return video_input(each, camera)
+        return video_input(each, camera, self._site(each, "photos"))
 
     def _site(self, each: UmcdVideo, name: str) -> Path:
         return self._out / "sites" / each.key.replace("/", "-") / name

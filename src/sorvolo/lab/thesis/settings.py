@@ -11,8 +11,8 @@ FIGURE_PX = 960
 """The longer side of a picture in the figures."""
 
 MAP_METHODS = ("thesis", "planar")
-PUBLISHED = "published"
-"""The kind of rows that compare a map with a published mosaic of the NPU Drone-Map dataset."""
+PUBLISHED, BENCHMARK = "published", "benchmark"
+"""The kinds of rows that compare a map with a published mosaic, of the NPU Drone-Map dataset and of UMCD's (2.4)."""
 COMPARISONS: dict[str, ThesisComparison | None] = {
     "thesis": ThesisComparison(),
     "thesis, eq. 3.21 as printed": ThesisComparison(ThesisSettings(isolation_as_printed=True)),

@@ -246,7 +246,7 @@ class RoiStitcher:
                 np.array([[1, 0, -low[0]], [0, 1, -low[1]], [0, 0, 1.0]])
                 @ each.placed.mosaic_from_image
             )
-            outline = apply_homography(roi_from_image, _corners(width, height))
+            outline = apply_homography(roi_from_image, _corners(*each.gray.shape[::-1]))
             if (outline.max(axis=0) <= 0).any() or (outline.min(axis=0) >= size).any():
                 continue
             cv2.warpPerspective(

@@ -18,7 +18,7 @@ from sorvolo.lab.thesis.published import (
     TABLE_4_6,
 )
 from sorvolo.lab.thesis.rows import Row
-from sorvolo.lab.thesis.settings import COMPARISONS, MAP_METHODS, PUBLISHED
+from sorvolo.lab.thesis.settings import BENCHMARK, COMPARISONS, MAP_METHODS, PUBLISHED
 
 _COUNTS = ("tp", "fp", "fn", "tn")
 
@@ -83,6 +83,7 @@ def _deviations(rows: Sequence[Row]) -> list[dict[str, Any]]:
             "deviation",
         )
         published = _values(own, PUBLISHED, "correlation")
+        benchmarks = _values(own, BENCHMARK, "correlation")
         if shares or published:
             found.append(
                 {
@@ -93,6 +94,8 @@ def _deviations(rows: Sequence[Row]) -> list[dict[str, Any]]:
                     "correlated": len(alike),
                     "published_correlation": _mean(published),
                     "published": len(published),
+                    "benchmark_correlation": _mean(benchmarks),
+                    "benchmarks": len(benchmarks),
                 }
             )
     return found

@@ -11,11 +11,14 @@ from sorvolo.lab.thesis.umcd import looks_like_umcd
 
 WITH, WITHOUT = "Videos With Telemetry", "Videos Without Telemetry"
 MOSAICKING, CHANGES = "Mosaicking", "Change Detection"
-CALIBRATION = "Camera Calibration"
+CALIBRATION, BENCHMARK = "Camera Calibration", "Benchmark Mosaics"
 """The names of the folders, as the thesis writes them; read in any case, with any separators."""
 
 MASKS_ENDING = "_masks"
 """Of the folder beside a video that holds its change masks, one a frame. The dataset has none: they are added."""
+
+PICTURE_ENDINGS = frozenset({".tif", ".tiff", ".png", ".jpg", ".jpeg"})
+"""Of published mosaics."""
 
 _VIDEO_ENDINGS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".m4v"})
 _TEXT_ENDINGS = frozenset({".txt", ".csv", ".log", ".nmea", ".srt", ".gpx", ".tsv", ".gps", ".dat"})
@@ -53,6 +56,28 @@ class UmcdFolder:
     mosaicking: tuple[UmcdVideo, ...]
     change_detection: tuple[UmcdVideo, ...]
     camera: Path | None
+    benchmarks: Path | None = None
+
+    def benchmark_of(self, video: UmcdVideo) -> Path | None:
+        """The published mosaic of a mosaicking video (thesis 2.4): a picture of its name below its environment's.
+
+        Of several, the one below a folder "...without..." is that of a video without telemetry. None where it is not
+        known for sure.
+        """
+        below = sorted(self.benchmarks.rglob("*")) if self.benchmarks is not None else []
+        found = []
+        for path in below:
+            folders = [_letters(each) for each in path.parts[len(self.place.parts) : -1]]
+            if (
+                path.suffix.lower() in PICTURE_ENDINGS
+                and path.stem.lower() == video.name.lower()
+                and _letters(video.environment) in folders
+                and not any(each.startswith("change") for each in folders)
+            ):
+                found.append((path, any("without" in each for each in folders)))
+        if len(found) > 1:
+            found = [each for each in found if each[1] != video.has_telemetry]
+        return found[0][0] if len(found) == 1 else None
 
     def mosaic_of(self, later: UmcdVideo) -> UmcdVideo | None:
         """The mosaicking video of the path that a change detection video flew: path4 of path4_1 (thesis 2.2)."""
@@ -69,7 +94,7 @@ def read_umcd_folder(place: Path) -> UmcdFolder:
     """
     if not place.is_dir():
         raise InputError(f"{place}: no such folder; give the folder of the UMCD dataset")
-    parts = {name: _folder(place, name) for name in (WITHOUT, WITH, CALIBRATION)}
+    parts = {name: _folder(place, name) for name in (WITHOUT, WITH, CALIBRATION, BENCHMARK)}
     mosaicking, changes = (_folder(parts[WITH], name) for name in (MOSAICKING, CHANGES))
     bare = _folder(parts[WITHOUT], MOSAICKING) or parts[WITHOUT]
     maps, later = videos_in(mosaicking), videos_in(changes)
@@ -79,7 +104,7 @@ def read_umcd_folder(place: Path) -> UmcdFolder:
             f"{place}: not the UMCD dataset: no videos in '{WITHOUT}', nor in '{MOSAICKING}' or '{CHANGES}' of "
             f"'{WITH}' (thesis, chapter 2); give the folder that holds these"
         )
-    return UmcdFolder(place, videos, maps, later, _camera(parts[CALIBRATION]))
+    return UmcdFolder(place, videos, maps, later, _camera(parts[CALIBRATION]), parts[BENCHMARK])
 
 
 def videos_in(part: Path | None) -> tuple[UmcdVideo, ...]:

@@ -5,9 +5,11 @@ from pathlib import Path
 from typing import Any
 
 from sorvolo.capture.calibration import camera_from_option
+from sorvolo.capture.photo_metadata import read_photo_metadata
 from sorvolo.capture.telemetry import is_telemetry
 from sorvolo.capture.video import read_video_info
 from sorvolo.errors import InputError
+from sorvolo.lab.thesis.npu_folder import photos_of_sequence
 from sorvolo.lab.thesis.umcd_folder import UmcdVideo
 
 
@@ -28,11 +30,17 @@ class VideoInput:
         return {"telemetry": self.telemetry, "camera": self.camera}
 
 
-def video_input(each: UmcdVideo, camera: Path | None) -> VideoInput:
+def video_input(each: UmcdVideo, camera: Path | None, scratch: Path) -> VideoInput:
     """Look into a video and what lies beside it; raises InputError for one that cannot be used, naming what it lacks.
+
+    A sequence of the NPU Drone-Map dataset, a folder, is made photos in `scratch`.
 
     A table of telemetry is not read here: the mission that reads it reports what is wrong with it.
     """
+    if each.video.is_dir():
+        photos, own_camera = photos_of_sequence(each.video, scratch)
+        first = read_photo_metadata(min(photos.iterdir()))
+        return VideoInput(photos, None, own_camera, 1.0, 0.0, (first.width_px, first.height_px))
     info = read_video_info(each.video)
     telemetry = next((path for path in each.texts if is_telemetry(path)), None)
     if each.has_telemetry and telemetry is None:
