@@ -31,6 +31,8 @@ DIALECTS = {
     "line": "F/5.6, SS 400, ISO 100, EV 0, GPS ({lon:.6f}, {lat:.6f}, 15), HOME (1.5, 2.5, -57.98m), "
     "D 698.70m, H {h:.2f}m, H.S 2.88m/s, V.S 0.00m/s, "
     "F.PRY (2.7°, -7.0°, 110.1°), G.PRY (-24.4°, 0.0°, 110.4°)",
+    "autel": "HOME(E: 1.5, N: 2.5) 2021.12.25 12:27:{s:02d}\n"
+    "GPS({ew}: {alon:.6f}, {ns}: {alat:.6f}, 120.5) ReH:{h:.1f} \nISO:100",
     "letters": "HOME(E: 1.5, N: 2.5, 3.0m) 2021.12.25 12:27:{s:02d}\n"
     "GPS({ew}: {alon:.6f}, {ns}: {alat:.6f}, 120.5m) BAROMETER:{h:.1f}",
 }
@@ -52,6 +54,17 @@ def srt(dialect: str, places, newline: str = "\n") -> str:
         )
         cues.append(f"{index + 1}\n00:00:{index:02d},000 --> 00:00:{index + 1:02d},000\n{body}\n\n")
     return "".join(cues).replace("\n", newline)
+
+
+def ass(dialect: str, places) -> str:
+    """The same cues as an Advanced SubStation Alpha file."""
+    head = "[Script Info]\nScriptType: v4.00+\n\n[Events]\nFormat: Layer, Start, End, Style, Name, MarginL, Effect, Text\n"
+    lines = []
+    for cue in srt(dialect, places).strip().split("\n\n"):
+        _, times, *body = cue.split("\n")
+        start, end = (f"{int(each[:2])}{each[2:8]}.{each[9:11]}" for each in times.split(" --> "))
+        lines.append(f"Dialogue: 0,{start},{end},Default,,0,0,0,," + "\\N".join(body))
+    return head + "\n".join(lines) + "\n"
 
 
 def codes(telemetry) -> dict[str, int]:
@@ -76,7 +89,7 @@ def test_every_dialect_comes_back(dialect, latitude, longitude, newline, height_
     assert telemetry["longitude_deg"] == pytest.approx([longitude] * 4, abs=6e-7)
     if dialect != "spaced":
         assert telemetry["height_above_takeoff_m"] == pytest.approx([height_m] * 4, abs=0.051)
-    if dialect in ("brackets", "spaced", "letters"):
+    if dialect in ("brackets", "spaced", "letters", "autel"):
         assert list(telemetry["orthometric_height_m"]) == [120.5] * 4
     else:
         assert np.isnan(telemetry["orthometric_height_m"]).all()
@@ -335,3 +348,17 @@ def test_real_file_of_several_recordings():
 def test_real_empty_file():
     with pytest.raises(InputError, match="no subtitle times"):
         dji_srt.read(real("broken_empty.SRT"), "broken_empty.SRT")
+
+
+@pytest.mark.parametrize("dialect", ["autel", "home", "brackets"])
+def test_ass_subtitles_say_the_same_as_srt(dialect):
+    places = [(41.89 + 1e-5 * row, -12.6, 49.9 + row) for row in range(8)]
+    expected = dji_srt.read(srt(dialect, places).encode(), "MAX_0001.SRT")
+    data = ass(dialect, places).encode()
+    assert dji_srt.recognises(data)
+    found = dji_srt.read(data, "MAX_0001.ass")
+    assert found.time_ns.tolist() == expected.time_ns.tolist()
+    assert found.video_time_ns.tolist() == expected.video_time_ns.tolist()
+    for name, column in expected.columns.items():
+        np.testing.assert_array_equal(found[name], column)
+    np.testing.assert_allclose(found["height_above_takeoff_m"], 49.9 + np.arange(8))

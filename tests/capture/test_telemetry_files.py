@@ -49,7 +49,7 @@ def test_every_reader_is_listed_by_its_own_name():
         (bytes(range(256)) * 10, "binary"),
         (
             b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR",
-            "a binary file, not a log in text; read are DJI subtitles",
+            "a binary file, not a log in text; read are DJI's and Autel's subtitles",
         ),
         (
             b"\0\0\0\x14ftypmp41\x13\x10\x18mp41\0",

@@ -539,3 +539,27 @@ def test_any_cells_raise_only_input_errors(cells):
         return
     latitude = telemetry["latitude_deg"]
     assert (np.abs(latitude[np.isfinite(latitude)]) <= 90).all()
+
+
+def litchi(*more: str) -> bytes:
+    """Ten rows of a log of Litchi's, with more columns of 1.5."""
+    names = "latitude,longitude,altitude(feet),ascent(feet),speed(mph),max_altitude(feet),datetime(utc),gimbalPitchRaw"
+    rows = [
+        f"41.8900{row},12.6,500,{100 * row},10,900,2026-04-02 12:44:{row:02d},-900"
+        + ",1.5" * len(more)
+        for row in range(10)
+    ]
+    return "\n".join([",".join([names, *more]), *rows]).encode()
+
+
+def test_columns_of_height_and_gimbal_that_are_not_understood_are_named():
+    telemetry = flight_table.read(litchi(), "litchi.csv")
+    np.testing.assert_allclose(telemetry["height_above_takeoff_m"], 30.48 * np.arange(10))
+    assert np.isnan(telemetry["orthometric_height_m"]).all()
+    (found,) = [each for each in telemetry.notices if each.code == "unknown_column"]
+    assert found.text.endswith("are not understood: altitude(feet), gimbalPitchRaw")
+    # where what they may hold is read, others of that kind are no news
+    more = litchi(
+        "altitude_msl(m)", "gimbal_pitch(deg)", "height_sonar(m)", "gimbal.isPitchAtLimit"
+    )
+    assert "unknown_column" not in codes(flight_table.read(more, "litchi.csv"))

@@ -14,7 +14,7 @@ LARGEST_FILE_BYTES = 500_000_000
 _HEAD_BYTES = (
     65_536  # of a file, by which its format is recognised; a flight table's header has thousands
 )
-_SUFFIXES = (".srt", ".csv", ".nmea", ".gpx", ".log", ".txt", ".tsv", ".gps", ".dat")
+_SUFFIXES = (".srt", ".ass", ".csv", ".nmea", ".gpx", ".log", ".txt", ".tsv", ".gps", ".dat")
 _VIDEO_SUFFIXES = frozenset(
     (".mp4", ".mov", ".mkv", ".avi", ".ts", ".m2ts", ".mts", ".m4v", ".webm", ".mpg", ".mpeg")
 )
@@ -59,7 +59,7 @@ def read_telemetry(path: Path) -> Telemetry:
     reader = _reader_for(data[:_HEAD_BYTES])
     if reader is None:
         raise InputError(
-            f"{path}: {_unknown(data)}; read are DJI subtitles (.SRT), GPX tracks with times, tables with Latitude and "
+            f"{path}: {_unknown(data)}; read are DJI's and Autel's subtitles (.SRT, .ass), GPX tracks with times, tables with Latitude and "
             "Longitude columns (DatCon, Airdata, DJI logs as .csv), and NMEA 0183 with GGA or RMC sentences"
         )
     return TELEMETRY_READERS[reader].read(data, str(path))

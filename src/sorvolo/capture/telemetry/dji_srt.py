@@ -1,4 +1,4 @@
-"""DJI's subtitles: one cue a frame or a second, in the dialects that a dozen drones have written."""
+"""DJI's and Autel's subtitles: one cue a frame or a second, in the dialects that a dozen drones have written."""
 
 import re
 from collections import Counter
@@ -30,6 +30,10 @@ _MOST_CUES = 1_000_000  # four and a half hours at 60 frames a second
 _LONGEST_CUE = 4000  # characters; drones write up to 600
 
 _CUE = re.compile(r"(\d{1,3}):(\d{2}):(\d{2})[,.](\d{1,3})[ \t]*-->")
+# a line of an .ass file: layer, start, end, style, name, three margins, effect, text
+_DIALOGUE = re.compile(
+    r"^Dialogue:[^,\n]*,\s*(\d:\d{2}:\d{2}\.\d{2}),(?:[^,\n]*,){7}", re.MULTILINE
+)
 _TELEMETRY = re.compile(
     r"\b(?:(?:GPS|HOME)\s*\(|(?:latitude|FrameCnt|SrtCnt)\s*:|BAROMETER\s*[:(])", re.IGNORECASE
 )
@@ -50,6 +54,7 @@ _COLUMN_OF_KEY = {
     "rel_alt": "height_above_takeoff_m",
     "barometer": "height_above_takeoff_m",
     "hb": "height_above_takeoff_m",
+    "reh": "height_above_takeoff_m",
     "abs_alt": "orthometric_height_m",
     "altitude": "orthometric_height_m",
     "gb_yaw": "camera_yaw_deg",
@@ -82,18 +87,18 @@ class _Cue:
 
 def recognises(head: bytes) -> bool:
     """Whether the file's first bytes hold a subtitle's times and any of DJI's keys."""
-    text = text_from_bytes(head)
+    text = _subtitles(head)
     return _CUE.search(text) is not None and _TELEMETRY.search(text) is not None
 
 
 def read(data: bytes, name: str) -> Telemetry:
-    """The samples of a DJI subtitle file, one per cue; `video_time_ns` is the cue's start.
+    """The samples of a subtitle file, .srt or .ass, one per cue; `video_time_ns` is the cue's start.
 
     rel_alt, BAROMETER, Hb and H are heights above take-off; abs_alt and altitude, which DJI calls absolute,
     are stored as orthometric. Dates name no time zone and are taken as UTC. `name` is for messages. Raises
     InputError when no cue states a position or an attitude.
     """
-    text = text_from_bytes(data)
+    text = _subtitles(data)
     counts: Counter[str] = Counter()
     decimals = [0]
     cues = [_cue(match, body, counts, decimals) for match, body in _cues_in(text, name)]
@@ -116,6 +121,14 @@ def read(data: bytes, name: str) -> Telemetry:
         notices=_notices(counts, int((stamps_ns != NO_TIME_NS).sum()), len(cues)),
         position_decimals=max(decimals) or None,
     )
+
+
+def _subtitles(data: bytes) -> str:
+    """The file's text, the cues of an .ass written as those of an .srt."""
+    text = text_from_bytes(data)
+    if "Dialogue:" not in text:
+        return text
+    return _DIALOGUE.sub(r"\1 -->\n", text).replace("\\N", "\n")
 
 
 def _columns_of(cues: list[_Cue]) -> dict[str, Floats]:

@@ -49,6 +49,7 @@ COLUMN_NAMES: Mapping[str, tuple[str, ...]] = {
         "relativealtitude",
         "relalt",
         "osdheight",
+        "ascent",
     ),
     "barometer": ("baroalt",),
     "camera_yaw": ("gimbalyaw", "gimbalheading"),
@@ -160,6 +161,10 @@ _UNITS: Mapping[str, Mapping[str, float]] = {
     "utc": {"": 1.0, "utc": 1.0, "gps": 1.0, "local": 1.0, **_SECONDS},
     "date": {"": 1.0, "utc": 1.0, "local": 1.0},
 }
+_HEIGHT_OR_GIMBAL = re.compile(
+    r"(?!.*(max|home|limit|valid|mode|speed)).*(altitude|height|ascent|elevation)"
+    r"|gimbal(?!is).*(pitch|roll|yaw|heading|tilt)(?!atlimit)"
+)
 _PUNCTUATION = re.compile(r"[\s_#:.\-\xa0]+")
 
 
@@ -217,10 +222,12 @@ class _Table:
 
 @dataclass(frozen=True)
 class _Header:
-    """The line with the columns' names: where the rows begin, the delimiter, each column's plain name and unit."""
+    """The line with the columns' names: where the rows begin, the delimiter, each column's name as it is written, and
+    its plain name and unit."""
 
     rows_from: int
     delimiter: str
+    cells: list[str]
     columns: list[tuple[str, str]]
 
 
@@ -285,12 +292,13 @@ def _header(text: str) -> _Header | None:
         for delimiter in (",", ";", "\t"):
             if delimiter not in line[0] or len(line[0]) > _LONGEST_HEADER:
                 continue
-            columns = [plain_name(cell) for cell in _split(line[0], delimiter)]
+            cells = _split(line[0], delimiter)
+            columns = [plain_name(cell) for cell in cells]
             plain = {column for column, _ in columns}
             if plain.intersection(COLUMN_NAMES["latitude"]) and plain.intersection(
                 COLUMN_NAMES["longitude"]
             ):
-                return _Header(line.end(), delimiter, columns)
+                return _Header(line.end(), delimiter, cells, columns)
     return None
 
 
@@ -333,7 +341,23 @@ def _known_columns(header: _Header) -> tuple[dict[str, int], dict[str, float], l
             )
         else:
             places[key], factors[key] = labels.index(label), factor
-    return places, factors, notices
+    return places, factors, notices + _not_understood(header, places)
+
+
+def _not_understood(header: _Header, places: Mapping[str, int]) -> list[Notice]:
+    """Names columns of heights and of the gimbal that nothing reads, where what they may hold is not read either."""
+    known = {name for names in COLUMN_NAMES.values() for name in names}
+    has_heights = "relative_height" in places and "altitude" in places
+    has_gimbal = "camera_pitch" in places
+    names = [
+        cell.strip()
+        for cell, (label, _) in zip(header.cells, header.columns)
+        if label not in known
+        and _HEIGHT_OR_GIMBAL.match(label)
+        and not (has_gimbal if label.startswith("gimbal") else has_heights)
+    ]
+    words = "columns that seem to hold heights or the gimbal's angles are not understood: "
+    return notice("unknown_column", len(names), words + ", ".join(names[:6]))
 
 
 def _rows(
