@@ -39,7 +39,9 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 # the EXIF FocalPlaneResolutionUnit: inch, centimetre, millimetre, micrometre
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _SIGN_OF_LETTER = ({"N": 1, "S": -1}, {"E": 1, "W": -1})  # of latitude, of longitude
-_APART_M = 10.0  # positions of one photo: rounding and corrections stay below; by choice
+APART_M = 10.0
+"""Positions of one photo contradict each other from here on: rounding and corrections stay below; by choice."""
+
 _M_S_PER_SPEED_UNIT = {"K": KM_AN_HOUR_M_S, "M": MILE_AN_HOUR_M_S, "N": KNOT_M_S}
 
 
@@ -353,9 +355,9 @@ def _place(gps: _Tags, properties: Mapping[str, str]) -> tuple[dict[str, float],
     if not any(xmp.values()):  # 0/0 is what drones write before their first fix
         return exif, None if all(signs) else PlaceDoubt.SIGN_ASSUMED
     by_xmp = {name: copysign(angle, xmp[name]) for name, angle in exif.items()}
-    if _apart_m(by_xmp, xmp) > _APART_M:
+    if apart_m(by_xmp, xmp) > APART_M:
         return exif, PlaceDoubt.CONTRADICTED
-    return by_xmp, PlaceDoubt.SIGN_BY_XMP if _apart_m(exif, by_xmp) > _APART_M else None
+    return by_xmp, PlaceDoubt.SIGN_BY_XMP if apart_m(exif, by_xmp) > APART_M else None
 
 
 def _on_earth(latitude_deg: float, longitude_deg: float) -> dict[str, float]:
@@ -365,7 +367,8 @@ def _on_earth(latitude_deg: float, longitude_deg: float) -> dict[str, float]:
     return {"latitude_deg": latitude_deg, "longitude_deg": longitude_deg}
 
 
-def _apart_m(one: Mapping[str, float], other: Mapping[str, float]) -> float:
+def apart_m(one: Mapping[str, float], other: Mapping[str, float]) -> float:
+    """How far two places, telemetry columns, are apart."""
     north_deg, east_deg = (one[name] - other[name] for name in ("latitude_deg", "longitude_deg"))
     east_deg = (east_deg + 180) % 360 - 180
     return M_PER_DEG_LATITUDE * hypot(north_deg, east_deg * cos(radians(one["latitude_deg"])))

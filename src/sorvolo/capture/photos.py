@@ -3,7 +3,7 @@
 import hashlib
 import re
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from enum import Enum, auto
@@ -15,7 +15,14 @@ import cv2
 import numpy as np
 
 from sorvolo.capture.decoding import LARGEST_FRAME_PX, decode_photo
-from sorvolo.capture.photo_metadata import PhotoMetadata, PlaceDoubt, read_photo_metadata
+from sorvolo.capture.photo_metadata import (
+    APART_M,
+    PhotoMetadata,
+    PlaceDoubt,
+    apart_m,
+    read_photo_metadata,
+)
+from sorvolo.capture.photo_positions import read_positions
 from sorvolo.capture.picture_sizes import is_same_shape, other_size
 from sorvolo.capture.telemetry.cleaning import clean, notice
 from sorvolo.errors import InputError
@@ -44,6 +51,14 @@ _EDGE_BYTES = (
     65_536  # of a photo's beginning and end, by which a copy of it is recognised; by choice
 )
 _EXIF_UTC = "UTC in the photos' EXIF"
+_OF_A_PLACE = {
+    "latitude_deg",
+    "longitude_deg",
+    "ellipsoidal_height_m",
+    "orthometric_height_m",
+    "horizontal_sigma_m",
+    "vertical_sigma_m",
+}
 _DOUBTS = {
     PlaceDoubt.VOID: "photos whose position is there, but marked void (V) by the camera, and not used: {}",
     PlaceDoubt.VOID_BY_XMP: "photos whose EXIF position is marked void (V), placed by their XMP: {}",
@@ -166,10 +181,14 @@ def read_picture(path: Path, *, reduces: bool = False) -> ImageRGB:
     return np.ascontiguousarray(_turn(image, metadata.orientation))
 
 
-def read_album(paths: Sequence[Path]) -> Album:
+def read_album(
+    paths: Sequence[Path], positions: Sequence[Path] = (), *, strict: bool = False
+) -> Album:
     """Read every photo's metadata and put the photos in order of time; takes milliseconds a photo.
 
-    Raises InputError when none of the files is a readable picture.
+    `positions` are files that place photos by name or number (`read_positions`), which goes before the photos' own; of
+    a photo in several the first counts. `strict`: one that cannot be used is an error, no notice. Raises InputError
+    when none of the files is a readable picture.
     """
     found = [
         _read(path) for path in sorted(paths, key=lambda path: (_natural(path.stem), path.name))
@@ -178,6 +197,7 @@ def read_album(paths: Sequence[Path]) -> Album:
         raise InputError(
             f"none of the {len(found)} pictures can be read; the first: {found[0].problem.removeprefix('corrupt: ')}"
         )
+    found, place_notices = _placed(found, positions, strict=strict)
     timed, start_origin, time_notices = _put_in_time(found)
     distinct = _mark_duplicates(timed)
     width_px, height_px = _usual_size(distinct)
@@ -196,7 +216,12 @@ def read_album(paths: Sequence[Path]) -> Album:
         telemetry,
         0 if start_origin.startswith("unknown") else photos[0].time_ns,
         start_origin,
-        (*time_notices, *gps_notices, *_picture_notices(photos, width_px, height_px)),
+        (
+            *place_notices,
+            *time_notices,
+            *gps_notices,
+            *_picture_notices(photos, width_px, height_px),
+        ),
     )
 
 
@@ -205,6 +230,49 @@ def _read(path: Path) -> Photo:
         return Photo(path, 0, read_photo_metadata(path))
     except InputError as error:
         return Photo(path, 0, PhotoMetadata(0, 0), f"corrupt: {error}", PhotoFault.UNREADABLE)
+
+
+def _placed(
+    photos: Sequence[Photo], files: Sequence[Path], *, strict: bool
+) -> tuple[list[Photo], list[Notice]]:
+    """The photos with the positions of files in place of their own, and how many each file places."""
+    notices: list[Notice] = []
+    placed: dict[str, dict[str, float]] = {}
+    by_name = {photo.path.name: photo.metadata for photo in photos}
+    for path in files:
+        try:
+            left = {name: each for name, each in by_name.items() if name not in placed}
+            stated, words = read_positions(path, left)
+        except InputError as error:
+            if strict:
+                raise
+            notices.append(Notice("unusable_telemetry", 1, f"not used: {error}"))
+            continue
+        far = sum(
+            "latitude_deg" in by_name[name].columns
+            and apart_m(by_name[name].columns, columns) > APART_M
+            for name, columns in stated.items()
+        )
+        text = f"photos placed by {path.name}: {{}} of {len(photos)}{words}"
+        contradicted = (
+            f"photos whose own position is more than 10 m from {path.name}'s, which is taken: {{}}"
+        )
+        notices += notice("positions_from_file", len(stated), text)
+        notices += notice(PlaceDoubt.CONTRADICTED, far, contradicted)
+        placed |= stated
+    return [
+        replace(photo, metadata=_replaced(photo.metadata, placed[photo.path.name]))
+        if photo.path.name in placed
+        else photo
+        for photo in photos
+    ], notices
+
+
+def _replaced(metadata: PhotoMetadata, place: Mapping[str, float]) -> PhotoMetadata:
+    """A photo's metadata with another place; its angles and its height above take-off stay its own."""
+    own = {name: value for name, value in metadata.columns.items() if name not in _OF_A_PLACE}
+    stated = {name: value for name, value in place.items() if np.isfinite(value)}
+    return replace(metadata, columns=stated | own, place_doubt=None)
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:

@@ -28,10 +28,12 @@ from sorvolo.capture.live.links import LINK_FORMS, is_link
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.stream import LiveStream, open_stream
 from sorvolo.capture.photo_metadata import PhotoMetadata
-from sorvolo.capture.photos import PhotoSource, read_album
+from sorvolo.capture.photo_positions import is_position_file
+from sorvolo.capture.photos import Album, PhotoSource, read_album
 from sorvolo.capture.telemetry import (
     find_telemetry_beside,
     is_telemetry,
+    logs_beside,
     read_telemetry,
     unusable_files_beside,
 )
@@ -200,11 +202,11 @@ def safe_name(text: str) -> str:
 
 @dataclass(frozen=True)
 class _AlbumInput:
-    """The photos of one flight; `place`, a folder or photo, names it; `others` counts its other files."""
+    """The photos of one flight; `place`, a folder or photo, names it; `others` are the folder's other files."""
 
     place: Path
     photos: Sequence[Path]
-    others: int = 0
+    others: Sequence[Path] = ()
 
 
 def _sort_inputs(inputs: Sequence[Path]) -> tuple[list[Path], list[_AlbumInput]]:
@@ -234,7 +236,8 @@ def _flights_in(folder: Path) -> tuple[list[Path], list[_AlbumInput]]:
         )
     files = [each for each in sorted(folder.iterdir()) if each.is_file() and each.name[0] != "."]
     if photos := _of_kind(files, PHOTO_SUFFIXES):
-        return [], [_AlbumInput(folder.resolve(), photos, len(files) - len(photos))]
+        others = [each for each in files if each not in set(photos)]
+        return [], [_AlbumInput(folder.resolve(), photos, others)]
     if films := _of_kind(files, VIDEO_SUFFIXES):
         return films, []
     raise InputError(_nothing_in(folder, len(files)))
@@ -383,17 +386,63 @@ def _unknown_camera(width_px: int, height_px: int) -> CameraModel:
 def _open_photos(
     source: _AlbumInput, name: str, telemetry: Path | None, camera: Path | str | None
 ) -> PhotoSource:
-    album = read_album(source.photos)
+    folder = source.place if source.place.is_dir() else source.place.parent
+    if telemetry is None:
+        positions, log = _positions_beside(folder), None
+    else:
+        positions, log = ([telemetry], None) if is_position_file(telemetry) else ([], telemetry)
+    album = read_album(source.photos, positions, strict=telemetry is not None)
+    found, notices = _photo_telemetry(folder, album, log)
     if camera is None:
         model = _guess(album.width_px, album.height_px, album.typical)
     else:
         model = camera_from_option(str(camera), album.width_px, album.height_px)
-    found = album.telemetry if telemetry is None else read_telemetry(telemetry)
-    ignored = notice(
-        "ignored_file", source.others, "files in the folder that are no photos, ignored: {}"
+    known = {*positions, *logs_beside(folder)}
+    ignored = [each.name for each in source.others if folder / each.name not in known]
+    notices += notice(
+        "ignored_file",
+        len(ignored),
+        f"files in the folder that are no photos, ignored: {{}} ({', '.join(ignored[:5])})",
     )
     fingerprint = _fingerprint(sorted(source.photos)[0])
-    return PhotoSource(name, fingerprint, album, model, found, ignored)
+    return PhotoSource(name, fingerprint, album, model, found, notices)
+
+
+def _positions_beside(folder: Path) -> list[Path]:
+    """The files of positions in a folder of photos, ODM's geo.txt first."""
+    found = [each for each in sorted(folder.iterdir()) if is_position_file(each)]
+    return sorted(found, key=lambda each: each.suffix.lower() == ".mrk")
+
+
+def _photo_telemetry(
+    folder: Path, album: Album, telemetry: Path | None
+) -> tuple[Telemetry, list[Notice]]:
+    """The telemetry that was named, else the photos' own, else that of the only log in their folder; and notices of logs
+    that are not used, each with what to do."""
+    if telemetry is not None:
+        return read_telemetry(telemetry), []
+    logs = logs_beside(folder)
+    beside = find_telemetry_beside(folder)
+    if album.telemetry.has_fixes:
+        why = "the photos have positions of their own"
+    elif beside is None:
+        why = "it is not clear which is the flight's"
+    elif not album.start_ns:
+        why = "the photos state no time, by which they would be found in it"
+    else:
+        try:
+            found = read_telemetry(beside)
+            words = f"the photos are placed by {beside.name}, the only log in their folder"
+            return found, [Notice("log_in_folder", 1, words)]
+        except InputError as error:
+            return album.telemetry, [Notice("unusable_telemetry", 1, f"not used: {error}")]
+    return album.telemetry, _unused(logs, why)
+
+
+def _unused(logs: Sequence[Path], why: str) -> list[Notice]:
+    names = ", ".join(each.name for each in logs[:5])
+    text = f"logs beside the pictures that are not used ({why}): {names}; give one as --telemetry to use it"
+    return notice("unused_telemetry", len(logs), text)
 
 
 def _video_telemetry(
@@ -403,11 +452,16 @@ def _video_telemetry(
     if telemetry is not None:
         return read_telemetry(telemetry), []
     if inside is not None and inside.telemetry.has_fixes:
-        return inside.telemetry, []
+        beside = find_telemetry_beside(video)
+        why = "the telemetry inside the video is"
+        return inside.telemetry, [] if beside is None else _unused([beside], why)
     notices = [_not_used(each) for each in unusable_files_beside(video)]
     beside = find_telemetry_beside(video)
     if beside is None:
-        return no_telemetry(), notices
+        why = "it is not clear which is the flight's"
+        return no_telemetry(), [*notices, *_unused(logs_beside(video), why)]
+    more = [each for each in logs_beside(video) if each != beside]
+    notices += _unused(more, f"{beside.name} is")
     try:
         return read_telemetry(beside), notices
     except InputError as error:

@@ -37,6 +37,9 @@ _INFORMATION = frozenset(
         "rotated_photo",
         "duplicate_photo",
         "time_zone_unknown",
+        "positions_from_file",
+        "log_in_folder",
+        "unused_telemetry",
     }
 )
 _ADVICE = {
@@ -52,6 +55,7 @@ _ADVICE = {
     "position_contradicted": "look whether the map lies at its place: one of the two is wrong",
     "time_zone_unknown": "nothing, unless telemetry from another file must fit: then give --offset",
     "empty_telemetry": "or give other telemetry with --telemetry",
+    "unknown_column": "rename one to height_above_takeoff(m), altitude_msl(m) or gimbal_pitch(deg) if it is that",
     "unknown_telemetry": "see docs/formats-in.md for what is read, or give other telemetry with --telemetry",
     "unusable_telemetry": "give a readable file with --telemetry",
     "mixed_cameras": "map each camera's pictures as its own flight",
@@ -210,11 +214,17 @@ def _camera_findings(model: CameraModel, flight: FlightFacts) -> list[Finding]:
 
 def _telemetry_findings(source: Source, frames: FrameFacts, facts: TelemetryFacts) -> list[Finding]:
     if not facts.positions:
+        is_video = source.kind == "video"
         return [
             Finding(
                 Level.WARNING,
                 "no positions: the map will have no scale and no place on Earth",
-                "give the flight's log with --telemetry, or put it beside the video under the same name",
+                "give the flight's log with --telemetry, or put it "
+                + (
+                    "beside the video under the same name"
+                    if is_video
+                    else "alone into the photos' folder"
+                ),
             )
         ]
     if facts.apart:

@@ -81,19 +81,37 @@ def find_telemetry_beside(video: Path) -> Path | None:
     "<name>_telemetry", then, where the folder holds no other video, the only telemetry file in it. Only
     files that a reader recognises count.
     """
-    folder = video if video.is_dir() else video.parent
-    if not folder.is_dir():
-        return None
-    files = sorted(each for each in folder.iterdir() if each.is_file() and each != video)
-    candidates = sorted(
-        (each for each in files if each.suffix.lower() in _SUFFIXES),
-        key=lambda each: (_SUFFIXES.index(each.suffix.lower()), each.name),
-    )
+    files = _files_beside(video)
+    candidates = [each for each in files if each.suffix.lower() in _SUFFIXES]
     if named := _named_like(video, candidates):
         return named
     if any(each.suffix.lower() in _VIDEO_SUFFIXES for each in files):
         return None
     return _only_one(list(filter(is_telemetry, candidates)))
+
+
+def logs_beside(video: Path) -> list[Path]:
+    """The telemetry files that may belong to a video or to a folder of photos: none is named as another video there."""
+    files = _files_beside(video)
+    others = {each.stem.lower() for each in files if each.suffix.lower() in _VIDEO_SUFFIXES}
+    taken = {name for stem in others for name in (stem, *(each.format(stem) for each in _BESIDE))}
+    return [
+        each
+        for each in files
+        if each.suffix.lower() in _SUFFIXES
+        and each.stem.lower() not in taken
+        and is_telemetry(each)
+    ]
+
+
+def _files_beside(video: Path) -> list[Path]:
+    """The files in a video's folder but itself, or in a folder of photos; telemetry's usual endings first."""
+    folder = video if video.is_dir() else video.parent
+    if not folder.is_dir():
+        return []
+    files = (each for each in folder.iterdir() if each.is_file() and each != video)
+    order = {suffix: place for place, suffix in enumerate(_SUFFIXES)}
+    return sorted(files, key=lambda each: (order.get(each.suffix.lower(), len(order)), each.name))
 
 
 def _named_like(video: Path, candidates: Sequence[Path]) -> Path | None:
