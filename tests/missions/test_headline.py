@@ -105,6 +105,17 @@ def test_steps_make_a_map_to_check(frames: list[PlacedFrame], why: str) -> None:
     assert headline.quality is MapQuality.DOUBTFUL and why in headline.text
 
 
+def test_a_map_that_lost_most_of_its_frames_is_to_be_checked_and_names_one_cause() -> None:
+    reasons = ["too few matching points"] * 5 + ["blurred"] * 3
+    lost = [PlacedFrame.rejected(k, f"{k}", k, why, _CAMERA) for k, why in enumerate(reasons)]
+    frames = [*(placed(10.0 * k, residual_px=4.0) for k in range(7)), *lost]
+    headline = map_headline(frames, flight_figures(frames, _CAMERA.fx_px), is_video=False)
+    assert headline.quality is MapQuality.DOUBTFUL
+    assert "8 of 15 frames" in headline.text and "5 of them because: too few" in headline.text
+    assert "blurred" not in headline.text and "badly" not in headline.text
+    assert quality_of([placed(10.0 * k) for k in range(8)] + lost) is MapQuality.MAP
+
+
 def test_a_map_with_faults_is_none_to_build_on() -> None:
     frames = [placed(10.0 * k, off_m=60.0) for k in range(8)]
     figures = flight_figures(frames, _CAMERA.fx_px)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
+import rasterio.windows
 from fake_changes import fake_change
 
 from real_data import real_data
@@ -35,7 +36,9 @@ from sorvolo.missions.heights.measure import (
 )
 from sorvolo.missions.heights.run import HeightSettings, make_heights
 from sorvolo.missions.map.flights import map_flights
+from sorvolo.missions.map.ground import shape_of
 from sorvolo.missions.search.prepare import heights_for
+from sorvolo.mosaic.graph_report import GraphReport
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.files import HeightFile
 from sorvolo.survey.findings import ChangeKind
@@ -82,7 +85,7 @@ def mapped(with_heights: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     site = Path(shutil.copytree(with_heights, tmp_path_factory.mktemp("heights") / "site"))
     (made,) = site.glob("flights/*/heights.tif")
     for name in ("heights.tif", "terrain.tif", "orthophoto.tif", "heights.json"):
-        (made.parent / name).unlink()
+        (made.parent / name).unlink(missing_ok=True)
     return site
 
 
@@ -113,6 +116,12 @@ def test_heights_of_a_mapped_flight_are_files_that_fit_each_other(
     ):
         assert picture.res == flat.res and picture.crs == flat.crs
         assert (picture.read(4) == 255).mean() > 0.3
+        # the map was made with --heights: it is the same orthophoto
+        window = rasterio.windows.from_bounds(*flat.bounds, picture.transform)
+        again, mapped_px = picture.read(window=window, boundless=True), flat.read()
+        both = (again[3] == 255) & (mapped_px[3] == 255)
+        assert both.mean() > 0.3
+        assert np.mean(np.abs(again[:3] - mapped_px[:3].astype(float))[:, both] < 20) > 0.95
     assert report["surface"]["holes_share"] < 0.2
     judged = report["surface"]["own_points"]
     assert judged["points"] > 100 and judged["within_2_sigma"] > 0.9 and judged["factor"] >= 1
@@ -324,10 +333,10 @@ def test_damaged_heights_are_named_and_no_comparison_stops_at_them(
 @pytest.mark.long
 def test_brighton_beach_has_heights(tmp_path: Path) -> None:
     photos = real_data("flights/brighton_beach")
-    list(
-        map_flights([photos], tmp_path / "site", MapSettings(model="none", m_per_px=0.2))
-    )  # heights use the photos
-    list(make_heights(tmp_path / "site", HeightSettings(cell_m=0.3, has_orthophoto=False)))
+    list(map_flights([photos], tmp_path / "site", MapSettings(model="none", m_per_px=0.2)))
+    mapped = json.loads(next((tmp_path / "site").glob("flights/*/report.json")).read_text())
+    assert not mapped["shape"]["is_flat"] and "not level" in mapped["shape"]["why"]
+    assert mapped["headline"]["quality"] == "map" and mapped["residual_px"]["median"] < 1
     report = json.loads(next((tmp_path / "site").glob("flights/*/heights.json")).read_text())
     assert report["cameras"]["views"] == 18 and report["cameras"]["residual_rms_px"] < 1.5
     assert (
@@ -380,3 +389,22 @@ def test_a_changed_area_has_its_height_change_where_both_flights_have_heights(
             assert unknown.height_change is None and not notices
     finally:
         shutil.rmtree(other)
+
+
+@pytest.mark.parametrize(
+    "is_uneven, asked, where, is_flat, why",
+    [
+        (False, None, {}, True, "level plane"),
+        (True, None, {}, False, "not level"),
+        (True, False, {}, True, "asked for"),
+        (False, True, {}, False, "asked for"),
+        (True, None, {"is_tied": True}, True, "tied to known ground"),
+        (True, True, {"is_local": True}, True, "GPS"),
+    ],
+)
+def test_a_map_stands_on_heights_where_its_ground_is_not_level_or_one_asks_for_it(
+    is_uneven: bool, asked: bool | None, where: dict[str, bool], is_flat: bool, why: str
+) -> None:
+    graph = GraphReport(1.0, 0.1, 0.0, 0.0, 3, 0, 0.0, 0.3, is_uneven=is_uneven)
+    shape = shape_of(graph, [], asked, **{"is_local": False, "is_tied": False} | where)
+    assert shape.is_flat is is_flat and why in shape.why

@@ -78,8 +78,12 @@ BaseMap = Annotated[
     typer.Option(help="Tie the map to this one: a GeoTIFF, or the folder of an earlier map."),
 ]
 WithHeights = Annotated[
-    bool,
-    typer.Option("--heights", help="Also make heights and a true orthophoto of each flight."),
+    bool | None,
+    typer.Option(
+        "--heights/--flat",
+        help="True orthophoto over measured heights, or a flat map.",
+        show_default="heights where the ground is not level",
+    ),
 ]
 
 
@@ -102,7 +106,7 @@ def map_command(
     classes: Classes = None,
     give_up: GiveUp = 30.0,
     catalogue: CatalogueAddress = "",
-    heights: WithHeights = False,
+    heights: WithHeights = None,
     refly: Refly = None,
     again: Again = False,
     as_json: AsJson = False,
@@ -136,6 +140,7 @@ def map_command(
         control_sigma_m=gcp_accuracy,
         checks=names(check),
         classes=wanted_classes(classes),
+        heights=heights,
     )
     with opened_site(site, writes=True) as place:
         # in a store the catalogue lies with the tiles
@@ -165,7 +170,7 @@ def map_command(
                 catalogues,
             )
         reports = [read_json(folder / "report.json") for folder in folders]
-        _print(reports, place.folder, catalogues, with_heights=heights, as_json=as_json)
+        _print(reports, place.folder, catalogues, with_heights=bool(heights), as_json=as_json)
     if any(report["headline"]["quality"] != "map" for report in reports):
         raise typer.Exit(TO_CHECK)
 
@@ -178,13 +183,17 @@ def _print(
     with_heights: bool,
     as_json: bool,
 ) -> None:
-    """Print what became of the flights; with heights, make and print them, too."""
+    """Print what became of the flights, and their heights; those asked for of a map that stayed flat are made."""
+    from sorvolo.store.site.files import HeightFile
+
     if not as_json:
         show_reports(reports, site, Console())
     heights = [
         make_and_read(site, report["flight"], catalogues=catalogues)
+        if _is_flat(report)
+        else read_json(site / "flights" / report["flight"] / HeightFile.REPORT)
         for report in reports
-        if with_heights
+        if with_heights or not _is_flat(report)
     ]
     if as_json:
         plain = [
@@ -197,6 +206,10 @@ def _print(
         return
     for report in heights:
         show_heights(site, report, Console())
+
+
+def _is_flat(report: Mapping[str, Any]) -> bool:
+    return bool(report.get("shape", {}).get("is_flat", True))
 
 
 def _thesis() -> "MapMethod":
@@ -242,6 +255,8 @@ def _frame_rows(frames: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def _quality_rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     """How well frames fit each other and, where the map has metres, the Earth."""
+    from sorvolo.missions.flight.report import LEVEL
+
     residual_px, gps_m = report["residual_px"]["median"], report["gps_residual_m"]["median"]
     base, has_metres = report.get("base"), report["georeferenced"]
     rows = [
@@ -303,6 +318,7 @@ def _quality_rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
             if base
             else "",
         ),
+        ("ground", escape(report.get("shape", {}).get("why", LEVEL.why))),
         ("map", size),
         ("ground seen", _seen(report.get("seen")) if has_metres else ""),
         ("objects found", escape(objects)),

@@ -223,7 +223,8 @@ class Cameras3D:
     the focal length and the optical centre found.
     `lost` are the names of views that no track holds. `points_m` (P, 3), `residual_px` the rms of all observations at
     the views' size, `fix_rms_m` (3,) cameras minus fixes, NaN without; `height_sigma` what heights err by the cameras.
-    `point_sigma_m` (P,) is what the points' heights err by their features alone, `point_views` (P,) how many see each.
+    `point_sigma_m` (P,) is what the points' heights err by their features alone, `point_views` (P,) how many see each;
+    `view_residuals_px` (V,) is the median of each view's residuals.
     """
 
     views: tuple[View, ...]
@@ -237,6 +238,7 @@ class Cameras3D:
     height_sigma: SmoothSigma = field(default_factory=SmoothSigma)
     point_sigma_m: Floats = field(default_factory=lambda: np.zeros(0))
     point_views: Rows = field(default_factory=lambda: np.zeros(0, int))
+    view_residuals_px: Floats = field(default_factory=lambda: np.zeros(0))
 
 
 def solve_cameras(
@@ -342,6 +344,7 @@ def _solved(
         if held[k]
     )
     residual = scene.residuals_px()
+    miss_px = np.linalg.norm(residual, axis=1)
     with np.errstate(invalid="ignore"):
         off = (scene.centres_m - priors.fixes_m)[held]
     # The pictures weighed as they fit (their residuals' median), which is better than the
@@ -361,6 +364,7 @@ def _solved(
         sigma,
         matched_deviations(scene, priors, weighed),
         np.bincount(scene.point, minlength=len(scene.points_m)),
+        np.array([np.nanmedian(miss_px[scene.view == k]) for k in np.flatnonzero(held)]),
     )
 
 

@@ -428,11 +428,11 @@ class PlanarMapper:
             if each in self._keyframes
         }
 
-    def sigmas_m(self) -> dict[int, float]:
+    def sigmas_m(self, *, leans: bool = True) -> dict[int, float]:
         """One-sigma error on the ground of each keyframe, per axis: its own and what all of the flight err in common.
 
         What a flight errs in common is its receiver's, or that of the known map it is tied to. Over ground that is not
-        level what its slopes may move the map by is added, and by what known ground was seen to miss it.
+        level what its slopes may move a flat map by is added (`leans`), and by what known ground was seen to miss it.
         """
         tied_to = [self._known[each].sigma_m for each in self._known if each in self._graph]
         common_m = (
@@ -440,10 +440,12 @@ class PlanarMapper:
             if np.isfinite(tied_to).any()
             else self._graph.common_sigma_m()
         )
-        leans_m = self._graph.leans_m()
+        leans_m = self._graph.leans_m() if leans else {}
         return {
             each: float(
-                np.sqrt(sigma_m**2 + common_m**2 + leans_m[each] ** 2 + self._ground_miss_m**2)
+                np.sqrt(
+                    sigma_m**2 + common_m**2 + leans_m.get(each, 0.0) ** 2 + self._ground_miss_m**2
+                )
             )
             for each, sigma_m in self._graph.sigmas_m().items()
         }

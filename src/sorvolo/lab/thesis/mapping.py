@@ -239,6 +239,7 @@ class ThesisRun(FlightRun):
         if not self._flight.stitched:
             raise nothing_placed(self._setup.source.name, self._log)
         painter = self._paint()
+        painter.settle()
         painter.finish()
         site, writer = self._archive.site(), self._begin_flight()
         with self._log.stage(Stage.REPORT):

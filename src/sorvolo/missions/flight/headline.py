@@ -1,5 +1,6 @@
 """A mapped flight in one line: whether it is a map at all, whether the map can be trusted, and how good it is."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -15,6 +16,7 @@ from sorvolo.survey.wording import counted, plural
 
 OBLIQUE_DEG = 35.0  # pictures that look to opposite sides share too little to be linked
 _MANY = 0.1  # share of the frames
+_MOST = 0.5  # share of the frames whose loss makes a map one to check; by choice
 _BAD_FIT_PX = 3.0  # median residual of a map's matches from which on it is warned of; by choice
 _TURNED_DEG = 6.0  # by which all stated angles may be off without a word
 _GUESSED = 0.1  # relative: a focal length that is hardly known
@@ -39,7 +41,7 @@ def flight_warnings(
         warnings.append(
             f"{lost} of {counted(len(placed), 'frame')} have no place in the map; `reasons` lists why"
         )
-    warnings += [*doubts(placed, figures), *agreement.remarks]
+    warnings += [*doubts(placed, figures, graph), *agreement.remarks]
     # ground that is not level, where the pictures still fit each other; where they do not, `doubts` reports it
     residual_px = figures.residual_median_px
     fits = residual_px is not None and residual_px <= _BAD_FIT_PX
@@ -68,8 +70,10 @@ def flight_warnings(
     return warnings
 
 
-def doubts(placed: Sequence[PlacedFrame], figures: FlightFigures) -> list[str]:
-    """What makes the map doubtful: steps in it, or pictures that fit each other badly."""
+def doubts(
+    placed: Sequence[PlacedFrame], figures: FlightFigures, graph: GraphReport | None = None
+) -> list[str]:
+    """What makes the map doubtful: steps in it, or pictures that fit each other badly; `graph` of a flat map."""
     warnings = []
     by_gps = sum(each.status is Status.GPS_ONLY for each in placed)
     if by_gps > _MANY * len(placed):
@@ -79,10 +83,25 @@ def doubts(placed: Sequence[PlacedFrame], figures: FlightFigures) -> list[str]:
         )
     if figures.residual_median_px is not None and figures.residual_median_px > _BAD_FIT_PX:
         warnings.append(
-            "pictures fit each other badly: high trees or houses (`sorvolo heights` makes an upright map of them), a "
-            "wrong camera, or a rolling shutter"
+            "pictures fit each other badly: the ground is not level, and the map is flat; `sorvolo heights` makes an "
+            "upright one"
+            if graph is not None and graph.is_uneven
+            else "pictures fit each other badly: a wrong camera or a rolling shutter; measure the camera with "
+            "`sorvolo calibrate`"
         )
     return warnings
+
+
+def _most_lost(placed: Sequence[PlacedFrame]) -> list[str]:
+    """Why a map is to be checked that most of its flight's frames are not part of."""
+    reasons = Counter(each.reason for each in placed if each.status is Status.REJECTED)
+    if reasons.total() <= _MOST * len(placed):
+        return []
+    cause, count = reasons.most_common(1)[0]
+    return [
+        f"{reasons.total()} of {counted(len(placed), 'frame')} have no place in the map, {count} of them because: "
+        f"{cause}; fly in good light, with 75 % overlap and GPS"
+    ]
 
 
 def unlevelled(
@@ -149,9 +168,10 @@ def map_headline(
     is_video: bool,
     agreement: Consistency = NOTHING_KNOWN,
     others: Sequence[str] = (),
+    graph: GraphReport | None = None,
 ) -> Headline:
     """The headline of a flight that was mapped; photos were each meant, so that one photo is a map. `others` are
-    further doubts about the map, in words."""
+    further doubts about the map, in words; `graph` is of a flat map."""
     seen = sum(each.status is not Status.REJECTED for each in placed)
     if is_video and (seen == 1 or figures.reach_m < _HOVERING * figures.diagonal_m):
         return Headline(MapQuality.ONE_VIEW, f"no map: {_one_view(figures, seen)}")
@@ -160,9 +180,9 @@ def map_headline(
             MapQuality.CONTRADICTORY,
             f"a map that contradicts itself: {'; '.join(agreement.faults)}",
         )
-    found = [*agreement.steps, *doubts(placed, figures), *others]
-    if found:
-        return Headline(MapQuality.DOUBTFUL, f"a map to check before use: {'; '.join(found)}")
+    found = [*_most_lost(placed), *agreement.steps, *doubts(placed, figures, graph), *others]
+    if found:  # one cause with its remedy; the warnings have all
+        return Headline(MapQuality.DOUBTFUL, f"a map to check before use: {found[0]}")
     matched = sum(each.status is Status.VISION for each in placed)
     return Headline(MapQuality.MAP, f"{matched:,} of {counted(len(placed), 'frame')} matched")
 

@@ -23,6 +23,7 @@ class Stage(StrEnum):
     COMPARE = "compare"
     EVIDENCE = "evidence"
     DETECT = "detect"
+    HEIGHTS = "heights"
     PAINT = "paint"
     STORE = "store"
     REPORT = "report"

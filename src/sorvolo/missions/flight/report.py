@@ -32,6 +32,17 @@ from sorvolo.survey.flight import CameraModel, Notice, Site
 from sorvolo.survey.mosaic import PlacedFrame, Status
 
 
+@dataclass(frozen=True)
+class MapShape:
+    """Whether a map is flat, else a true orthophoto over heights, and why, in one sentence."""
+
+    is_flat: bool
+    why: str
+
+
+LEVEL = MapShape(True, "the map is flat: a level plane explains the pictures")
+
+
 @dataclass(frozen=True, eq=False)
 class FlightResult:
     """How a flight ended: its frames where they lie, the camera as it was found, what method planar's graph and the
@@ -46,6 +57,7 @@ class FlightResult:
     control: ControlReport | None = None
     base: BaseReport | None = None
     pieces: Sequence[Sequence[int]] = ()  # frames, by index, that links tie together
+    shape: MapShape = LEVEL
 
 
 def build_report(
@@ -65,10 +77,12 @@ def build_report(
     """
     source, placed, graph = setup.source, result.placed, result.graph
     figures = flight_figures(placed, result.camera.fx_px)
-    agreement = consistency(placed, result.pieces, figures, _stated(setup, result), graph)
+    # what the plane of a flat map shows of itself is no witness of a map that stands on heights
+    plane = graph if result.shape.is_flat else None
+    agreement = consistency(placed, result.pieces, figures, _stated(setup, result), plane)
     headline = {}
     if result.makes_map:
-        others = unlevelled(placed, graph, setup)
+        others = unlevelled(placed, plane, setup)
         headline["headline"] = asdict(
             map_headline(
                 placed,
@@ -76,6 +90,7 @@ def build_report(
                 is_video=source.kind == "video",
                 agreement=agreement,
                 others=others,
+                graph=plane,
             )
         )
     return {
@@ -110,6 +125,7 @@ def build_report(
         "sigma_m": figures.sigma_m,
         "control": control_summary(result.control) if result.control else None,
         "base": asdict(result.base) if result.base else None,
+        **({} if result.shape == LEVEL else {"shape": asdict(result.shape)}),
         "relief_m": graph.relief_m if graph else None,
         "altitude_offset_m": graph.altitude_offset_m if graph else None,
         "links": {"kept": graph.links, "dropped_as_false": graph.links_dropped} if graph else None,
@@ -122,7 +138,7 @@ def build_report(
         **_effort(log, seconds, max(1, len(placed))),
         "notices": [asdict(each) for each in (*source.telemetry.notices, *setup.notices, *notices)],
         "warnings": [
-            *flight_warnings(placed, figures, setup, log, agreement, graph),
+            *flight_warnings(placed, figures, setup, log, agreement, plane),
             *(result.control.remarks if result.control else ()),
         ],
         "settings": asdict(settings),

@@ -101,6 +101,9 @@ class MapSettings:
         str, ...
     ] = ()  # control points held back to measure the map; "NAME*" for all that begin so
     memory_mb: float | None = None  # for what can be read again; None: 512 MB
+    heights: bool | None = (
+        None  # whether the map stands on measured heights; None: where the ground is not level
+    )
     classes: tuple[str, ...] = ()  # that are looked for; none: those that the model usually reports
 
     def __post_init__(self) -> None:

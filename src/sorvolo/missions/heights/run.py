@@ -1,17 +1,18 @@
 """Heights of mapped flights: cameras in 3D, a height model, the bare ground and a true orthophoto, as files."""
 
 import json
-import resource
 import time
 from collections import OrderedDict
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.geometry.arrays import ImageGray, ImageRGB
-from sorvolo.geometry.grid import SiteGrid
+from sorvolo.geometry.arrays import Floats32, ImageGray, ImageRGB, ImageRGBA
+from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.heights.cameras import Cameras3D, CameraSettings, solve_cameras
 from sorvolo.heights.figures import (
     OwnPointSettings,
@@ -28,6 +29,7 @@ from sorvolo.heights.surface import Surface, SurfaceSettings, sweep_surface
 from sorvolo.heights.terrain import TerrainSettings, terrain
 from sorvolo.heights.views import View, fix_from_residual, ground_outlines_m, pixels_wide
 from sorvolo.missions.flight.headline import contradicts_itself
+from sorvolo.missions.flight.report import peak_memory_mb
 from sorvolo.mosaic.exposure import corrected
 from sorvolo.registration.features import gray_from_rgb
 from sorvolo.registration.lens import Undistorter, at_size, refined_camera
@@ -198,6 +200,19 @@ class HeightsUpdate:
     share: float
 
 
+@dataclass(frozen=True, eq=False)
+class GroundModel:
+    """A flight's ground in space: its cameras, the surface that they see, the bare ground below it, and the pictures
+    of the cameras that points in space hold. `bare_m` (H, W) counts as the surface does; `seconds` is what it took."""
+
+    solved: Cameras3D
+    surface: Surface
+    bare_m: Floats32
+    pictures: FlightPictures
+    figures: Mapping[str, Any]
+    seconds: Mapping[str, float]
+
+
 def make_heights(
     site: Path,
     settings: HeightSettings = HeightSettings(),
@@ -220,50 +235,60 @@ def make_heights(
         ]
         started_s = time.monotonic()
         views = flight_views(archive, flight_id, keyframes)
-        _lattice(archive.site(), views, settings)  # too many cells end here, before minutes of work
-        yield HeightsUpdate(flight_id, "cameras", 0.0)
-        solved = solve_cameras(views, FlightPictures(archive, keyframes).gray, settings.cameras)
-        kept = [each for each in keyframes if each.name not in set(solved.lost)]
-        pictures = FlightPictures(archive, kept, solved.radial)
-        cameras_s = time.monotonic() - started_s
-        give_back()
-        swept = yield from _sweep(archive, solved, pictures, settings, flight_id)
-        surface, judgement = judged_by_points(swept, solved, settings.own_points)
-        mapped = archive.report(flight_id)
-        yield HeightsUpdate(flight_id, "ground", 0.0)
-        ground, shows_ground = terrain(surface.lattice, surface.up_m, settings.terrain)
-        files = (f"flights/{flight_id}/{file}" for file in HeightFile)
-        with archive.replacing(*files):
-            _write_models(archive, flight_id, surface, ground)
-            heights_s = time.monotonic() - started_s
-            give_back()
+        model = yield from model_ground(archive, views, keyframes, settings)
+        folder = archive.flight_folder(flight_id)
+        with archive.replacing(*(f"flights/{flight_id}/{file}" for file in HeightFile)):
             if settings.has_orthophoto:
-                yield from _paint(archive, surface, solved, pictures, settings, flight_id)
-            report = {
-                "flight": flight_id,
-                "run": run_of(keyframes),
-                "cell_m": surface.lattice.cell_m,
-                "height_reference": archive.site().height_reference,
-                "cameras": camera_figures(solved),
-                "surface": surface_figures(surface, shows_ground, judgement),
-                "warnings": [
-                    *_map_warnings(mapped),
-                    *camera_warnings(solved),
-                    *surface_warnings(surface),
-                    *(each.text for each in archive.notices),
-                ],
-                "contradicts_itself": contradicts_itself(mapped),
-                "seconds": {
-                    "cameras": cameras_s,
-                    "heights": heights_s,
-                    "total": time.monotonic() - started_s,
-                },
-                "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-            }
-            atomic_write_bytes(
-                archive.height_path(flight_id, HeightFile.REPORT), json_bytes(report)
+                with scratch_folder(folder) as scratch:
+                    tiles = TileFolder(scratch)
+                    for index, rgba, share in ground_tiles(model, archive.site_grid()):
+                        tiles.save(index, rgba)
+                        yield HeightsUpdate(flight_id, "orthophoto", share)
+                    write_cog(tiles, archive.site_grid(), folder / HeightFile.ORTHOPHOTO)
+            write_heights(
+                archive,
+                model,
+                folder,
+                flight_id=flight_id,
+                run=run_of(keyframes),
+                mapped=archive.report(flight_id),
+                seconds=time.monotonic() - started_s,
             )
         yield HeightsUpdate(flight_id, "done", 1.0)
+
+
+def model_ground(
+    archive: Archive,
+    views: Sequence[View],
+    keyframes: Sequence[StoredKeyframe],
+    settings: HeightSettings = HeightSettings(),
+) -> Generator[HeightsUpdate, None, GroundModel]:
+    """The ground that views, each of one keyframe, see in space, yielding progress.
+
+    Raises InputError where they share too little for it.
+    """
+    flight_id, site = keyframes[0].flight_id, archive.site()
+    started_s = time.monotonic()
+    _lattice(site, views, settings)  # too many cells end here, before minutes of work
+    yield HeightsUpdate(flight_id, "cameras", 0.0)
+    solved = solve_cameras(views, FlightPictures(archive, keyframes).gray, settings.cameras)
+    kept = [each for each in keyframes if each.name not in set(solved.lost)]
+    pictures = FlightPictures(archive, kept, solved.radial)
+    cameras_s = time.monotonic() - started_s
+    give_back()
+    swept = yield from _sweep(site, solved, pictures, settings, flight_id)
+    surface, judgement = judged_by_points(swept, solved, settings.own_points)
+    yield HeightsUpdate(flight_id, "ground", 0.0)
+    bare_m, shows_ground = terrain(surface.lattice, surface.up_m, settings.terrain)
+    give_back()
+    return GroundModel(
+        solved,
+        surface,
+        bare_m,
+        pictures,
+        surface_figures(surface, shows_ground, judgement),
+        {"cameras": cameras_s, "heights": time.monotonic() - started_s},
+    )
 
 
 def _map_warnings(mapped: Mapping[str, Any]) -> list[str]:
@@ -297,13 +322,14 @@ def height_grid(site: Site, cell_m: float) -> SiteGrid:
 
 
 def _sweep(
-    archive: Archive,
+    site: Site,
     solved: Cameras3D,
     pictures: FlightPictures,
     settings: HeightSettings,
     flight_id: str,
 ) -> Generator[HeightsUpdate, None, Surface]:
-    lattice = _lattice(archive.site(), solved.views, settings)
+    low_m = min(0.0, float(np.percentile(solved.points_m[:, 2], 0.5)))  # low ground is seen farther
+    lattice = _lattice(site, solved.views, settings, low_m)
 
     small = SmallPictures(pictures, solved.views, settings.surface.sizes_m(lattice.cell_m))
     for each in sweep_surface(
@@ -315,15 +341,34 @@ def _sweep(
     raise AssertionError("a sweep ends with a surface")
 
 
-def _lattice(site: Site, views: Sequence[View], settings: HeightSettings) -> Lattice:
-    """The cells over the ground that the views show. Raises GeometryError for more of them than can be handled."""
+def _lattice(
+    site: Site, views: Sequence[View], settings: HeightSettings, low_m: float = 0.0
+) -> Lattice:
+    """The cells over the ground, `low_m` at its lowest, that the views show.
+
+    Raises GeometryError for more of them than can be handled.
+    """
     outlines_m = ground_outlines_m(views)
     cell_m = settings.cell_m or Lattice.cell_for(outlines_m, site.m_per_px)
+    outlines_m = np.concatenate([outlines_m, ground_outlines_m(views, low_m)])
     return Lattice.over(outlines_m, height_grid(site, cell_m))
 
 
-def _write_models(archive: Archive, flight_id: str, surface: Surface, ground: Any) -> None:
-    site = archive.site()
+def write_heights(
+    archive: Archive,
+    model: GroundModel,
+    folder: Path,
+    *,
+    flight_id: str,
+    run: str,
+    mapped: Mapping[str, Any],
+    seconds: float,
+) -> None:
+    """Write heights.tif, terrain.tif, heights.png and heights.json of a ground into a folder.
+
+    `run` is the mapping run that it is of, `mapped` that one's report.json, `seconds` what all of it took.
+    """
+    surface, site = model.surface, archive.site()
     grid = height_grid(site, surface.lattice.cell_m).grid
     zero_m = site.origin.height_m
     write_height_cog(
@@ -331,33 +376,38 @@ def _write_models(archive: Archive, flight_id: str, surface: Surface, ground: An
         (f"height, {site.height_reference}", "one sigma"),
         surface.lattice.first,
         grid,
-        archive.height_path(flight_id, HeightFile.SURFACE),
+        folder / HeightFile.SURFACE,
     )
     write_height_cog(
-        [ground + zero_m],
+        [model.bare_m + zero_m],
         (f"bare ground, {site.height_reference}",),
         surface.lattice.first,
         grid,
-        archive.height_path(flight_id, HeightFile.GROUND),
+        folder / HeightFile.GROUND,
     )
-    atomic_write_bytes(
-        archive.height_path(flight_id, HeightFile.PICTURE), png_from_rgba(relief_picture(surface))
-    )
+    atomic_write_bytes(folder / HeightFile.PICTURE, png_from_rgba(relief_picture(surface)))
+    report = {
+        "flight": flight_id,
+        "run": run,
+        "cell_m": surface.lattice.cell_m,
+        "height_reference": site.height_reference,
+        "cameras": camera_figures(model.solved),
+        "surface": model.figures,
+        "warnings": [
+            *_map_warnings(mapped),
+            *camera_warnings(model.solved),
+            *surface_warnings(surface),
+            *(each.text for each in archive.notices),
+        ],
+        "contradicts_itself": contradicts_itself(mapped),
+        "seconds": {**model.seconds, "total": seconds},
+        "peak_memory_mb": peak_memory_mb(),
+    }
+    atomic_write_bytes(folder / HeightFile.REPORT, json_bytes(report))
 
 
-def _paint(
-    archive: Archive,
-    surface: Surface,
-    solved: Cameras3D,
-    pictures: FlightPictures,
-    settings: HeightSettings,
-    flight_id: str,
-) -> Generator[HeightsUpdate]:
-    folder, site_grid = archive.flight_folder(flight_id), archive.site_grid()
-    with scratch_folder(folder) as scratch:
-        tiles = TileFolder(scratch)
-        painting = paint_orthophoto(surface, site_grid, solved.views, pictures.colour)
-        for index, rgba, share in painting:
-            tiles.save(index, rgba)
-            yield HeightsUpdate(flight_id, "orthophoto", share)
-        write_cog(tiles, site_grid, archive.height_path(flight_id, HeightFile.ORTHOPHOTO))
+def ground_tiles(
+    model: GroundModel, site_grid: SiteGrid
+) -> Iterator[tuple[TileIndex, ImageRGBA, float]]:
+    """The tiles of a ground's true orthophoto; see `paint_orthophoto`."""
+    return paint_orthophoto(model.surface, site_grid, model.solved.views, model.pictures.colour)

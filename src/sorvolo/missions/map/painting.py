@@ -1,11 +1,13 @@
 """A flight's keyframes painted into the site's map: coarsely while they still move, and once when they stand."""
 
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
-from sorvolo.geometry.arrays import ImageRGB, Mask, Matrix3
+import numpy as np
+
+from sorvolo.geometry.arrays import ImageRGB, ImageRGBA, Mask, Matrix3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.geometry.homography import pose_from_homography
@@ -252,8 +254,8 @@ class FlightPainter:
             self._coarse.show()
         return painted
 
-    def finish(self) -> None:
-        """Paint all keyframes where they stand in the end.
+    def settle(self) -> None:
+        """Ready all pictures for the painting where they stand in the end.
 
         What was shown while they still moved is taken out first: when that was painted, which a clock decides, must not
         be seen in the map.
@@ -265,6 +267,14 @@ class FlightPainter:
         if self._painted_at or self._is_live:
             self._writer.take_back_tiles()
         self._writer.release_memory()
+
+    def finish(
+        self, ground: Iterable[tuple[TileIndex, ImageRGBA]] = (), shown: Collection[int] = ()
+    ) -> None:
+        """Paint all keyframes where they stand in the end.
+
+        `ground` are tiles of a picture of the ground that is ready, which stands in for the keyframes `shown` in it.
+        """
         with self._log.stage(Stage.PAINT):
             site_grid, known_images = (
                 self._archive.site_grid(),
@@ -276,16 +286,29 @@ class FlightPainter:
                     return known_images.get(keyframe_id)
                 return self._writer.image(keyframe_id - len(self._known))
 
-            canvas = Canvas(
-                site_grid.grid,
-                self._writer.tiles,
-                image,
-                painted=self._known.canvas_frames(site_grid),
-                keeps_known_ground=True,
-            )
+            def canvas() -> Canvas:
+                return Canvas(
+                    site_grid.grid,
+                    tiles,
+                    image,
+                    painted=self._known.canvas_frames(site_grid),
+                    keeps_known_ground=True,
+                )
+
+            tiles = self._writer.tiles
+            growing = canvas()
             if len(self._known):
-                canvas.paint([], forget=self._known.superseded)
-            self._paint(canvas, self._frames, site_grid, self._stored, self._valid)
+                growing.paint([], forget=self._known.superseded)
+            for index, rgba in ground:
+                before = tiles.get(index)
+                tiles[index] = (
+                    rgba if before is None else np.where(before[..., 3:] == 255, before, rgba)
+                )
+            if shown:
+                growing = canvas()
+            self._paint(
+                growing, self._frames.difference(shown), site_grid, self._stored, self._valid
+            )
 
     def _paint_small(self, keyframe_ids: Collection[int]) -> int:
         coarse = self._coarse

@@ -23,12 +23,14 @@ from sorvolo.missions.flight.map_objects import (
     search_summary,
     why_not_searched,
 )
-from sorvolo.missions.flight.report import FlightResult, build_report
+from sorvolo.missions.flight.report import FlightResult, MapShape, build_report
 from sorvolo.missions.flight.request import REQUEST
 from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.flight.settings import TILES_MB, MapSettings, memory_budget_bytes
 from sorvolo.missions.flight.setup import FlightSetup, new_site
+from sorvolo.missions.heights.run import GroundModel, ground_tiles, write_heights
 from sorvolo.missions.map.coverage import FlightCoverage
+from sorvolo.missions.map.ground import ground_of, shape_of, standing_frames
 from sorvolo.missions.map.painting import FlightPainter, KnownKeyframes
 from sorvolo.mosaic.base_ties import BaseReport, FoundFrame, tie_to_base
 from sorvolo.mosaic.exposure import Exposure
@@ -45,6 +47,7 @@ from sorvolo.store.pages.flight import report_page
 from sorvolo.store.site.archive import Archive, FlightWriter
 from sorvolo.store.site.catalogue import StoredKeyframe
 from sorvolo.store.site.spill import SpillFile
+from sorvolo.store.site.upkeep import HEIGHTS
 from sorvolo.survey.control import ControlReport
 from sorvolo.survey.flight import Frame, LostFrame, Notice, PosedFrame
 from sorvolo.survey.map_objects import ObjectSearch
@@ -352,25 +355,71 @@ class PlanarRun(FlightRun):
 
         Nothing is committed. Frames that came to nothing are rejected; without any other nothing is painted.
         """
-        if self._times_ns:
-            with self._log.stage(Stage.REGISTER):
-                self._mapper.release()
-                if self._writer is not None:
-                    self._writer.release_memory()  # room for the largest solve
-                self._mapper.settle()
-                self._offset = self._find_offset()
-                self._tie_to_ground()
-            if self._finder is not None:  # the detector's memory is free then for painting
-                with self._log.stage(Stage.DETECT):
-                    self._finder.rest()
-            self._started_painter().finish()
+        painter = self._settled()
+        if painter is not None:
+            painter.finish()
         return self._placed()
+
+    def _settled(self) -> FlightPainter | None:
+        """What paints the flight, all keyframes standing where they do in the end; None where none has a place."""
+        if not self._times_ns:
+            return None
+        with self._log.stage(Stage.REGISTER):
+            self._mapper.release()
+            if self._writer is not None:
+                self._writer.release_memory()  # room for the largest solve
+            self._mapper.settle()
+            self._offset = self._find_offset()
+            self._tie_to_ground()
+        if self._finder is not None:  # the detector's memory is free then for painting
+            with self._log.stage(Stage.DETECT):
+                self._finder.rest()
+        painter = self._started_painter()
+        painter.settle()
+        return painter
+
+    def _paint_ground(
+        self, painter: FlightPainter, placed: list[PlacedFrame]
+    ) -> tuple[list[PlacedFrame], MapShape, GroundModel | None]:
+        """Paint the map, flat or over the heights of its ground; the frames as they stand on it."""
+        shape = shape_of(
+            self._mapper.report(),
+            placed,
+            self._settings.heights,
+            is_local=self._archive.site().is_local,
+            is_tied=self._setup.known_ground is not None,
+        )
+        model = None
+        if not shape.is_flat:
+            writer = self.begin()
+            frames = [each for each in placed if each.status is not Status.REJECTED]
+            keyframes = [writer.keyframe(each, self.images[each.index]) for each in frames]
+            with self._log.stage(Stage.HEIGHTS):
+                found = ground_of(self._archive, frames, keyframes)
+            if isinstance(found, str):
+                shape = MapShape(True, f"the map is flat, for heights could not be made: {found}")
+            else:
+                model = found
+        if model is None:
+            painter.finish()
+            return placed, shape, None
+        index_of = {each.name: each.index for each in placed}
+        shown = {len(self._known) + index_of[view.name] for view in model.solved.views}
+        tiles = ground_tiles(model, self._archive.site_grid())
+        painter.finish(((index, rgba) for index, rgba, _ in tiles), shown)
+        sigmas_m = {
+            each - len(self._known): sigma_m
+            for each, sigma_m in self._mapper.sigmas_m(leans=False).items()
+        }
+        return standing_frames(placed, model, sigmas_m), shape, model
 
     def finish(self, notices: Sequence[Notice], started_s: float) -> None:
         """See `FlightRun.finish`."""
-        placed = self.complete()
-        if all(each.status is Status.REJECTED for each in placed):
+        painter = self._settled()
+        placed = self._placed()
+        if painter is None or all(each.status is Status.REJECTED for each in placed):
             raise self._nothing_placed()
+        placed, shape, model = self._paint_ground(painter, placed)
         writer = self.begin()
         search = self._search(placed)
         with self._log.stage(Stage.REPORT):
@@ -384,6 +433,7 @@ class PlanarRun(FlightRun):
             control=self._control,
             base=self._base,
             pieces=[[each - len(self._known) for each in ids] for ids in self._mapper.pieces()],
+            shape=shape,
         )
         report = build_report(
             self._setup,
@@ -401,6 +451,16 @@ class PlanarRun(FlightRun):
         if self._coverage is not None:
             files, report["seen"] = self._coverage.conclude(self.pictures_on_ground())
             documents.update(files)
+        if model is not None:
+            write_heights(
+                self._archive,
+                model,
+                writer.staged(HEIGHTS),
+                flight_id=self._setup.source.name,
+                run=writer.run,
+                mapped=report,
+                seconds=time.monotonic() - started_s,
+            )
         writer.commit(
             placed,
             self.images,

@@ -66,6 +66,7 @@ _STAGE_WORDS = {
     "register": "matching frames",
     "compare": "comparing views with the map",
     "evidence": "gathering evidence over views",
+    "heights": "measuring heights",
     "paint": "painting the map",
     "detect": "waiting for the detector, and placing its detections",
     "store": "saving pictures and tiles",
@@ -171,7 +172,8 @@ def _summary(report: Mapping[str, Any]) -> str:
             "laid over other maps, and no file with coordinates is written."
         )
     sigma_m, gps_m = number_at(report, "sigma_m"), number_at(report, "gps_residual_m", "median")
-    sentences = []
+    why = str(at(report, "shape", "why") or "")
+    sentences = [f"{why[:1].upper()}{why[1:]}."] if why else []
     if sigma_m is not None:
         sources = "control points" if report.get("control") else "GPS fixes"
         sources = "places on the base map" if report.get("base") else sources

@@ -102,6 +102,11 @@ class FlightWriter:
                 raise
 
     @property
+    def run(self) -> str:
+        """Which mapping run this is, as its pictures' paths name it."""
+        return str(self._run_id)
+
+    @property
     def is_open(self) -> bool:
         """Whether the flight is still on its way: neither committed nor left."""
         return self._is_open
@@ -200,7 +205,7 @@ class FlightWriter:
 
         `changed` (H, W) is 0 or more, `valid` (H, W) where it is known. Raises StoreError on a full disk.
         """
-        folder = self._make_staged("masks")
+        folder = self.staged("masks")
         name = mask_name(frame_name, self._boxes)
         write_view_masks(folder, name, changed, valid)
         self._boxes[name] = boxes_json(boxes)
@@ -298,7 +303,8 @@ class FlightWriter:
     def _staged(self) -> Path:
         return self._files.staged_folder(self._flight_id, self._run_id)
 
-    def _make_staged(self, name: str) -> Path:
+    def staged(self, name: str) -> Path:
+        """The folder of this name, made, whose files become the flight's with the commit. See `take_staged`."""
         folder = self._staged / name
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
@@ -309,11 +315,11 @@ class FlightWriter:
         flight_folder = self._files.flight_folder(self._flight_id)
         for name in STAGED_FOLDERS:
             if (flight_folder / name).is_dir():
-                self._make_staged(name)
+                self.staged(name)
         for name, data in crop_files(changes).items():
-            atomic_write_bytes(self._make_staged("changes") / name, data, durable=False)
+            atomic_write_bytes(self.staged("changes") / name, data, durable=False)
         for name, data in object_crops(search.objects if search is not None else ()).items():
-            atomic_write_bytes(self._make_staged(CROPS) / name, data, durable=False)
+            atomic_write_bytes(self.staged(CROPS) / name, data, durable=False)
         if self._boxes:
             atomic_write_bytes(
                 self._staged / "masks" / BOXES_FILE, json_bytes(self._boxes), durable=False

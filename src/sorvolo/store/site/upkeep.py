@@ -30,7 +30,7 @@ from sorvolo.store.rasters.geotiff import write_cog
 from sorvolo.store.site import catalogue as records
 from sorvolo.store.site import change_records, object_records
 from sorvolo.store.site.catalogue import OwedFiles, VersionEntry
-from sorvolo.store.site.files import JOURNAL, STAGED, DamagedError
+from sorvolo.store.site.files import JOURNAL, STAGED, DamagedError, HeightFile
 from sorvolo.store.site.journal import is_journal_after
 from sorvolo.store.site.object_records import StoredObject
 
@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from sorvolo.store.site.archive import Archive
 
 STAGED_FOLDERS = ("changes", "masks", CROPS)
+HEIGHTS = "heights"
+"""The staged folder whose files go to the flight's own folder."""
 # of the map in changes.html; daily flights without change should cost little
 _PICTURE_PX, _UNCHANGED_PX = 1600, 800
 _ENDINGS = (".geojson", ".json", ".kml", ".gpx")  # of lists of places
@@ -154,7 +156,8 @@ def _write_flight_files(files: "Archive", owed: OwedFiles) -> None:
     staged = folder / STAGED / str(owed.run_id)
     lists = (f"{name}{ending}" for name in ("changes", OBJECTS) for ending in _ENDINGS)
     pictures = (name for name in STAGED_FOLDERS if (staged / name).is_dir())
-    names = (*contents, *owed.leftovers, *lists, "changes.html", *pictures)
+    heights = HeightFile if (staged / HEIGHTS).is_dir() else ()
+    names = (*contents, *owed.leftovers, *lists, "changes.html", *pictures, *heights)
     with files.replacing(*(f"flights/{owed.flight_id}/{name}" for name in names)):
         for name, content in contents.items():
             atomic_write_bytes(folder / name, content)
@@ -232,6 +235,10 @@ def take_staged(flight_folder: Path, run_id: int) -> None:
                 (staged / name).rmdir()
             sync_file(flight_folder)
             shutil.rmtree(former, ignore_errors=True)
+    for path in (staged / HEIGHTS).glob("*"):
+        with writing(flight_folder):
+            (flight_folder / HeightFile.ORTHOPHOTO).unlink(missing_ok=True)  # of another run
+            os.replace(path, flight_folder / path.name)
     shutil.rmtree(flight_folder / STAGED, ignore_errors=True)
 
 
