@@ -18,20 +18,21 @@ _SHARED = 5  # logarithm of the focal scale, left-over distortion of third and f
 _SIX = np.arange(6)
 
 
+_ROBUST_SIGMAS = 2.0  # where the Cauchy loss bends
+_FOCAL_SIGMA = 0.02  # relative, of the focal length that the map's flight settled on
+_RADIAL_SIGMA = (0.02, 0.02)  # of third and fifth order
+_CENTRE_SIGMA = 0.01  # of the optical centre, in focal lengths
+_ITERATIONS = 25  # at most; by choice
+LEAST_SIGMA_PX = 0.1  # of a feature's place, however well all fit
+
+
 @dataclass(frozen=True)
 class AdjustmentSettings:
     """How observations and priors are weighed."""
 
     sigma_px: float = 0.5  # of a feature's place
-    robust_sigmas: float = 2.0  # where the Cauchy loss bends
-    focal_sigma: float = 0.02  # relative, of the focal length that the map's flight settled on
-    radial_sigma: tuple[float, float] = (0.02, 0.02)  # of third and fifth order
-    centre_sigma: float = 0.01  # of the optical centre, in focal lengths
-    attitude_sigma_deg: float = (
-        3.0  # of all the map's attitudes in common: they lean where the ground is not level
-    )
-    iterations: int = 25  # at most; by choice
-    least_sigma_px: float = 0.1  # of a feature's place, however well all fit
+    # of all the map's attitudes in common: they lean where the ground is not level
+    attitude_sigma_deg: float = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +132,7 @@ def adjust(scene: Scene, priors: Priors, settings: AdjustmentSettings) -> Scene:
     """The scene that observations and priors agree best on."""
     damping = 1e-4
     normal = _linearise(scene, priors, settings)
-    for _ in range(settings.iterations):
+    for _ in range(_ITERATIONS):
         moved = _advance(scene, *_step(normal, damping))
         trial = _linearise(moved, priors, settings)
         if not trial.cost <= normal.cost:
@@ -178,10 +179,10 @@ def matched_deviations(scene: Scene, priors: Priors, settings: AdjustmentSetting
 def _linearise(scene: Scene, priors: Priors, settings: AdjustmentSettings) -> _Normal:
     residual, by_camera, by_shared, by_point = _derivatives(scene)
     white = residual / settings.sigma_px
-    squared = (white**2).sum(axis=1) / settings.robust_sigmas**2
+    squared = (white**2).sum(axis=1) / _ROBUST_SIGMAS**2
     usable = np.isfinite(squared)
     root = np.sqrt(np.where(usable, 1 / (1 + np.where(usable, squared, 0)), 0)) / settings.sigma_px
-    cost = settings.robust_sigmas**2 * float(np.log1p(np.where(usable, squared, 1e6)).sum())
+    cost = _ROBUST_SIGMAS**2 * float(np.log1p(np.where(usable, squared, 1e6)).sum())
     residual = np.where(usable[:, None], residual, 0.0) * root[:, None]
     by_camera, by_shared, by_point = (
         np.where(usable[:, None, None], each, 0.0) * root[:, None, None]
@@ -202,9 +203,7 @@ def _linearise(scene: Scene, priors: Priors, settings: AdjustmentSettings) -> _N
     gradient[:-_SHARED] = -_summed(_pulls(by_camera, residual), scene.view, views).ravel()
     gradient[-_SHARED:] = -_pulls(by_shared, residual).sum(axis=0)
     cost += _add_priors(scene, priors, settings, system, gradient)
-    lens_sigma = np.array(
-        [settings.focal_sigma, *settings.radial_sigma, *2 * (settings.centre_sigma,)]
-    )
+    lens_sigma = np.array([_FOCAL_SIGMA, *_RADIAL_SIGMA, *2 * (_CENTRE_SIGMA,)])
     system[-_SHARED:, -_SHARED:] += np.diag(1 / lens_sigma**2)
     gradient[-_SHARED:] -= scene.shared / lens_sigma**2
     cost += float(((scene.shared / lens_sigma) ** 2).sum())

@@ -15,6 +15,7 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.pose import Pose
 from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 from sorvolo.heights.adjustment import (
+    LEAST_SIGMA_PX,
     AdjustmentSettings,
     Priors,
     Scene,
@@ -350,7 +351,7 @@ def _solved(
     # The pictures weighed as they fit (their residuals' median), which is better than the
     # settings assume.
     fit_px = SIGMA_PER_MEDIAN_DEVIATION * float(np.nanmedian(np.abs(residual)))
-    weighed = replace(settings.adjustment, sigma_px=max(fit_px, settings.adjustment.least_sigma_px))
+    weighed = replace(settings.adjustment, sigma_px=max(fit_px, LEAST_SIGMA_PX))
     sigma = SmoothSigma.fitted(scene.points_m[:, :2], height_deviations(scene, priors, weighed))
     return Cameras3D(
         moved,

@@ -19,6 +19,18 @@ from sorvolo.heights.views import View
 _NARROW = SweepSettings(window_cells=(3, 7), smoothing=SmoothingSettings(more_levels=0.6))
 
 
+_COARSER = 2  # cells of the first sweep, in those of the model
+_TILE_CELLS = 320  # side of a tile: with its apron it fits the memory of a small computer
+_TILE_SHARE = 0.3  # of a photo's ground: a tile is seen whole by the photos that are compared on it
+_APRON_CELLS = 10  # beyond a tile, so that neighbouring tiles agree: more than half a patch
+_COARSE_APRON_CELLS = 5  # of the first sweep, whose patches are smaller
+_MARGIN_CELLS = 12.0  # heights searched above and below what the first sweep found, in cells
+_MATCH_CELLS = 0.12  # sigma of a match where photos agree perfectly, in cells of parallax
+_RELIEF_SHARE = (
+    0.25  # of the heights' spread around a cell: at an edge it is not known which is right
+)
+
+
 @dataclass(frozen=True)
 class SurfaceSettings:
     """How the height model is made, and how its sigma follows from what the sweep saw."""
@@ -27,26 +39,12 @@ class SurfaceSettings:
     coarse: SweepSettings = field(
         default_factory=lambda: _NARROW
     )  # to find what heights a tile has
-    coarser: int = 2  # cells of the first sweep, in those of the model
-    tile_cells: int = 320  # side of a tile: with its apron it fits the memory of a small computer
-    tile_share: float = (
-        0.3  # of a photo's ground: a tile is seen whole by the photos that are compared on it
-    )
-    apron_cells: int = 10  # beyond a tile, so that neighbouring tiles agree: more than half a patch
-    coarse_apron_cells: int = 5  # of the first sweep, whose patches are smaller
-    margin_cells: float = (
-        12.0  # heights searched above and below what the first sweep found, in cells
-    )
     unsure_cells: float = 3.0  # how far off heights are that are likely as well, beyond which one pair decides nothing
     islands: IslandSettings = field(default_factory=IslandSettings)
-    match_cells: float = 0.12  # sigma of a match where photos agree perfectly, in cells of parallax
-    relief_share: float = (
-        0.25  # of the heights' spread around a cell: at an edge it is not known which is right
-    )
 
     def sizes_m(self, cell_m: float) -> tuple[float, float]:
         """What a pixel covers of the ground in the pictures that the two sweeps take, for cells of `cell_m`."""
-        return self.coarser * cell_m, cell_m
+        return _COARSER * cell_m, cell_m
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,14 +86,14 @@ def sweep_surface(
     reach = camera_m - ground
     everywhere = Bounds(float(low - 0.05 * reach), float(max(high, ground + 0.4 * reach)), ground)
     side = _tile_cells(lattice.cell_m, views, settings)
-    wide = lattice.coarser(settings.coarser)
+    wide = lattice.coarser(_COARSER)
     coarse = _coarse(wide, views, pictures, everywhere, settings)
     obstacles = Obstacles.surely(wide, coarse, max(settings.coarse.window_cells))
     up_m, sigma_m = (np.full(lattice.shape, np.nan, np.float32) for _ in range(2))
     covered, shown_by = np.zeros(lattice.shape, bool), np.zeros(lattice.shape, np.uint8)
     tiles = list(lattice.windows(side))
     for number, (x0, y0, x1, y1) in enumerate(tiles):
-        apron = settings.apron_cells
+        apron = _APRON_CELLS
         window = lattice.window(x0 - apron, y0 - apron, x1 + apron, y1 + apron)
         bounds = _tile_bounds(coarse, settings, (x0, y0, x1, y1), lattice.cell_m)
         if bounds is not None:
@@ -126,9 +124,7 @@ def sweep_surface(
         settings.sweep,
     )
     given = np.isfinite(ground_m)
-    sigma_m[given] = np.hypot(
-        sigma_m[given], settings.relief_share * (up_m[given] - ground_m[given])
-    )
+    sigma_m[given] = np.hypot(sigma_m[given], _RELIEF_SHARE * (up_m[given] - ground_m[given]))
     up_m[given] = ground_m[given]
     up_m[_seen_through(lattice, up_m, views, pictures, settings)] = np.nan
     sigma_m[np.isnan(up_m)] = np.nan
@@ -143,7 +139,7 @@ def _seen_through(
     settings: SurfaceSettings,
 ) -> Mask:
     """(H, W) the cells that photos see through, found on cells of the first sweep."""
-    times = settings.coarser
+    times = _COARSER
     coarse = lattice.coarser(times)
     found = seen_through(
         coarse,
@@ -166,7 +162,7 @@ def _coarse(
     settings: SurfaceSettings,
 ) -> Floats32:
     up_m = np.full(lattice.shape, np.nan, np.float32)
-    apron = settings.coarse_apron_cells
+    apron = _COARSE_APRON_CELLS
     for x0, y0, x1, y1 in lattice.windows(_tile_cells(lattice.cell_m, views, settings)):
         window = lattice.window(x0 - apron, y0 - apron, x1 + apron, y1 + apron)
         swept = sweep(window, views, lambda i: pictures(i, lattice.cell_m), bounds, settings.coarse)
@@ -181,20 +177,20 @@ def _tile_cells(cell_m: float, views: Sequence[View], settings: SurfaceSettings)
         / view.camera.fx_px
         for view in views
     ]
-    return int(np.clip(settings.tile_share * np.median(ground_m) / cell_m, 32, settings.tile_cells))
+    return int(np.clip(_TILE_SHARE * np.median(ground_m) / cell_m, 32, _TILE_CELLS))
 
 
 def _tile_bounds(
     coarse: Floats32, settings: SurfaceSettings, window: tuple[int, int, int, int], cell_m: float
 ) -> Bounds | None:
     """The heights to search in a tile; None where the coarse model has a hole as large as the tile."""
-    x0, y0, x1, y1 = (round(each / settings.coarser) for each in window)
+    x0, y0, x1, y1 = (round(each / _COARSER) for each in window)
     around = coarse[max(0, y0 - 6) : y1 + 7, max(0, x0 - 6) : x1 + 7]
     known = around[np.isfinite(around)]
     if not len(known):
         return None
     low, high = np.percentile(known, [0.5, 99.5])
-    margin = settings.margin_cells * cell_m
+    margin = _MARGIN_CELLS * cell_m
     return Bounds(float(low - margin), float(high + margin), float(np.median(known)))
 
 
@@ -216,8 +212,8 @@ def _sigma_m(
 ) -> Floats32:
     """(H, W) one sigma of the heights: of the match, of other likely heights, of an edge nearby, of the cameras."""
     likeness = np.sqrt(np.clip(swept.score, 0.01, 1))
-    match = settings.match_cells * lattice.cell_m / np.maximum(swept.spread, 0.02) / likeness
-    relief = settings.relief_share * _relief(up_m)
+    match = _MATCH_CELLS * lattice.cell_m / np.maximum(swept.spread, 0.02) / likeness
+    relief = _RELIEF_SHARE * _relief(up_m)
     other = np.nan_to_num(swept.deviation_m)
     sigma = np.sqrt(match**2 + relief**2 + other**2 + camera_sigma.on(lattice) ** 2).astype(
         np.float32

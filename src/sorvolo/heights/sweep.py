@@ -85,23 +85,23 @@ Seen: TypeAlias = Mask | bool
 """Where a photo sees the cells of a window: (H, W), or everywhere, or nowhere."""
 
 
+_VIEWS = 4  # laid over each other at a time
+_CONTRAST_PX = 9  # side of the surroundings that a pixel's gray is measured against
+_PAIR_SHARE = 0.5  # of the pairs of photos that see a cell: the others may be hidden from it
+_NOISE_LEVELS = 3.0  # gray levels; texture below it decides nothing
+_LEVEL_PX = 0.8  # parallax between two planes, of the two photos farthest apart
+_MOST_LEVELS = 160  # planes of one sweep: bounds time and memory
+_LEAST_SCORE = 0.1  # of agreement, 0 to 1, below which a cell stays a hole
+
+
 @dataclass(frozen=True)
 class SweepSettings:
     """How photos are compared."""
 
-    views: int = 4  # laid over each other at a time
     window_cells: tuple[int, int] = (
         5,
         15,
     )  # sides of the patches that are compared: detail, and what is sure
-    contrast_px: int = 9  # side of the surroundings that a pixel's gray is measured against
-    pair_share: float = (
-        0.5  # of the pairs of photos that see a cell: the others may be hidden from it
-    )
-    noise_levels: float = 3.0  # gray levels; texture below it decides nothing
-    level_px: float = 0.8  # parallax between two planes, of the two photos farthest apart
-    most_levels: int = 160  # planes of one sweep: bounds time and memory
-    least_score: float = 0.1  # of agreement, 0 to 1, below which a cell stays a hole
     smoothing: SmoothingSettings = field(default_factory=SmoothingSettings)
 
 
@@ -142,7 +142,7 @@ def sweep(
     see a cell depends on its height: where fewer than two see the height that fits best, the cell is a hole.
     """
     low_m, high_m = bounds.low_m, bounds.high_m
-    chosen = choose_views(lattice, views, bounds.usual_m, settings.views, obstacles)
+    chosen = choose_views(lattice, views, bounds.usual_m, _VIEWS, obstacles)
     shape = lattice.shape
     if len(chosen) < 2:
         nothing = np.full(shape, np.nan, np.float32)
@@ -151,8 +151,8 @@ def sweep(
             *(np.full(shape, each, np.float32) for each in (0.0, len(chosen), 0.0, np.nan, 0.0)),
         )
     spreads = _spreads(lattice, [views[k] for k in chosen], bounds.usual_m)
-    finest_m = settings.level_px * lattice.cell_m / max(float(spreads.max()), 0.05)
-    level_m = max(finest_m, (high_m - low_m) / (settings.most_levels - 1))
+    finest_m = _LEVEL_PX * lattice.cell_m / max(float(spreads.max()), 0.05)
+    level_m = max(finest_m, (high_m - low_m) / (_MOST_LEVELS - 1))
     levels: Floats = low_m + level_m * np.arange(int(np.ceil((high_m - low_m) / level_m)) + 1.0)
     eyes_m = np.array([views[k].site_from_camera.translation_m for k in chosen])
     laid = [_Laid(views[k], pictures(k), lattice, bounds, eyes_m, settings) for k in chosen]
@@ -172,7 +172,7 @@ def sweep(
     )
     away = levels[None, :, None].astype(np.float32) - up_m[:, None]
     deviation = np.asarray(np.sqrt((chance * away**2).sum(axis=1) / chance.sum(axis=1)), np.float32)
-    up_m[~(score >= settings.least_score)] = (
+    up_m[~(score >= _LEAST_SCORE)] = (
         np.nan
     )  # no two photos see the height that fits, or they do not agree
     shown_by = np.sum(
@@ -431,7 +431,7 @@ class _Laid:
 
     def _crop_to(self, picture: ImageGray, bounds: Bounds, settings: SweepSettings) -> Floats32:
         """Keep of the picture what the cells see at all heights."""
-        apron = self._apron = settings.contrast_px
+        apron = self._apron = _CONTRAST_PX
         low, high = np.zeros(2, int), np.array(self._size)
         seen = [
             self._picture_from_cells(each) @ self._corners for each in (bounds.low_m, bounds.high_m)
@@ -454,7 +454,7 @@ def _contrast(picture: Floats32, angle_rad: float, settings: SweepSettings) -> F
 
     Along the line between two photos, for an edge along that line fits itself at every height.
     """
-    side = settings.contrast_px
+    side = _CONTRAST_PX
     way = np.linspace(-(side // 2), side // 2, 4 * side)
     line = np.zeros((side, side), np.float32)
     x, y = way * np.cos(angle_rad) + side // 2, way * np.sin(angle_rad) + side // 2
@@ -467,7 +467,7 @@ def _contrast(picture: Floats32, angle_rad: float, settings: SweepSettings) -> F
             )
     away = picture - cv2.filter2D(picture, -1, line / line.sum())
     spread = cv2.sqrBoxFilter(away, -1, (side, side))
-    return np.asarray(away / np.sqrt(spread + np.float32(settings.noise_levels**2)), np.float32)
+    return np.asarray(away / np.sqrt(spread + np.float32(_NOISE_LEVELS**2)), np.float32)
 
 
 def _agreements(laid: Sequence[_Laid], levels_m: Floats, settings: SweepSettings) -> Floats32:
@@ -494,7 +494,7 @@ def _agreement(
     pictures = {k: laid[k].at(up_m) for k in {k for i, j, _ in pairs for k in (i, j)}}
     scores = [_likeness(pictures[i][j] * pictures[j][i], both, settings) for i, j, both in pairs]
     is_whole = all(any(each is True for each in both) for _, _, both in pairs)
-    return (_better_mean if is_whole else _better_mean_of_known)(scores, settings.pair_share)
+    return (_better_mean if is_whole else _better_mean_of_known)(scores, _PAIR_SHARE)
 
 
 def _pairs(known: Sequence[Sequence[Seen]]) -> Iterator[tuple[int, int, list[Seen]]]:

@@ -13,22 +13,23 @@ from cv2.typing import MatLike
 from sorvolo.geometry.arrays import Floats32, Mask
 from sorvolo.heights.lattice import Lattice
 
+_CELL_M = 0.5  # the filter's own cells, at least
+_SLOPE = 0.2  # of the ground, at most
+_LEAST_HEIGHT_M = 0.3  # above the ground around: lower things are ground
+
 
 @dataclass(frozen=True)
 class TerrainSettings:
     """What counts as standing on the ground."""
 
-    cell_m: float = 0.5  # the filter's own cells, at least
     widest_m: float = 30.0  # of a building or a grove
-    slope: float = 0.2  # of the ground, at most
-    least_height_m: float = 0.3  # above the ground around: lower things are ground
 
 
 def terrain(
     lattice: Lattice, up_m: Floats32, settings: TerrainSettings = TerrainSettings()
 ) -> tuple[Floats32, Mask]:
     """(H, W) the ground's height, everywhere, and which cells show it; `up_m` (H, W) may have holes (NaN)."""
-    factor = max(1, round(settings.cell_m / lattice.cell_m))
+    factor = max(1, round(_CELL_M / lattice.cell_m))
     low, known = _lowest(up_m, factor)
     is_ground = _ground_cells(filled(low, known), known, lattice.cell_m * factor, settings)
     ground = cv2.GaussianBlur(filled(low, is_ground), (0, 0), 1.0)
@@ -43,7 +44,7 @@ def terrain(
         borderMode=cv2.BORDER_REPLICATE,
     )
     with np.errstate(invalid="ignore"):
-        shows = np.abs(up_m - fine) < settings.least_height_m
+        shows = np.abs(up_m - fine) < _LEAST_HEIGHT_M
     return np.where(shows, up_m, fine).astype(np.float32), shows
 
 
@@ -91,11 +92,11 @@ def _ground_cells(low: Floats32, known: Mask, cell_m: float, settings: TerrainSe
         opened_now = cv2.morphologyEx(
             opened, cv2.MORPH_OPEN, _disk(radius), borderType=cv2.BORDER_REPLICATE
         )
-        allowed = settings.least_height_m + settings.slope * (radius - before) * cell_m
+        allowed = _LEAST_HEIGHT_M + _SLOPE * (radius - before) * cell_m
         is_ground &= opened - opened_now <= allowed
         opened, before = opened_now, radius
         radius = max(radius + 1, round(radius * 1.4))
-    return is_ground & (np.abs(low - surface) < settings.least_height_m)
+    return is_ground & (np.abs(low - surface) < _LEAST_HEIGHT_M)
 
 
 def _disk(radius: int) -> MatLike:

@@ -19,16 +19,20 @@ from sorvolo.survey.findings import HeightChange
 Polygons: TypeAlias = Sequence[Sequence[PointsM]]
 
 
+_ROUNDS = 6  # of a robust fit
+_CLIP_SIGMAS = 3.0  # of the spread: what changed outside the area does not tie
+_BLOCK_M = 5.0  # errors of a height model hold on for about as long
+_LEAST_STABLE = 500  # cells
+_BEYOND = (
+    0.1  # of the area outside of the height model: an area drawn elsewhere, not a hole; by choice
+)
+
+
 @dataclass(frozen=True)
 class VolumeSettings:
     """How two dates are tied to each other, and how errors of cells add up."""
 
-    rounds: int = 6  # of a robust fit
-    clip_sigmas: float = 3.0  # of the spread: what changed outside the area does not tie
-    block_m: float = 5.0  # errors of a height model hold on for about as long
-    least_stable: int = 500  # cells
     least_known: float = 0.5  # of the area
-    beyond: float = 0.1  # of the area outside of the height model: an area drawn elsewhere, not a hole; by choice
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +86,7 @@ def tie(
     )
     north = -down
     spread, sigma, count = np.inf, np.inf, 0
-    for _ in range(settings.rounds):
+    for _ in range(_ROUNDS):
         moved = later.on(earlier.lattice, shift_m[:2])
         off = earlier.up_m - (moved.up_m + shift_m[2])
         usable = (
@@ -92,16 +96,16 @@ def tie(
             & np.isfinite(north)
             & (np.hypot(east, north) < 1.0)
         )
-        if usable.sum() < settings.least_stable:
+        if usable.sum() < _LEAST_STABLE:
             raise InputError(
                 f"the two flights share {int(usable.sum())} cells of ground outside the area, "
-                f"{settings.least_stable} are needed to tie them; give a smaller area, or flights that reach beyond it"
+                f"{_LEAST_STABLE} are needed to tie them; give a smaller area, or flights that reach beyond it"
             )
         middle = float(np.median(off[usable]))
         spread = max(
             SIGMA_PER_MEDIAN_DEVIATION * float(np.median(np.abs(off[usable] - middle))), 1e-4
         )
-        usable &= np.abs(off - middle) < settings.clip_sigmas * spread
+        usable &= np.abs(off - middle) < _CLIP_SIGMAS * spread
         step = _step(off[usable], east[usable], north[usable])
         shift_m += step
         sigma, count = (
@@ -188,12 +192,12 @@ def _added_up(
     if share < settings.least_known:
         beyond = 1 - float(inside.sum()) * cell_m2 / area_m2 if area_m2 > 0 else 0.0
         advice = "fly it with more overlap"
-        if beyond > settings.beyond:
+        if beyond > _BEYOND:
             advice = f"{beyond:.0%} of it is beyond the flight's heights: draw it on flown ground (check its CRS)"
         raise InputError(
             f"only {share:.0%} of the area has heights, {settings.least_known:.0%} are needed; {advice}"
         )
-    alike = max(1.0, (settings.block_m / cell_m) ** 2)  # cells whose errors are one
+    alike = max(1.0, (_BLOCK_M / cell_m) ** 2)  # cells whose errors are one
     scatter = float(
         np.sqrt((sigma[known].astype(np.float64) ** 2).sum() * min(alike, float(known.sum())))
     )
@@ -217,7 +221,7 @@ def _step(off: Floats, east: Floats, north: Floats) -> Floats:
 
 def _offset_sigma(off: Floats, usable: Mask, cell_m: float, settings: VolumeSettings) -> float:
     """One sigma of the height of the tie: blocks of cells whose errors are alike count once."""
-    side = max(1, round(settings.block_m / cell_m))
+    side = max(1, round(_BLOCK_M / cell_m))
     rows, columns = np.nonzero(usable)
     block = (rows // side) * (usable.shape[1] // side + 1) + columns // side
     _, at, count = np.unique(block, return_inverse=True, return_counts=True)

@@ -24,32 +24,32 @@ from sorvolo.survey.control import (
 LEAST_CONTROL = 3  # points: two fix a similarity, the third shows whether they are right
 
 
+_MARK_PX = 1.0  # with which a person marks, px of the frame
+_EXCLUDED_SIGMAS = 5.0  # beyond which a point may be wrong ...
+_EXCLUDED_TIMES = 4.0  # ... if it also misses so many times as much as the others
+_MOST_MISFIT = 0.12  # of the points' spread: more, and the points are not those in the pictures
+_LEAST_SPREAD_M = 0.1  # rms: closer together they give no scale and no north
+_MOST_OFF_GPS_M = 60.0  # no receiver errs so far: the points' CRS is another
+_MOST_SCALE = 1.3  # between GPS and the points
+_ON_LINE = (
+    0.1  # spread across over spread along, or over that of a picture's ground: less is one line
+)
+_CLEARLY_BETTER = (
+    0.5  # times the rms miss, by choice: heights in feet that fit so much better are in feet
+)
+_IN_CORNER = (
+    0.3  # their spread over that of the flight's cameras, below which they hold a corner of it
+)
+
+
 @dataclass(frozen=True)
 class ControlSettings:
     """How control points are weighed, and when one of them is taken for wrong."""
 
     sigma_m: float = 0.05  # of the survey, horizontal
-    mark_px: float = 1.0  # with which a person marks, px of the frame
     checks: tuple[
         str, ...
     ] = ()  # labels held back; one that ends in * stands for all that begin so
-    excluded_sigmas: float = 5.0  # beyond which a point may be wrong ...
-    excluded_times: float = 4.0  # ... if it also misses so many times as much as the others
-    most_misfit: float = (
-        0.12  # of the points' spread: more, and the points are not those in the pictures
-    )
-    least_spread_m: float = 0.1  # rms: closer together they give no scale and no north
-    most_off_gps_m: float = 60.0  # no receiver errs so far: the points' CRS is another
-    most_scale: float = 1.3  # between GPS and the points
-    on_line: float = (
-        0.1  # spread across over spread along, or over that of a picture's ground: less is one line
-    )
-    clearly_better: float = (
-        0.5  # times the rms miss, by choice: heights in feet that fit so much better are in feet
-    )
-    in_corner: float = (
-        0.3  # their spread over that of the flight's cameras, below which they hold a corner of it
-    )
 
     def holds_back(self, label: str) -> bool:
         """Whether this point measures the map in place of tying it."""
@@ -117,9 +117,7 @@ def tie_control(
         # marks.
         heights_m = [mapper.pose(each).translation_m[2] for each in seen.ties.keyframe_ids.tolist()]
         expected_m = float(
-            np.hypot(
-                settings.sigma_m, settings.mark_px * np.median(heights_m) / problem.camera.fx_px
-            )
+            np.hypot(settings.sigma_m, _MARK_PX * np.median(heights_m) / problem.camera.fx_px)
         )
         wrong = _wrong_point(seen, misses, used, expected_m, settings)
         if wrong is None or len(used) == LEAST_CONTROL:
@@ -158,12 +156,12 @@ def _misfit_remarks(
     misses, _ = seen.misses(mapper.ground_places_m(seen.ties))
     is_used = np.array([label in used for label in seen.labels], bool)
     missed_m = _rms_m(misses[is_used])
-    if missed_m <= settings.excluded_sigmas * expected_m:
+    if missed_m <= _EXCLUDED_SIGMAS * expected_m:
         return ()
     found = f"the control points miss the map by {missed_m:.2f} m (rms), and {expected_m:.2f} m was to be expected"
     in_feet = replace(seen, ties=replace(seen.ties, place_m=seen.ties.place_m * (1.0, 1.0, FOOT_M)))
     as_read_m, as_feet_m = (_unlike_m(mapper, each, is_used) for each in (seen, in_feet))
-    if as_feet_m < settings.clearly_better * as_read_m:
+    if as_feet_m < _CLEARLY_BETTER * as_read_m:
         return (f"{found}; their heights (z) fit far better as feet: give them in metres",)
     return (f"{found}: the ground is not level, or their heights (z) are wrong",)
 
@@ -198,13 +196,13 @@ def layout_remarks(
     `picture_m` wide on the ground: on one line, or all in one corner. Their residuals are small, however far off the
     map is elsewhere."""
     along_m, across_m = _spreads_m(places_m)
-    if across_m < settings.on_line * min(along_m, picture_m / np.sqrt(12)):
+    if across_m < _ON_LINE * min(along_m, picture_m / np.sqrt(12)):
         return (
             f"the control points lie on one line ({4 * along_m:.0f} m long, {4 * across_m:.1f} m wide): they do not "
             "show how the map lies beside it; add points to both sides, or hold some back there (--check)",
         )
     reach_m = _spreads_m(cameras_m)[0]
-    if along_m < settings.in_corner * reach_m:
+    if along_m < _IN_CORNER * reach_m:
         return (
             f"the control points reach over {4 * along_m:.0f} m of a flight of {4 * reach_m:.0f} m: they do not show "
             "how the map lies away from them; spread them over the whole area",
@@ -256,7 +254,7 @@ def _seen(
         keyframes,
         problem.camera.rays_from_pixels(pixels)[:, :2],
         np.array([place_of[each.label] for each in marks]).reshape(-1, 3),
-        settings.mark_px * np.array(scale),
+        _MARK_PX * np.array(scale),
         settings.sigma_m * np.sqrt(count),  # marks of one point share its error
     )
     return _Seen(labels, point, ties)
@@ -294,7 +292,7 @@ def _wrong_point(
     }
     worst = max(miss_m, key=lambda label: miss_m[label])
     usual_m = float(np.median([value for label, value in miss_m.items() if label != worst]))
-    limit_m = max(settings.excluded_sigmas * expected_m, settings.excluded_times * usual_m)
+    limit_m = max(_EXCLUDED_SIGMAS * expected_m, _EXCLUDED_TIMES * usual_m)
     return worst if miss_m[worst] > limit_m else None
 
 
@@ -338,13 +336,13 @@ def _disagreement(
         for each in (ties.place_m[:, :2], places_m)
     )
     spread_m = float(np.linalg.norm(a.std(axis=0)))
-    if spread_m < settings.least_spread_m:
+    if spread_m < _LEAST_SPREAD_M:
         return f"the control points all lie within {4 * spread_m:.2g} m of each other"
     change = similarity_of_most(a, b) if np.isfinite(b).all() else None
     if change is None:
         return "the control points are marked where no picture shows the ground"
     miss_m = np.sort(np.linalg.norm(apply_homography(change, b) - a, axis=1))[(len(a) + 1) // 2]
-    if miss_m > settings.most_misfit * spread_m:
+    if miss_m > _MOST_MISFIT * spread_m:
         return f"the control points miss those marked by {miss_m:.1f} m on ground {2 * spread_m:.0f} m wide"
     return "" if problem.is_datum else _against_gps(a, b, change, spread_m, settings)
 
@@ -355,8 +353,8 @@ def _against_gps(
     """How surveyed places `a` cannot be those that a map by GPS has at `b`, (P, 2) each; "" where they can."""
     off_m = float(np.median(np.linalg.norm(a - b, axis=1)))
     scale = float(np.hypot(change[0, 0], change[1, 0]))
-    if off_m > settings.most_off_gps_m + 0.25 * spread_m:
+    if off_m > _MOST_OFF_GPS_M + 0.25 * spread_m:
         return f"the control points lie {off_m:.0f} m from where GPS has what is marked"
-    if not 1 / settings.most_scale < scale < settings.most_scale:
+    if not 1 / _MOST_SCALE < scale < _MOST_SCALE:
         return f"the control points are {scale:.2f} times as far apart as GPS has what is marked"
     return ""

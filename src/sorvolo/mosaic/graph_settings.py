@@ -30,21 +30,25 @@ class OffsetSettings:
     )
 
 
+PAIRS_PER_LINK = 40  # matches that stand for a link, spread over it
+INDEPENDENT_PAIRS = 20.0  # matches of one link share lens and relief errors: they count as so many
+WINDOW = 6  # recent keyframes freed by each local solve
+UNEVEN = (
+    0.002  # relief left between linked pictures over the height: level ground 0.0003, hills 0.004
+)
+STRAINED = (
+    3.0  # times a link's believed noise: the ground around it cannot be laid without bending more
+)
+
+
 @dataclass(frozen=True)
 class PoseGraphSettings:
     """What the graph may move and when it solves."""
 
-    pairs_per_link: int = 40  # matches that stand for a link, spread over it
-    independent_pairs: float = (
-        20.0  # matches of one link share lens and relief errors: they count as so many
-    )
     sigma_px: float = (
         0.3  # floor of a match's noise; calibration and rolling shutter never are better
     )
-    window: int = 6  # recent keyframes freed by each local solve
     region: int = 120  # keyframes; a larger flight is solved around its newest ones only, until it ends or is strained
-    uneven: float = 0.002  # relief left between linked pictures over the height: level ground 0.0003, hills 0.004
-    strained: float = 3.0  # times a link's believed noise: the ground around it cannot be laid without bending more
     focal_sigma: float = 0.0  # relative; 0 holds the focal length
     radial_sigma: float = 0.0  # prior of the left-over radial distortion; 0 holds it
     altitude_offset_sigma_m: float = 1.0  # how well the altitude's zero is known to be the ground

@@ -173,17 +173,19 @@ def _bytes(keyframe: Keyframe, thumbnail: ImageRGB) -> bytes:
     return data.getvalue()
 
 
+_REGISTRATION_SIDE_PX = 1024  # longest side of the image that is registered
+_PREVIOUS = 2  # keyframes before, always tried
+_SPATIAL = 2  # further ones under the predicted view: they close loops between strips
+_WANTED_LINKS = 4  # with fewer, pictures that refused are asked again with SIFT
+_LEAST_OVERLAP = 0.2  # of a view, for a spatial neighbour
+_RECOVERY = 30  # keyframes tried for a frame that is lost and has no GPS
+
+
 @dataclass(frozen=True)
 class PlanarSettings:
     """How a keyframe is tied to others."""
 
-    registration_side_px: int = 1024  # longest side of the image that is registered
-    previous: int = 2  # keyframes before, always tried
-    spatial: int = 2  # further ones under the predicted view: they close loops between strips
-    wanted_links: int = 4  # with fewer, pictures that refused are asked again with SIFT
-    least_overlap: float = 0.2  # of a view, for a spatial neighbour
     recent_links: int = 400  # of which colours are compared while the flight goes on
-    recovery: int = 30  # keyframes tried for a frame that is lost and has no GPS
     links: LinkSettings = field(default_factory=LinkSettings)
     exposure: ExposureSettings = field(default_factory=ExposureSettings)
 
@@ -481,7 +483,7 @@ class PlanarMapper:
     def _keyframe(
         self, keyframe_id: int, camera: Camera, image: ImageRGB, prior: CameraPrior
     ) -> Keyframe:
-        scale = min(1.0, self._settings.registration_side_px / max(image.shape[:2]))
+        scale = min(1.0, _REGISTRATION_SIDE_PX / max(image.shape[:2]))
         gray = gray_from_rgb(image)
         if scale < 1.0:
             size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
@@ -498,25 +500,21 @@ class PlanarMapper:
         All candidates are tried the cheap way first. Only where few of them link are those that refused tried
         with SIFT and correlation, until enough link: few links let tall trees bend a strip.
         """
-        previous = self._own[::-1][: self._settings.previous]
+        previous = self._own[::-1][:_PREVIOUS]
         tie = _Tie(new, self._guess_by_telemetry(new))
         if previous:
             self._ask(
                 tie, previous[0], self._loose_prediction(new, previous[0], tie.guess), Effort.CHEAP
             )
         self._ask_under(tie, previous)
-        if len(tie.links) < self._settings.wanted_links:
+        if len(tie.links) < _WANTED_LINKS:
             self._ask_dearly(tie)
             self._ask_under(tie, previous)
         if not tie.links and not new.prior.knows_place:
             # Ask the last pictures and some of all the flight until one links: nobody knows where
             # the new one is.
             for each in [*self._own[::-1][1:10], *self._own[:: max(1, len(self._own) // 20)]]:
-                if (
-                    each not in tie.refusals
-                    and len(tie.refusals) < self._settings.recovery
-                    and not tie.links
-                ):
+                if each not in tie.refusals and len(tie.refusals) < _RECOVERY and not tie.links:
                     self._ask(tie, each, None, Effort.ALL)
         if not self._own and tie.guess is None:
             tie.guess = Pose(new.prior.rotation, new.prior.position_m)
@@ -564,7 +562,7 @@ class PlanarMapper:
             if not tie.links and other in tie.refusals and refusal.prediction is not None:
                 # telemetry may be plainly wrong (pictures turned by half a turn, a compass that hangs): ask them alone
                 self._ask(tie, other, None, Effort.ALL)
-            if len(tie.links) >= self._settings.wanted_links:
+            if len(tie.links) >= _WANTED_LINKS:
                 return
 
     def _guess_by_telemetry(self, new: Keyframe) -> Pose | None:
@@ -626,8 +624,8 @@ class PlanarMapper:
             for k, each in enumerate(previous, 1)
             if each not in tried and overlap[count - k] > 0.1
         ]
-        under = np.flatnonzero(overlap > self._settings.least_overlap)
-        limit = len(chosen) + self._settings.spatial + (0 if linked else 3)
+        under = np.flatnonzero(overlap > _LEAST_OVERLAP)
+        limit = len(chosen) + _SPATIAL + (0 if linked else 3)
         near = {*tried, *previous}
         for k in under[np.argsort(-overlap[under], kind="stable")].tolist():
             each = ids[k]

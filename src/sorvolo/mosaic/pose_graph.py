@@ -35,7 +35,15 @@ from sorvolo.mosaic.graph_rows import (
     move_all,
     telemetry_trust,
 )
-from sorvolo.mosaic.graph_settings import OffsetSettings, PoseGraphSettings
+from sorvolo.mosaic.graph_settings import (
+    INDEPENDENT_PAIRS,
+    PAIRS_PER_LINK,
+    STRAINED,
+    UNEVEN,
+    WINDOW,
+    OffsetSettings,
+    PoseGraphSettings,
+)
 from sorvolo.mosaic.ground_ties import GroundTies
 from sorvolo.mosaic.normal_equations import Factors
 from sorvolo.mosaic.shelf import Shelf
@@ -133,7 +141,7 @@ class PoseGraph:
         self._names: list[int] = []
         self._nodes: list[_Node] = []
         self._rows = NodeRows()
-        self._links = LinkRows(settings.pairs_per_link, settings.independent_pairs, shelf)
+        self._links = LinkRows(PAIRS_PER_LINK, INDEPENDENT_PAIRS, shelf)
         self._shared = np.zeros(len(SHARED))
         self._dropped = 0
         self._solved_at = self._region_solved_at = 0
@@ -234,7 +242,7 @@ class PoseGraph:
                 max(self._settings.sigma_px, each.sigma_px),
             )
         free = np.zeros(len(self._nodes), bool)
-        free[-self._settings.window :] = True
+        free[-WINDOW:] = True
         free[[self._ids[each.old_id] for each in links]] = True
         free &= self._own()
         self._solve_around(free, iterations=2)
@@ -456,7 +464,7 @@ class PoseGraph:
 
     def _is_uneven(self) -> bool:
         own = self._own()
-        return bool(own.any()) and self._relief_m() > self._settings.uneven * np.median(
+        return bool(own.any()) and self._relief_m() > UNEVEN * np.median(
             self._rows.centres_m[own, 2]
         )
 
@@ -517,7 +525,7 @@ class PoseGraph:
         usual_px = float(np.median(self._links.sigma_px))
         false = noise.is_false(usual_px)  # perhaps: the whole map is solved before one is dropped
         believed_px = np.maximum(self._links.sigma_px[chosen], usual_px)
-        self._is_strained |= bool((noise.across_px > self._settings.strained * believed_px).any())
+        self._is_strained |= bool((noise.across_px > STRAINED * believed_px).any())
         self._weigh(chosen[~false], noise, ~false)
         self._weigh_telemetry()
         return self._moved(np.flatnonzero(free))

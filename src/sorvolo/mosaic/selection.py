@@ -18,6 +18,15 @@ _COPIES_KEPT = 16  # more than wait between the decoder and the selection
 _COARSE_PX = 64  # at which a sensor's noise averages out and ground still shows itself
 
 
+_BLURRED = 0.6  # of the usual sharpness: wait for a better one
+_USELESS = 0.35  # of the usual sharpness: reject
+_BARE_LEVELS = (
+    0.6  # of gray, spread at 64 px: one gray 0, with noise 0.5, the barest real field 2.2
+)
+_USUAL = 25  # frames that show how sharp the flight's usually are
+_SPARSE_SHARE = 2 / 3  # of the way between keyframes that decoded frames may lie apart
+
+
 @dataclass(frozen=True)
 class SelectionSettings:
     """When a frame is worth a place in the map."""
@@ -26,13 +35,6 @@ class SelectionSettings:
     least_overlap: float = (
         0.5  # a blurred frame is skipped only while its successors still overlap this much
     )
-    blurred: float = 0.6  # of the usual sharpness: wait for a better one
-    useless: float = 0.35  # of the usual sharpness: reject
-    bare_levels: float = (
-        0.6  # of gray, spread at 64 px: one gray 0, with noise 0.5, the barest real field 2.2
-    )
-    usual: int = 25  # frames that show how sharp the flight's usually are
-    sparse_share: float = 2 / 3  # of the way between keyframes that decoded frames may lie apart
 
     def __post_init__(self) -> None:
         if not 0 < self.least_overlap <= self.overlap < 1:
@@ -161,7 +163,7 @@ def select_keyframes(
         typical = float(np.median(latest)) if latest else clarity
         texture = normalise_contrast(gray)
         overlap = 0.0 if last is None or keep_all else _overlap(last, texture)
-        latest, count = (*latest, clarity)[-settings.usual :], count + 1
+        latest, count = (*latest, clarity)[-_USUAL:], count + 1
         reason = _reason_if_selected(overlap, clarity, typical, count, settings)
         if reason is None:
             continue
@@ -176,10 +178,10 @@ def shows_all_between(old: ImageGray, new: ImageGray, settings: SelectionSetting
 
     Keyframes chosen among frames so near overlap by `least_overlap` at least, with the usual settings.
     """
-    if sharpness(new) < settings.blurred * sharpness(old):
+    if sharpness(new) < _BLURRED * sharpness(old):
         return False
     moved = 1 - _overlap(normalise_contrast(old), normalise_contrast(new))
-    return moved <= settings.sparse_share * (1 - settings.overlap)
+    return moved <= _SPARSE_SHARE * (1 - settings.overlap)
 
 
 class SmallCopies:
@@ -241,7 +243,7 @@ def has_texture(image: ImageRGB, settings: SelectionSettings) -> bool:
     scale = _COARSE_PX / max(gray.shape)
     size = (max(4, round(gray.shape[1] * scale)), max(4, round(gray.shape[0] * scale)))
     coarse = cv2.resize(gray.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    return float((coarse - cv2.boxFilter(coarse, -1, (9, 9))).std()) >= settings.bare_levels
+    return float((coarse - cv2.boxFilter(coarse, -1, (9, 9))).std()) >= _BARE_LEVELS
 
 
 def _reason_if_selected(
@@ -250,9 +252,9 @@ def _reason_if_selected(
     """The `reason` of a selected frame; None for a frame to leave out. `count` frames gave the `typical` sharpness."""
     if overlap > settings.overlap:
         return None
-    if clarity < settings.useless * typical and count > 3:
+    if clarity < _USELESS * typical and count > 3:
         return f"blurred: {clarity / typical:.0%} of the usual sharpness"
-    if clarity < settings.blurred * typical and overlap > settings.least_overlap:
+    if clarity < _BLURRED * typical and overlap > settings.least_overlap:
         return None
     return ""
 
