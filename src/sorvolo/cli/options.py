@@ -20,7 +20,7 @@ OnlyFlight = Annotated[str | None, typer.Option("--flight", help="Only this flig
 Telemetry = Annotated[
     str | None,
     typer.Option(
-        help="The flight's log if it is not beside the video; for a live source, the receiver's address."
+        help="The flight's log, or photos' geo.txt or Timestamp.MRK, if not beside the pictures; live: the receiver's address."
     ),
 ]
 Camera = Annotated[
@@ -31,7 +31,7 @@ Camera = Annotated[
 ]
 Area = Annotated[
     Path | None,
-    typer.Option(help="Outline of the area: GeoJSON, KML, KMZ, or a list of corners."),
+    typer.Option(help="Outline of the area: GeoJSON, KML, KMZ, .plan, or a list of corners."),
 ]
 Offset = Annotated[
     float | None,
