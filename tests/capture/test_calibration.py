@@ -306,7 +306,7 @@ def test_every_preset_is_a_camera_near_its_makers_angle_of_view():
 
 def test_every_preset_has_its_source_in_the_docs():
     page = (
-        (Path(__file__).parents[2] / "docs" / "formats-in.md")
+        (Path(__file__).parents[2] / "docs" / "calibrate.md")
         .read_text()
         .partition("## Camera presets")[2]
     )

@@ -148,7 +148,7 @@ def test_the_only_log_in_the_photos_folder_is_used(photos: Path) -> None:
     log = gpx(photos)
     source = open_photos(photos)
     assert source.telemetry.format == "gpx" and len(source.telemetry) == 5
-    assert codes(source) == {"photo_without_gps": 5, "time_zone_unknown": 5, "log_in_folder": 1}
+    assert codes(source) == {"time_zone_unknown": 5, "log_in_folder": 1}
     # of two it is not clear which, and photos that have positions need none: both are named
     other = gpx(photos, "other.gpx")
     source = open_photos(photos)

@@ -241,3 +241,22 @@ def test_an_empty_telemetry_file_beside_the_video_is_named(tmp_path: Path) -> No
     found = {notice.code: notice.text for notice in source.notices()}
     assert "DJI_0001.SRT" in found["empty_telemetry"] and "0 bytes" in found["empty_telemetry"]
     assert not source.telemetry.has_fixes
+
+
+def test_logs_beside_the_video_that_are_not_used_are_named(tmp_path: Path) -> None:
+    """Two logs of which none has the video's name, one more beside the one used, and one of a kind that is not read."""
+    write_video(tmp_path / "DJI_0001.mp4")
+    rows = "".join(f"41.89000{row},12.6,2026-04-02 12:44:0{row}\n" for row in range(5))
+    for name in ("a.csv", "b.csv"):
+        (tmp_path / name).write_text(f"latitude,longitude,datetime(utc)\n{rows}")
+    (tmp_path / "DJI_0001.ulg").write_bytes(b"ULog\x01\x12\x35")
+
+    def named() -> dict[str, str]:
+        (source,) = open_sources([tmp_path / "DJI_0001.mp4"])
+        return {each.code: each.text for each in source.notices()}
+
+    first = named()
+    assert "a.csv, b.csv; give one as --telemetry" in first["unused_telemetry"]
+    assert "DJI_0001.ulg" in first["unknown_telemetry"]
+    (tmp_path / "a.csv").rename(tmp_path / "DJI_0001.csv")
+    assert "(DJI_0001.csv is): b.csv" in named()["unused_telemetry"]

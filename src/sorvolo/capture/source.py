@@ -5,7 +5,7 @@ import re
 import threading
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Protocol
@@ -393,6 +393,9 @@ def _open_photos(
         positions, log = ([telemetry], None) if is_position_file(telemetry) else ([], telemetry)
     album = read_album(source.photos, positions, strict=telemetry is not None)
     found, notices = _photo_telemetry(folder, album, log)
+    if found is not album.telemetry:  # a log needs no positions in the photos
+        kept = [each for each in album.notices if each.code != "photo_without_gps"]
+        album = replace(album, notices=tuple(kept))
     if camera is None:
         model = _guess(album.width_px, album.height_px, album.typical)
     else:

@@ -15,6 +15,7 @@ _HEAD_BYTES = (
     65_536  # of a file, by which its format is recognised; a flight table's header has thousands
 )
 _SUFFIXES = (".srt", ".ass", ".csv", ".nmea", ".gpx", ".log", ".txt", ".tsv", ".gps", ".dat")
+_UNREAD_SUFFIXES = (".ulg", ".tlog", ".bin", ".kml", ".fit", ".tcx", ".mcap", ".bag")  # of logs
 _VIDEO_SUFFIXES = frozenset(
     (".mp4", ".mov", ".mkv", ".avi", ".ts", ".m2ts", ".mts", ".m4v", ".webm", ".mpg", ".mpeg")
 )
@@ -141,7 +142,7 @@ def unusable_files_beside(video: Path) -> list[Path]:
     return sorted(
         each
         for each in video.parent.iterdir()
-        if each.suffix.lower() in _SUFFIXES
+        if each.suffix.lower() in (*_SUFFIXES, *_UNREAD_SUFFIXES)
         and each.stem.lower() in names
         and each.is_file()
         and not is_telemetry(each)
