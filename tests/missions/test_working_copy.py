@@ -21,7 +21,7 @@ from sorvolo.missions.site.working_copy import fetch_site, send_site
 from sorvolo.store.copies.bucket import BucketEnd
 from sorvolo.store.copies.object_store import open_objects
 from sorvolo.store.site.archive import Archive
-from sorvolo.store.site.origin import ORIGIN, UNSENT
+from sorvolo.store.site.files import ORIGIN, UNSENT
 
 
 @pytest.fixture(scope="module")

@@ -12,10 +12,9 @@ from starlette.testclient import TestClient
 
 from sorvolo.errors import SettingsError
 from sorvolo.station.app import station_app
-from sorvolo.station.pyramid import BytesCache, TilePyramid
 from sorvolo.station.settings import StationSettings
 from sorvolo.station.sites import bounds_lonlat
-from sorvolo.station.tiles import render
+from sorvolo.station.tiles import BytesCache, TilePyramid, render
 from sorvolo.store.site.archive import Archive
 from waiting import wait_for
 

@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sorvolo.station.ingest import BUSY_CODE, REFUSED_CODE, Ingest, IngestLimits, LinkClosed
-from sorvolo.station.messages import Hello, Kind, Message, Sample
+from sorvolo.station.messages import Hello, Kind, Message, MessageSample
 from sorvolo.station.video import VideoHub
 
 HELLO = Message(
@@ -144,7 +144,7 @@ def test_the_delay_of_pictures_is_stated_where_the_clocks_agree(
 ) -> None:
     """Clocks apart, or a recorded flight: no page is given the flight's zero to count from."""
     ingest = Ingest(tmp_path, IngestLimits(free_bytes=0))
-    sample = Sample(time.time_ns() + seconds * 1_000_000_000, {"latitude_deg": 46.0})
+    sample = MessageSample(time.time_ns() + seconds * 1_000_000_000, {"latitude_deg": 46.0})
     stated = Message(Kind.TELEMETRY, 1, 2_000_000, sample.to_json().encode()).to_bytes()
     asyncio.run(ingest.serve("drone", Drone(HELLO, stated)))
     assert ingest.hub("drone").epoch_us == (

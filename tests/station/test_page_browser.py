@@ -33,7 +33,7 @@ from websockets.sync.client import ClientConnection, connect
 from faulty_link import FaultyLink
 from sorvolo.geometry.coordinates import Coordinates, place_text
 from sorvolo.station.events import NewEvent
-from sorvolo.station.messages import Hello, Kind, Message, Sample
+from sorvolo.station.messages import Hello, Kind, Message, MessageSample
 from sorvolo.station.runs import Run
 from sorvolo.station.tokens import make_token
 from sorvolo.store.exports.change_files import crop_names
@@ -623,7 +623,9 @@ def test_a_delay_does_not_depend_on_the_browser_s_clock(
         each for each in units(write_video(tmp_path / "v.mp4"), "h264") if each.kind is Kind.VIDEO
     ]
     with greeted(served, "punctual", "f" * 16) as drone:
-        now = Sample(time.time_ns() - 5_000_000_000, {"latitude_deg": 45.0, "longitude_deg": 9.0})
+        now = MessageSample(
+            time.time_ns() - 5_000_000_000, {"latitude_deg": 45.0, "longitude_deg": 9.0}
+        )
         drone.send(Message(Kind.TELEMETRY, 1, 0, now.to_json().encode()).to_bytes())
         for number, each in enumerate(
             messages

@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sorvolo.station.pyramid import BytesCache, TilePyramid, halved
-from sorvolo.station.tiles import MapOverview
+from sorvolo.station.tiles import BytesCache, MapOverview, TilePyramid, halved
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.tiles import TileView
 

@@ -20,8 +20,7 @@ from sorvolo.station.state import StationState, compact_json, utc_now
 from sorvolo.station.tokens import make_token
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue_place import POINTER
-from sorvolo.store.site.files import COPYING
-from sorvolo.store.site.origin import ORIGIN
+from sorvolo.store.site.files import COPYING, ORIGIN
 from waiting import wait_for
 
 HOST = "http://127.0.0.1:8750"

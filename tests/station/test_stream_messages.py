@@ -16,7 +16,7 @@ from sorvolo.station.messages import (
     Hello,
     Kind,
     Message,
-    Sample,
+    MessageSample,
     begins_decoding,
     codec_string,
     hello_from_json,
@@ -44,7 +44,7 @@ def units(video: Path, codec: str) -> list[Message]:
                     )
                 )
                 if len(found) % 5 == 0:
-                    sample = Sample(
+                    sample = MessageSample(
                         TIME_NS + 1000 * pts,
                         {"latitude_deg": 45.0, "longitude_deg": 9.0 + pts * 1e-9},
                     )
@@ -112,7 +112,7 @@ def test_telemetry_that_cannot_be_is_refused(text: str) -> None:
 
 def test_telemetry_keeps_what_is_known_and_drops_the_rest() -> None:
     text = '{"time_ns": 5, "columns": {"latitude_deg": NaN, "speed_m_s": 3, "evil": 1}, "stated": {"slant_range_m": 9}}'
-    assert sample_from_json(text) == Sample(5, {"speed_m_s": 3.0}, {"slant_range_m": 9.0})
+    assert sample_from_json(text) == MessageSample(5, {"speed_m_s": 3.0}, {"slant_range_m": 9.0})
 
 
 @given(
@@ -130,7 +130,7 @@ def test_telemetry_keeps_what_is_known_and_drops_the_rest() -> None:
     )
 )
 def test_a_local_set_states_what_the_telemetry_did(columns: dict[str, float]) -> None:
-    (stated,) = local_sets(local_set(Sample(TIME_NS, columns)), counts={})  # type: ignore[arg-type]
+    (stated,) = local_sets(local_set(MessageSample(TIME_NS, columns)), counts={})  # type: ignore[arg-type]
     assert stated.time_ns == TIME_NS
     found = columns_of(stated)
     assert set(found) == set(columns)
@@ -143,11 +143,11 @@ def test_a_local_set_states_what_the_telemetry_did(columns: dict[str, float]) ->
 
 def test_a_gimbal_and_an_aircraft_without_one() -> None:
     gimbal = {"camera_yaw_deg": -90.0, "camera_pitch_deg": -80.0, "camera_roll_deg": 0.0}
-    found = columns_of(next(local_sets(local_set(Sample(TIME_NS, gimbal)), counts={})))  # type: ignore[arg-type]
+    found = columns_of(next(local_sets(local_set(MessageSample(TIME_NS, gimbal)), counts={})))  # type: ignore[arg-type]
     assert found["camera_pitch_deg"] == pytest.approx(-80, abs=0.01)
     assert found["camera_yaw_deg"] % 360 == pytest.approx(270, abs=0.01)
     body = {"body_yaw_deg": 20.0, "body_pitch_deg": -40.0, "body_roll_deg": 3.0}
-    found = columns_of(next(local_sets(local_set(Sample(TIME_NS, body)), counts={})))  # type: ignore[arg-type]
+    found = columns_of(next(local_sets(local_set(MessageSample(TIME_NS, body)), counts={})))  # type: ignore[arg-type]
     assert found == pytest.approx(body, abs=0.01)
 
 

@@ -20,8 +20,7 @@ from sealing import seal_again
 from sorvolo.errors import InputError, StoreError
 from sorvolo.geometry.polygons import signed_area
 from sorvolo.store.exports.change_files import changes_geojson, mask_name, write_view_masks
-from sorvolo.store.exports.placemarks import Placemark, gpx_bytes, kml_bytes
-from sorvolo.store.exports.places import longitude_latitude
+from sorvolo.store.exports.places import Placemark, gpx_bytes, kml_bytes, longitude_latitude
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.change_records import StoredChange, stored_changes
 from sorvolo.survey.findings import Change, ChangeKind, HeightChange, Verdict

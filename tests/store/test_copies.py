@@ -17,8 +17,7 @@ from fake_flights import hashes, mapped_site
 
 from ended_work import ended
 from sorvolo.errors import StoreError
-from sorvolo.store.copies.folder import FolderEnd
-from sorvolo.store.copies.site_state import SiteFile, SiteState
+from sorvolo.store.copies.folder import FolderEnd, SiteFile, SiteState
 from sorvolo.store.copies.transfer import CopyOutcome, copy, verify
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.files import COPYING

@@ -30,7 +30,7 @@ from sorvolo.store.rasters.base_map import BaseMap
 from sorvolo.store.rasters.geotiff import parse_crs, read_raster
 from sorvolo.store.rasters.height_model import read_height_model
 from sorvolo.store.site.archive import Archive
-from sorvolo.store.site.names import is_plain_name
+from sorvolo.store.site.files import is_plain_name
 
 
 @pytest.fixture(scope="module")

@@ -26,7 +26,7 @@ from sorvolo.store.exports.map_pictures import (
     write_preview,
     write_small_maps,
 )
-from sorvolo.store.exports.placemarks import Placemark, kml_bytes
+from sorvolo.store.exports.places import Placemark, kml_bytes
 from sorvolo.store.exports.plain import geojson_bytes, plain_json, utc_text
 from sorvolo.store.images import shrink, unweighted, weighted
 from sorvolo.survey.flight import Site

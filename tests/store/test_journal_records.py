@@ -11,8 +11,7 @@ import pytest
 from sorvolo.errors import GeometryError
 from sorvolo.geometry.arrays import Floats, ImageGray, Mask
 from sorvolo.geometry.pose import Pose
-from sorvolo.store.site.journal import Entry, RunJournal
-from sorvolo.store.site.journal_records import RecordPacker, unpacked
+from sorvolo.store.site.journal import Entry, RecordPacker, RunJournal, unpacked
 
 
 class Colour(StrEnum):

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from sorvolo.errors import InputError
 from sorvolo.lab.datasets import read_dataset
-from sorvolo.store.exports.label_files import (
+from sorvolo.store.exports.detection_files import (
     coco_document,
     picture_of_detections,
     write_coco,

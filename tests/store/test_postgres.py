@@ -19,7 +19,7 @@ from sorvolo.cli.main import main
 from sorvolo.errors import SettingsError, StoreError, UnavailableError
 from sorvolo.store.copies.folder import FolderEnd
 from sorvolo.store.copies.transfer import copy
-from sorvolo.store.site import postgres as postgres_module
+from sorvolo.store.site import database as postgres_module
 from sorvolo.store.site import schema
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue_place import (
@@ -30,9 +30,8 @@ from sorvolo.store.site.catalogue_place import (
     chosen_catalogues,
     parsed_url,
 )
-from sorvolo.store.site.database import ConnectionLostError
+from sorvolo.store.site.database import ConnectionLostError, PostgresDatabase
 from sorvolo.store.site.journal import Entry
-from sorvolo.store.site.postgres import PostgresDatabase
 
 PASSWORD = "c0rrect-horse"
 

@@ -27,9 +27,8 @@ from sorvolo.cluster.flights import (
 from sorvolo.errors import SettingsError, StoreError
 from sorvolo.missions.flight.request import software
 from sorvolo.missions.worker import Order
-from sorvolo.store.atomic import atomic_write_bytes, writing
+from sorvolo.store.atomic import atomic_write_bytes, take_lock, writing
 from sorvolo.store.exports.detection_files import REPORT, find_watched
-from sorvolo.store.locks import take_lock
 from sorvolo.store.site.catalogue import utc_now
 from sorvolo.store.site.catalogue_place import is_site
 

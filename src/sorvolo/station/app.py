@@ -18,12 +18,10 @@ from starlette.staticfiles import StaticFiles
 from sorvolo import __version__
 from sorvolo.errors import SettingsError
 from sorvolo.station.camera_door import CameraDoor, door_path
-from sorvolo.station.cogs import answer_raster_errors, cog_routes
 from sorvolo.station.collections import Findings, SiteCollections
 from sorvolo.station.crops import FlightVideos, crop_routes, video_routes
-from sorvolo.station.drawings import Drawings, drawing_routes
 from sorvolo.station.events import EventLog, event_routes
-from sorvolo.station.exports import export_routes
+from sorvolo.station.exports import answer_raster_errors, cog_routes, export_routes
 from sorvolo.station.ingest import Ingest, IngestLimits
 from sorvolo.station.inputs import Inputs
 from sorvolo.station.map_watch import MapWatch
@@ -34,11 +32,11 @@ from sorvolo.station.metrics import (
     memory_bytes,
     metrics_routes,
 )
-from sorvolo.station.ogc_features import feature_routes, landing_links
+from sorvolo.station.ogc_features import feature_routes, landing_links, stac_routes
 from sorvolo.station.outward import Outward, OutwardSettings
 from sorvolo.station.place import PlaceIndex, place_routes
 from sorvolo.station.problems import PROBLEM_ANSWERS, Problem, answer_problems
-from sorvolo.station.reviews import Reviews, review_routes
+from sorvolo.station.reviews import Drawings, Reviews, drawing_routes, review_routes
 from sorvolo.station.runs import Runs, run_routes
 from sorvolo.station.security import COOKIE, Doorkeeper, holder_in, needs
 from sorvolo.station.settings import (
@@ -50,7 +48,6 @@ from sorvolo.station.settings import (
 )
 from sorvolo.station.site_deletion import SiteDeletion, site_deletion_routes
 from sorvolo.station.sites import SiteShelf, readable, site_detail
-from sorvolo.station.stac import stac_routes
 from sorvolo.station.state import RootLock, StationState
 from sorvolo.station.stream_routes import announcing, stream_routes
 from sorvolo.station.tiles import WebTiles, wmts_routes

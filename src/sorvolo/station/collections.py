@@ -16,17 +16,15 @@ from shapely.geometry.base import BaseGeometry
 from sorvolo.station.problems import Problem
 from sorvolo.station.sites import SiteShelf
 from sorvolo.station.state import StationState
-from sorvolo.store.exports.change_files import changes_geojson
+from sorvolo.store.exports.change_files import changes_geojson, objects_geojson
 from sorvolo.store.exports.detection_files import CROPS, TRACKS
 from sorvolo.store.exports.ground_files import COVERAGE
-from sorvolo.store.exports.object_files import objects_geojson
 from sorvolo.store.exports.places import longitude_latitude
 from sorvolo.store.exports.plain import features_name
 from sorvolo.store.nofollow import read_below
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import FlightEntry
-from sorvolo.store.site.files import LIVE_COVERAGE
-from sorvolo.store.site.names import is_plain_name
+from sorvolo.store.site.files import LIVE_COVERAGE, is_plain_name
 from sorvolo.survey.flight import Site
 
 TITLES: Mapping[str, str] = {

@@ -18,12 +18,11 @@ from sorvolo.geometry.arrays import ImageRGB, PointsM
 from sorvolo.station.collections import Findings, SiteCollections
 from sorvolo.station.inputs import Inputs
 from sorvolo.station.problems import Problem
-from sorvolo.station.pyramid import BytesCache
 from sorvolo.station.security import needs
 from sorvolo.station.sites import SiteShelf
+from sorvolo.station.tiles import BytesCache
 from sorvolo.station.tokens import Role
-from sorvolo.store.exports.change_files import crop_names
-from sorvolo.store.exports.object_files import CROPS, crop_name
+from sorvolo.store.exports.change_files import CROPS, crop_name, crop_names
 from sorvolo.store.images import jpeg_from_image, rgba_from_png
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import StoredKeyframe

@@ -31,7 +31,7 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.station.messages import (
     CODECS,
     Kind,
-    Sample,
+    MessageSample,
     has_picture,
     parameter_sets,
     with_parameter_sets,
@@ -194,7 +194,7 @@ class Recording:
             start_ns = source.start_ns or time.time_ns()
             times_us = range(0, round(duration_s * 1e6) + 1, _TIME_EVERY_US)
             return [
-                _piece(first_us + each, Sample(start_ns + each * 1000, {}, lens))
+                _piece(first_us + each, MessageSample(start_ns + each * 1000, {}, lens))
                 for each in times_us
             ]
         clock = tied_clock(source, telemetry)
@@ -207,7 +207,7 @@ class Recording:
                 found.append(
                     _piece(
                         max(0, first_us + round(float(second) * 1e6)),
-                        Sample(time_ns, columns, stated),
+                        MessageSample(time_ns, columns, stated),
                     )
                 )
         return found
@@ -341,7 +341,7 @@ class LiveFootage:
             if not has_metadata and placed.dts_us >= due_us:
                 due_us = placed.dts_us + _TIME_EVERY_US
                 yield _piece(
-                    placed.pts_us, Sample(self._clock.utc_ns(placed.pts_us, time.time_ns()))
+                    placed.pts_us, MessageSample(self._clock.utc_ns(placed.pts_us, time.time_ns()))
                 )
             yield placed
 
@@ -358,7 +358,7 @@ class LiveFootage:
         while self._fixes:
             arrived_ns, epoch = self._fixes.popleft()
             age_us = max(0, (time.time_ns() - arrived_ns) // 1000)
-            yield _piece(max(0, pts_us - age_us), Sample(arrived_ns, dict(epoch.values)))
+            yield _piece(max(0, pts_us - age_us), MessageSample(arrived_ns, dict(epoch.values)))
 
 
 class Timeline:
@@ -502,11 +502,11 @@ def _until(samples: deque[FootagePiece], time_us: int) -> Iterator[FootagePiece]
         yield samples.popleft()
 
 
-def _piece(pts_us: int, sample: Sample) -> FootagePiece:
+def _piece(pts_us: int, sample: MessageSample) -> FootagePiece:
     return FootagePiece(Kind.TELEMETRY, pts_us, sample.to_json().encode(), dts_us=pts_us)
 
 
-def _sample_of(stated: LocalSet) -> Sample:
+def _sample_of(stated: LocalSet) -> MessageSample:
     kept = (
         "sensor_horizontal_fov_deg",
         "sensor_vertical_fov_deg",
@@ -516,7 +516,7 @@ def _sample_of(stated: LocalSet) -> Sample:
         "frame_center_longitude_deg",
         "slant_range_m",
     )
-    return Sample(
+    return MessageSample(
         stated.time_ns,
         columns_of(stated),
         {name: stated[name] for name in kept if isfinite(stated[name])},

@@ -17,7 +17,7 @@ from sorvolo.station.messages import (
     Hello,
     Kind,
     Message,
-    Sample,
+    MessageSample,
     begins_decoding,
     check_stream,
     has_picture,
@@ -160,7 +160,7 @@ class Ingest:
         }
         return found | (flight.figures() if flight is not None else {})
 
-    def samples(self) -> dict[str, Sample]:
+    def samples(self) -> dict[str, MessageSample]:
         """The newest telemetry of each drone that sends now, by stream. Safe to use from other threads."""
         found = {
             stream: self._flights[stream].last_sample
@@ -365,7 +365,7 @@ class Flight:
         self._file = FlightFile(path, hello.codec)
         self.is_open = True
         self.frames = self.samples = self.repeated = self.missing = 0
-        self.last_sample: Sample | None = None
+        self.last_sample: MessageSample | None = None
         self.zero_us: int | None = None  # UTC of the flight's zero, as telemetry has it
         self._needs_key = True
         self._taken_s: deque[float] = deque(maxlen=90)
@@ -478,7 +478,7 @@ def _utc_us(text: Any) -> int:
     return round(datetime.fromisoformat(str(text)).timestamp() * 1e6)
 
 
-def _is_now(sample: Sample) -> bool:
+def _is_now(sample: MessageSample) -> bool:
     """Whether telemetry is of a flight that goes on, whose delay can be stated, and not of a recorded one."""
     return abs(time.time_ns() - sample.time_ns) < _LIVE_NS
 

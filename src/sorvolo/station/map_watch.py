@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from sorvolo.errors import SorvoloError
 from sorvolo.station.events import EventLog, NewEvent
 from sorvolo.station.problems import Problem
-from sorvolo.station.pyramid import TilePyramid
 from sorvolo.station.reviews import Reviews
 from sorvolo.station.sites import SiteShelf, bounds_lonlat
-from sorvolo.station.tiles import WebTiles
+from sorvolo.station.tiles import TilePyramid, WebTiles
 from sorvolo.store.site.archive import Archive
 
 _LOOK_EVERY_S = 0.1  # it delays what a page shows; by choice

@@ -151,7 +151,7 @@ def hello_from_json(text: str | bytes) -> Hello:
 
 
 @dataclass(frozen=True)
-class Sample:
+class MessageSample:
     """One moment of telemetry. `columns` are named as survey.flight.TELEMETRY_COLUMNS, `stated` as ST 0601 has them.
 
     `stated` holds what telemetry columns have no name for: the lens's field of view, the ground's height.
@@ -173,8 +173,8 @@ class Sample:
         )
 
 
-def sample_from_json(text: str | bytes) -> Sample:
-    """The inverse of `Sample.to_json`; unknown names are ignored. Raises InputError for anything else."""
+def sample_from_json(text: str | bytes) -> MessageSample:
+    """The inverse of `MessageSample.to_json`; unknown names are ignored. Raises InputError for anything else."""
     found = _json_object(text, _MOST_TELEMETRY_BYTES, "telemetry")
     try:
         time_ns = int(found["time_ns"])
@@ -186,7 +186,7 @@ def sample_from_json(text: str | bytes) -> Sample:
         ) from error
     if not 0 <= time_ns < 2**63:
         raise InputError(f"telemetry of the time {time_ns} ns; 0 to 2^63 was needed")
-    return Sample(time_ns, columns, stated)
+    return MessageSample(time_ns, columns, stated)
 
 
 def _numbers(found: Mapping[str, Any], names: Any) -> dict[str, float]:

@@ -46,8 +46,7 @@ from sorvolo.station.settings import RESERVE_FILE, RUNS_FOLDER, STREAMS_FOLDER, 
 from sorvolo.station.sites import SiteShelf
 from sorvolo.station.state import Reserve, StationState, compact_json, shortage, utc_after, utc_now
 from sorvolo.station.tokens import Holder, Role
-from sorvolo.store.atomic import writing
-from sorvolo.store.locks import take_lock
+from sorvolo.store.atomic import take_lock, writing
 
 RUNNING, FINISHED, INCOMPLETE, FAILED, STOPPED, LOST = (
     "running",

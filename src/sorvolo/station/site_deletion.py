@@ -14,17 +14,15 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Header, Response
 
 from sorvolo.errors import StoreError
-from sorvolo.station.drawings import Drawings
 from sorvolo.station.problems import Problem
-from sorvolo.station.reviews import Reviews
+from sorvolo.station.reviews import Drawings, Reviews
 from sorvolo.station.runs import Runs
 from sorvolo.station.security import needs
 from sorvolo.station.sites import SiteShelf
 from sorvolo.station.tokens import Role
 from sorvolo.store.atomic import writing
 from sorvolo.store.site.catalogue_place import CATALOGUE, catalogue_file
-from sorvolo.store.site.files import COPYING, BusyError, lock_folder
-from sorvolo.store.site.origin import ORIGIN
+from sorvolo.store.site.files import COPYING, ORIGIN, BusyError, lock_folder
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,7 @@ from sorvolo.station.settings import STATE_FOLDER, STREAMS_FOLDER
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import FlightEntry, VersionEntry
 from sorvolo.store.site.catalogue_place import CATALOGUE, catalogue_file, is_site
-from sorvolo.store.site.files import HeightFile
-from sorvolo.store.site.names import is_plain_name
+from sorvolo.store.site.files import HeightFile, is_plain_name
 
 _DEEPEST = 2  # folders below the root: `sorvolo demo` puts its site one deeper than its folder
 _MOST_FOLDERS = 2000  # looked at below a root; by choice

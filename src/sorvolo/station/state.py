@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from sorvolo.errors import DiskFullError, StoreError
-from sorvolo.store.atomic import writing
-from sorvolo.store.locks import take_lock
+from sorvolo.store.atomic import take_lock, writing
 
 STATE_FILE = "station.db"
 """The file of the station's memory, in its own folder."""

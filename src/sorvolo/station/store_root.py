@@ -15,9 +15,7 @@ from sorvolo.store.copies.object_store import open_objects
 from sorvolo.store.copies.transfer import CopyUpdate
 from sorvolo.store.copies.working import WorkingCopy
 from sorvolo.store.site.catalogue_place import catalogue_file
-from sorvolo.store.site.files import BusyError
-from sorvolo.store.site.names import is_plain_name
-from sorvolo.store.site.origin import cache_folder
+from sorvolo.store.site.files import BusyError, cache_folder, is_plain_name
 
 _LOG = logging.getLogger("sorvolo.station.store_root")
 _EVERY_S = 20.0  # a store is asked for what is new; by choice: each question costs

@@ -11,7 +11,7 @@ from typing import BinaryIO
 
 from sorvolo.capture.live.klv import ITEMS, encode
 from sorvolo.errors import StoreError
-from sorvolo.station.messages import Kind, Message, Sample, sample_from_json, with_delimiter
+from sorvolo.station.messages import Kind, Message, MessageSample, sample_from_json, with_delimiter
 
 _PACKET, _BODY = 188, 184
 _PAT, _PMT, _VIDEO, _METADATA, _MARK = 0x0000, 0x1000, 0x0100, 0x0101, 0x1FE0
@@ -171,7 +171,7 @@ class FlightFile:
         self._file.seek(keep)
 
 
-def local_set(sample: Sample) -> bytes:
+def local_set(sample: MessageSample) -> bytes:
     """A sample as a MISB ST 0601 local set; numbers outside their tag's range are left out.
 
     A gimbal's angles are given as a sensor on a level platform that heads where the camera looks, the aircraft's own

@@ -27,7 +27,7 @@ from sorvolo.station.settings import StationSettings
 from sorvolo.station.state import utc_now
 from sorvolo.station.tokens import Holder, Role
 from sorvolo.store.atomic import atomic_write_bytes, writing
-from sorvolo.store.site.names import is_plain_name
+from sorvolo.store.site.files import is_plain_name
 
 VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".ts")
 """Files that are taken as videos."""

@@ -1,6 +1,7 @@
 """Files that appear whole or not at all: written beside their place, synced, then renamed."""
 
 import errno
+import fcntl
 import os
 import secrets
 import shutil
@@ -112,3 +113,12 @@ def temporary_beside(path: Path) -> Path:
     """A name in the same folder that nothing has; what a killed process leaves there is a leftover."""
     # nobody can know the name before and put a link there, which other programs' writers would follow
     return path.with_name(f"{TEMPORARY_PREFIX}{secrets.token_hex(6)}-{path.name}")
+
+
+def take_lock(descriptor: int) -> bool:
+    """Take the lock of an open file, which it keeps until it is closed; False where another one has it."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True

@@ -16,8 +16,7 @@ from sorvolo.store.pages.plots import (
     stated_and_found,
     unit_axes,
 )
-from sorvolo.store.pages.render import cell, render
-from sorvolo.store.pages.words import known, picture_uri
+from sorvolo.store.pages.words import cell, known, picture_uri, render
 
 _KIND_WORDS = {
     "false alarm": "The most certain false alarms",

@@ -23,7 +23,7 @@ from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.units import KNOT_M_S
 from sorvolo.store.atomic import atomic_path, atomic_write_bytes
-from sorvolo.store.rasters.gdal import open_raster
+from sorvolo.store.rasters.geotiff import open_raster
 from sorvolo.survey.flight import Frame, Telemetry
 
 UMCD_COLUMNS = (

@@ -10,16 +10,15 @@ from sorvolo.lab.thesis.sheets import Sheet
 from sorvolo.store.pages.plots import (
     Axes,
     Bar,
-    Label,
     Line,
+    PlotLabel,
     Scale,
     bar_plot,
     colour_class,
     line_plot,
     round_length,
 )
-from sorvolo.store.pages.render import render
-from sorvolo.store.pages.words import jpeg_uri
+from sorvolo.store.pages.words import jpeg_uri, render
 
 _WIDE_PX, _LOW_PX, _MARGIN_PX = 720.0, 260.0, 46.0
 _RATES = ("precision", "recall", "f1")
@@ -125,11 +124,11 @@ def _histogram_plot(means: Mapping[str, Floats]) -> dict[str, Any]:
         for place, mean in enumerate(means.values())
     ]
     ticks = list(y.ticks(4))
-    labels = [Label(_MARGIN_PX - 6, y(tick) + 4, f"{100 * tick:g}", "end") for tick in ticks]
-    labels += [Label(x(tick), _LOW_PX - 16, f"{tick:g}") for tick in x.ticks(6)]
+    labels = [PlotLabel(_MARGIN_PX - 6, y(tick) + 4, f"{100 * tick:g}", "end") for tick in ticks]
+    labels += [PlotLabel(x(tick), _LOW_PX - 16, f"{tick:g}") for tick in x.ticks(6)]
     labels += [
-        Label(8, 12, "% of pixels", "start"),
-        Label(_WIDE_PX - 8, _LOW_PX - 2, "difference, gray levels", "end"),
+        PlotLabel(8, 12, "% of pixels", "start"),
+        PlotLabel(_WIDE_PX - 8, _LOW_PX - 2, "difference, gray levels", "end"),
     ]
     across = tuple(("grid", y(tick)) for tick in ticks)
     axes = Axes(_MARGIN_PX, _WIDE_PX - 8, 18, _LOW_PX - 34, across, (), tuple(labels))
@@ -167,7 +166,11 @@ def _outline_plot(row: Mapping[str, Any], outlines_m: Floats, px: float) -> dict
     foot = height - 14
     lines.append(Line("ink", [(_MARGIN_PX, foot), (_MARGIN_PX + bar_m * px, foot)]))
     axes = Axes(
-        0, 0, 0, 0, labels=(Label(_MARGIN_PX + bar_m * px + 8, foot + 4, f"{bar_m:g} m", "start"),)
+        0,
+        0,
+        0,
+        0,
+        labels=(PlotLabel(_MARGIN_PX + bar_m * px + 8, foot + 4, f"{bar_m:g} m", "start"),),
     )
     title = "Rigid transform" if row["transform"] == "similarity" else "Homography"
     return {

@@ -4,9 +4,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sorvolo.store.pages.plots import Axes, Label, Line, Scale, colour_class, line_plot
-from sorvolo.store.pages.render import render
-from sorvolo.store.pages.words import at, known, seconds_words
+from sorvolo.store.pages.plots import Axes, Line, PlotLabel, Scale, colour_class, line_plot
+from sorvolo.store.pages.words import at, known, render, seconds_words
 
 _WIDE_PX, _LOW_PX, _MARGIN_PX = 720.0, 250.0, 46.0
 _LOSSES = {
@@ -137,11 +136,11 @@ def _certain(lines: _Lines) -> dict[str, list[tuple[float, float]]]:
 
 
 def _axes(x: Scale, y: Scale) -> Axes:
-    labels = [Label(_MARGIN_PX - 6, y(tick) + 4, f"{tick:g}", "end") for tick in y.ticks(5)]
+    labels = [PlotLabel(_MARGIN_PX - 6, y(tick) + 4, f"{tick:g}", "end") for tick in y.ticks(5)]
     labels += [
-        Label(x(tick), _LOW_PX - 16, f"{tick:g}") for tick in x.ticks(8) if tick == round(tick)
+        PlotLabel(x(tick), _LOW_PX - 16, f"{tick:g}") for tick in x.ticks(8) if tick == round(tick)
     ]
-    labels.append(Label(_WIDE_PX - 8, _LOW_PX - 2, "step", "end"))
+    labels.append(PlotLabel(_WIDE_PX - 8, _LOW_PX - 2, "step", "end"))
     across = tuple(("grid", y(tick)) for tick in y.ticks(5))
     return Axes(_MARGIN_PX, _WIDE_PX - 8, 14, _LOW_PX - 34, across, (), tuple(labels))
 

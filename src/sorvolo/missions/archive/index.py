@@ -6,8 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from sorvolo.errors import InputError, StoreError
-from sorvolo.store.index.archive_index import ArchiveIndex, IndexedSite
-from sorvolo.store.index.site_rows import flight_rows, site_state
+from sorvolo.store.index.archive_index import ArchiveIndex, IndexedSite, flight_rows, site_state
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue_place import Catalogues, is_site
 

@@ -20,8 +20,7 @@ from sorvolo.missions.flight.request import live_request
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.store.images import image_from_jpeg, jpeg_from_image
 from sorvolo.store.site.archive import Archive
-from sorvolo.store.site.journal import Entry, RunJournal, content_sha256
-from sorvolo.store.site.journal_records import RecordPacker, unpacked
+from sorvolo.store.site.journal import Entry, RecordPacker, RunJournal, content_sha256, unpacked
 from sorvolo.survey.flight import CameraModel, CameraPrior, Frame
 
 _BEGUN, _SAMPLES, _FRAME = "flight", "telemetry", "frame"

@@ -17,7 +17,7 @@ from sorvolo.missions.heights.run import height_grid, newest_flight, run_of
 from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.store.exports.places import longitude_latitude
 from sorvolo.store.exports.plain import feature_collection, geojson_bytes
-from sorvolo.store.rasters.heights import read_height_cog
+from sorvolo.store.rasters.height_model import read_height_cog
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.files import DamagedError, HeightFile
 from sorvolo.survey.flight import Site

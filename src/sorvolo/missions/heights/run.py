@@ -38,7 +38,7 @@ from sorvolo.store.exports.plain import features_name, json_bytes
 from sorvolo.store.freed_memory import give_back
 from sorvolo.store.images import ImageCache, png_from_rgba
 from sorvolo.store.rasters.geotiff import write_cog
-from sorvolo.store.rasters.heights import write_height_cog
+from sorvolo.store.rasters.height_model import write_height_cog
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import StoredKeyframe
 from sorvolo.store.site.catalogue_place import Catalogues

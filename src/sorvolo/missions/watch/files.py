@@ -25,13 +25,15 @@ from sorvolo.store.exports.detection_files import (
     DetectionLines,
     crop_around,
     detection_row,
+    picture_of_detections,
     track_placemarks,
     tracks_collection,
+    write_coco,
     write_crop,
+    write_yolo,
     written_crop,
 )
-from sorvolo.store.exports.label_files import picture_of_detections, write_coco, write_yolo
-from sorvolo.store.exports.placemarks import gpx_bytes, kml_bytes
+from sorvolo.store.exports.places import gpx_bytes, kml_bytes
 from sorvolo.store.exports.plain import features_name, geojson_bytes
 from sorvolo.store.images import jpeg_from_image
 from sorvolo.survey.flight import Frame, Site

@@ -16,9 +16,7 @@ from typing import Any, BinaryIO, Self
 
 from sorvolo.errors import NotFoundError, SorvoloWarning, StoreError
 from sorvolo.store.atomic import writing
-from sorvolo.store.copies.folder import refuse_loss, refuse_other
-from sorvolo.store.copies.object_store import ConflictError, Objects
-from sorvolo.store.copies.site_state import (
+from sorvolo.store.copies.folder import (
     CatalogueState,
     SiteFile,
     SiteState,
@@ -27,12 +25,15 @@ from sorvolo.store.copies.site_state import (
     missing_from,
     named_files,
     refuse_damaged,
+    refuse_loss,
+    refuse_other,
     tile_of,
 )
+from sorvolo.store.copies.object_store import ConflictError, Objects
 from sorvolo.store.nofollow import chunks_of
 from sorvolo.store.site.catalogue import Catalogue
 from sorvolo.store.site.catalogue_place import CATALOGUE
-from sorvolo.store.site.names import checked_sha256
+from sorvolo.store.site.files import checked_sha256
 
 MANIFEST = "sorvolo-site.json"
 _FORMAT = 1

@@ -8,8 +8,7 @@ from pathlib import Path
 
 from sorvolo.errors import StoreError
 from sorvolo.store.copies.bucket import BucketEnd
-from sorvolo.store.copies.folder import FolderEnd
-from sorvolo.store.copies.site_state import SiteFile
+from sorvolo.store.copies.folder import FolderEnd, SiteFile
 from sorvolo.store.nofollow import sha256_of
 from sorvolo.store.site.files import DamagedError
 

@@ -13,18 +13,24 @@ from typing import BinaryIO, Self
 from sorvolo.errors import StoreError
 from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.store.copies.bucket import SHOWN, BucketEnd, Manifest, key_of
-from sorvolo.store.copies.folder import FolderEnd
-from sorvolo.store.copies.object_store import Objects, open_objects
-from sorvolo.store.copies.site_state import (
+from sorvolo.store.copies.folder import (
     CatalogueState,
+    FolderEnd,
     SiteFile,
     SiteState,
     tile_of,
 )
+from sorvolo.store.copies.object_store import Objects, open_objects
 from sorvolo.store.copies.transfer import CopyUpdate, copy
 from sorvolo.store.site.catalogue_place import is_site
-from sorvolo.store.site.files import DamagedError, lock_folder
-from sorvolo.store.site.origin import ORIGIN, TILE_SIZES, UNSENT, cache_folder
+from sorvolo.store.site.files import (
+    ORIGIN,
+    TILE_SIZES,
+    UNSENT,
+    DamagedError,
+    cache_folder,
+    lock_folder,
+)
 
 
 class WorkingCopy:

@@ -12,8 +12,7 @@ from sorvolo.geometry.arrays import ImageRGBA, PointsPx
 from sorvolo.geometry.geodesy import Projection
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.store.atomic import atomic_path, atomic_write_bytes
-from sorvolo.store.exports.placemarks import kml_from_one
-from sorvolo.store.exports.places import near_longitudes, wrapped_deg
+from sorvolo.store.exports.places import kml_from_one, near_longitudes, wrapped_deg
 from sorvolo.store.exports.plain import name_safe
 from sorvolo.store.images import png_from_rgba, shrink, unweighted, weighted
 

@@ -18,7 +18,7 @@ from sorvolo.geometry.polygons import swollen
 from sorvolo.store.atomic import atomic_path
 from sorvolo.store.exports.map_pictures import Picture, with_room
 from sorvolo.store.exports.places import longitude_latitude, near_longitudes
-from sorvolo.store.rasters.gdal import crs_of_epsg, quiet_gdal
+from sorvolo.store.rasters.geotiff import crs_of_epsg, quiet_gdal
 from sorvolo.survey.flight import Site
 
 PICTURE_PX = 1200

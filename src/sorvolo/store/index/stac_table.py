@@ -15,11 +15,10 @@ from shapely.geometry.base import BaseGeometry
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.units import DAY_NS
 from sorvolo.store.atomic import atomic_path
-from sorvolo.store.exports.change_files import crop_names
-from sorvolo.store.exports.object_files import crop_name
+from sorvolo.store.exports.change_files import crop_name, crop_names
 from sorvolo.store.exports.places import longitude_latitude
 from sorvolo.store.exports.plain import utc_text
-from sorvolo.store.index.site_rows import FlightRows, flight_rows
+from sorvolo.store.index.archive_index import FlightRows, flight_rows
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import VersionEntry
 from sorvolo.store.site.files import HeightFile

@@ -19,7 +19,7 @@ from sqlalchemy import (
 from sqlalchemy.types import UserDefinedType
 
 from sorvolo.errors import StoreError
-from sorvolo.store.site.database import Layout
+from sorvolo.store.site.database import DatabaseLayout
 from sorvolo.store.site.schema import (
     Nanoseconds,
     String,
@@ -140,7 +140,7 @@ def make_index(connection: Connection) -> None:
     make_numbers(connection, FORMAT)
 
 
-LAYOUT = Layout(_APPLICATION_ID, make_index, beside="public", page_bytes=16_384)
+LAYOUT = DatabaseLayout(_APPLICATION_ID, make_index, beside="public", page_bytes=16_384)
 
 
 def _demand_postgis(connection: Connection) -> None:

@@ -17,7 +17,6 @@ from sorvolo.store.exports.map_pictures import Picture
 from sorvolo.store.exports.places import SYSTEMS, place_words
 from sorvolo.store.exports.plain import time_words
 from sorvolo.store.images import shrink
-from sorvolo.store.pages.render import render
 from sorvolo.store.pages.words import (
     area_words,
     at,
@@ -27,6 +26,7 @@ from sorvolo.store.pages.words import (
     number_at,
     picture_uri,
     plural,
+    render,
     with_unit,
 )
 from sorvolo.store.site.change_records import StoredChange

@@ -18,7 +18,6 @@ from sorvolo.store.pages.plots import (
     round_length,
     track_plan,
 )
-from sorvolo.store.pages.render import render
 from sorvolo.store.pages.words import (
     area_words,
     at,
@@ -30,6 +29,7 @@ from sorvolo.store.pages.words import (
     number_at,
     picture_uri,
     plural,
+    render,
     seconds_words,
     with_unit,
 )

@@ -9,7 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from sorvolo.geometry.arrays import Floats
-from sorvolo.store.pages.render import render
+from sorvolo.store.pages.words import render
 
 _WIDE_PX = (
     720  # of all drawings: a phone's screen and a page's column take it; the rest by choice too
@@ -81,7 +81,7 @@ class Mark:
 
 
 @dataclass(frozen=True)
-class Label:
+class PlotLabel:
     """A text in a plot."""
 
     x: float
@@ -100,7 +100,7 @@ class Axes:
     bottom: float
     across: tuple[tuple[str, float], ...] = ()
     down: tuple[tuple[str, float], ...] = ()
-    labels: tuple[Label, ...] = ()
+    labels: tuple[PlotLabel, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -129,10 +129,10 @@ def bar_plot(
     """Groups of bars beside each other, shares in per cent upwards, each group with its name below."""
     y = Scale(0, 1, height - 34, 18)
     wide = (width - 2 * _MARGIN_PX) / max(1, len(groups))
-    drawn, labels = [], [Label(8, 12, "%", "start")]
+    drawn, labels = [], [PlotLabel(8, 12, "%", "start")]
     for place, (name, bars) in enumerate(groups):
         left, step = _MARGIN_PX + (place + 0.1) * wide, 0.8 * wide / max(1, len(bars))
-        labels.append(Label(_MARGIN_PX + (place + 0.5) * wide, height - 14, name))
+        labels.append(PlotLabel(_MARGIN_PX + (place + 0.5) * wide, height - 14, name))
         for k, bar in enumerate(bars):
             drawn.append(
                 (
@@ -145,10 +145,10 @@ def bar_plot(
                 )
             )
             labels.append(
-                Label(left + (k + 0.42) * step, y(bar.share) - 4, f"{100 * bar.share:.0f}")
+                PlotLabel(left + (k + 0.42) * step, y(bar.share) - 4, f"{100 * bar.share:.0f}")
             )
     ticks = (0.0, 0.25, 0.5, 0.75, 1.0)
-    labels += [Label(_MARGIN_PX - 6, y(tick) + 4, f"{100 * tick:g}", "end") for tick in ticks]
+    labels += [PlotLabel(_MARGIN_PX - 6, y(tick) + 4, f"{100 * tick:g}", "end") for tick in ticks]
     frame = Axes(
         _MARGIN_PX,
         width - 8,
@@ -181,11 +181,11 @@ def unit_axes(across: str, upwards: str) -> tuple[Scale, Scale, Axes]:
     """Scales and axes of a square plot, SIDE_PX a side, of two shares from 0 to 1."""
     x, y = Scale(0, 1, _MARGIN_PX, SIDE_PX - 12), Scale(0, 1, SIDE_PX - _MARGIN_PX, 12)
     ticks = (0.0, 0.25, 0.5, 0.75, 1.0)
-    labels = [Label(x(tick), y(0) + 16, f"{tick:g}") for tick in ticks]
-    labels += [Label(x(0) - 6, y(tick) + 4, f"{tick:g}", "end") for tick in ticks]
+    labels = [PlotLabel(x(tick), y(0) + 16, f"{tick:g}") for tick in ticks]
+    labels += [PlotLabel(x(0) - 6, y(tick) + 4, f"{tick:g}", "end") for tick in ticks]
     labels += [
-        Label(x(1), SIDE_PX - 8, across, "end"),
-        Label(6, SIDE_PX - 8, f"{upwards} upwards", "start"),
+        PlotLabel(x(1), SIDE_PX - 8, across, "end"),
+        PlotLabel(6, SIDE_PX - 8, f"{upwards} upwards", "start"),
     ]
     return (
         x,
@@ -289,11 +289,11 @@ def gps_scatter(track: TrackColumns, *, unit: str) -> str:
     size, low = _SCATTER_PX, _SCATTER_PX - _MARGIN_PX
     x, y = Scale(-reach, reach, _MARGIN_PX, size - 12), Scale(-reach, reach, low, 12)
     ticks = list(x.ticks(6))
-    labels = [Label(x(tick), low + 16, f"{tick:g}") for tick in ticks]
-    labels += [Label(_MARGIN_PX - 6, y(tick) + 4, f"{tick:g}", "end") for tick in ticks]
+    labels = [PlotLabel(x(tick), low + 16, f"{tick:g}") for tick in ticks]
+    labels += [PlotLabel(_MARGIN_PX - 6, y(tick) + 4, f"{tick:g}", "end") for tick in ticks]
     labels += [
-        Label(size - 12, size - 10, f"east, {unit}", "end"),
-        Label(8, 22, f"north, {unit}", "start"),
+        PlotLabel(size - 12, size - 10, f"east, {unit}", "end"),
+        PlotLabel(8, 22, f"north, {unit}", "start"),
     ]
     frame = Axes(
         _MARGIN_PX,
@@ -360,12 +360,12 @@ def _plan_scales(east: Floats, north: Floats) -> tuple[Scale, Scale, float, floa
     return x, Scale(y_low, y_high, height - _MARGIN_PX, _MARGIN_PX), height, px
 
 
-def _start_label(x: Floats, y: Floats, fix_x: Floats | None, first: int) -> Label:
+def _start_label(x: Floats, y: Floats, fix_x: Floats | None, first: int) -> PlotLabel:
     """The word at the track's start, on the side to which the track does not go, clear of the fix."""
     around = [float(x[0])] + ([] if fix_x is None else [float(fix_x[first])])
     if x[:2][-1] < x[0]:
-        return Label(max(around) + 9, float(y[0]) + 4, "start", "start")
-    return Label(min(around) - 9, float(y[0]) + 4, "start", "end")
+        return PlotLabel(max(around) + 9, float(y[0]) + 4, "start", "start")
+    return PlotLabel(min(around) - 9, float(y[0]) + 4, "start", "end")
 
 
 def _frame_axes(count: int, low: float, high: float, unit: str) -> tuple[Scale, Scale, Axes]:
@@ -373,13 +373,13 @@ def _frame_axes(count: int, low: float, high: float, unit: str) -> tuple[Scale, 
     x = Scale(1, max(count, 2), _MARGIN_PX + 8, _WIDE_PX - 14)
     y = Scale(low, high, _LOW_PX - 34, 18)
     ticks = list(y.ticks(5))
-    labels = [Label(_MARGIN_PX - 6, y(tick) + 4, f"{tick:g}", "end") for tick in ticks]
+    labels = [PlotLabel(_MARGIN_PX - 6, y(tick) + 4, f"{tick:g}", "end") for tick in ticks]
     labels += [
-        Label(x(tick), _LOW_PX - 16, f"{tick:g}") for tick in x.ticks(8) if tick == round(tick)
+        PlotLabel(x(tick), _LOW_PX - 16, f"{tick:g}") for tick in x.ticks(8) if tick == round(tick)
     ]
     labels += [
-        Label(8, 12, unit, "start"),
-        Label(_WIDE_PX - 8, _LOW_PX - 2, "selected frame, in order", "end"),
+        PlotLabel(8, 12, unit, "start"),
+        PlotLabel(_WIDE_PX - 8, _LOW_PX - 2, "selected frame, in order", "end"),
     ]
     across = tuple((_line_style(tick), y(tick)) for tick in ticks)
     return x, y, Axes(_MARGIN_PX, _WIDE_PX - 8, 18, _LOW_PX - 34, across, (), tuple(labels))

@@ -5,13 +5,13 @@ from typing import Any
 
 from sorvolo.geometry.arrays import ImageRGBA
 from sorvolo.store.pages.plots import colour_class, stated_and_found
-from sorvolo.store.pages.render import render
 from sorvolo.store.pages.words import (
     area_words,
     at,
     known,
     number_at,
     picture_uri,
+    render,
     seconds_words,
     with_unit,
 )

@@ -14,7 +14,6 @@ from sorvolo.geometry.arrays import Floats
 from sorvolo.store.exports.places import SYSTEMS, degrees_words
 from sorvolo.store.exports.plain import NO_PLACE_FILES
 from sorvolo.store.pages.plots import round_length
-from sorvolo.store.pages.render import render
 from sorvolo.store.pages.words import (
     at,
     finite_or_none,
@@ -22,6 +21,7 @@ from sorvolo.store.pages.words import (
     jpeg_uri,
     known,
     number_at,
+    render,
     seconds_words,
     with_unit,
 )

@@ -17,7 +17,7 @@ from sorvolo.geometry.arrays import ImageRGBA, PointsM
 from sorvolo.geometry.crs import transformer
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.geometry.grid import SiteGrid, TileIndex
-from sorvolo.store.rasters.gdal import crs_of_epsg, open_raster, transform_on_grid, why_no_place
+from sorvolo.store.rasters.geotiff import crs_of_epsg, open_raster, transform_on_grid, why_no_place
 
 _WGS84 = CRS.from_epsg(4326)
 _SITE_MAP = "mosaic.tif"

@@ -20,7 +20,7 @@ from sorvolo.store.exports.plain import features_name, plain_json
 from sorvolo.store.images import image_from_jpeg
 from sorvolo.store.nofollow import MOST_BYTES, open_below, read_below, sha256_of
 from sorvolo.store.site import catalogue as records
-from sorvolo.store.site import change_records, object_records
+from sorvolo.store.site import change_records
 from sorvolo.store.site.catalogue import (
     Catalogue,
     FlightEntry,
@@ -29,7 +29,7 @@ from sorvolo.store.site.catalogue import (
     VersionEntry,
 )
 from sorvolo.store.site.catalogue_place import Catalogues, is_site
-from sorvolo.store.site.change_records import StoredChange, StoredReview
+from sorvolo.store.site.change_records import StoredChange, StoredObject, StoredReview, StoredSearch
 from sorvolo.store.site.files import (
     JOURNAL,
     LIVE_COVERAGE,
@@ -38,18 +38,15 @@ from sorvolo.store.site.files import (
     DamagedError,
     HeightFile,
     begin_writing,
+    checked_document,
+    checked_image_path,
+    checked_name,
+    find_origin,
+    is_plain_name,
     refuse_traps,
 )
 from sorvolo.store.site.flight_writer import FlightWriter
 from sorvolo.store.site.journal import RunJournal
-from sorvolo.store.site.names import (
-    checked_document,
-    checked_image_path,
-    checked_name,
-    is_plain_name,
-)
-from sorvolo.store.site.object_records import StoredObject, StoredSearch
-from sorvolo.store.site.origin import find_origin
 from sorvolo.store.site.tiles import GrowingTiles, TileBlobs, TileView
 from sorvolo.store.site.upkeep import (
     forget_journals,
@@ -213,20 +210,20 @@ class Archive:
 
     def objects(self, flight_id: str | None = None) -> list[StoredObject]:
         """The objects that complete runs found, by flight rank and number; of one flight."""
-        return self.catalogue_rows(object_records.load_objects, flight_id)
+        return self.catalogue_rows(change_records.load_objects, flight_id)
 
     def searches(self) -> list[StoredSearch]:
         """Which ground each complete run searched for objects, by flight rank."""
-        return self.catalogue_rows(object_records.load_searches)
+        return self.catalogue_rows(change_records.load_searches)
 
     def newest_objects(self, flights: Collection[str] | None = None) -> list[StoredObject]:
         """What stands on the site by the newest look at each piece of ground; as far as these flights know."""
         with self.catalogue.reading() as connection:
             found, searches = (
-                object_records.load_objects(connection),
-                object_records.load_searches(connection),
+                change_records.load_objects(connection),
+                change_records.load_searches(connection),
             )
-        return object_records.newest_objects(
+        return change_records.newest_objects(
             [each for each in found if flights is None or each.flight_id in flights],
             [each for each in searches if flights is None or each.flight_id in flights],
         )

@@ -35,7 +35,7 @@ from sorvolo.store.rasters.geotiff import COMPRESSIONS
 from sorvolo.store.site import schema
 from sorvolo.store.site.catalogue_place import Catalogues, open_database
 from sorvolo.store.site.database import Database, SqliteDatabase
-from sorvolo.store.site.names import checked_crs, checked_image_path, checked_sha256
+from sorvolo.store.site.files import checked_crs, checked_image_path, checked_sha256
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import Status
 

@@ -15,7 +15,14 @@ from sorvolo.errors import SettingsError, StoreError
 from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.store.exports.plain import json_bytes
 from sorvolo.store.nofollow import read_below
-from sorvolo.store.site.database import CATALOGUE_LAYOUT, Database, Layout, SqliteDatabase
+from sorvolo.store.site.database import (
+    CATALOGUE_LAYOUT,
+    Database,
+    DatabaseLayout,
+    PostgresDatabase,
+    SqliteDatabase,
+    shown_url,
+)
 
 CATALOGUE = "site.db"
 POINTER = "site-catalogue.json"
@@ -64,8 +71,6 @@ class Catalogues:
 
     def find_trusted(self, url: URL) -> URL | None:
         """The trusted URL of the same database; the only one where the server has moved; None for a stranger's."""
-        from sorvolo.store.site.postgres import shown_url
-
         same = [each for each in self.trusted if shown_url(each) == shown_url(url)]
         return next(iter(same or (self.trusted if len(self.trusted) == 1 else ())), None)
 
@@ -129,11 +134,9 @@ def parsed_url(words: str) -> URL | None:
 
 
 def create_pointed(
-    folder: Path, pointer: str, url: URL, name: str, layout: Layout = CATALOGUE_LAYOUT
+    folder: Path, pointer: str, url: URL, name: str, layout: DatabaseLayout = CATALOGUE_LAYOUT
 ) -> None:
     """Make a schema of a new name, then the folder's pointer to it: a kill in between leaves an empty schema."""
-    from sorvolo.store.site.postgres import PostgresDatabase, shown_url
-
     plain = re.sub(r"[^a-z0-9]+", "_", name.lower())[:40].strip("_")
     schema = f"{plain}_{secrets.token_hex(6)}"
     database = PostgresDatabase(url, schema, write=True, layout=layout)
@@ -149,7 +152,7 @@ def pointed_database(
     pointer: str,
     *,
     write: bool,
-    layout: Layout = CATALOGUE_LAYOUT,
+    layout: DatabaseLayout = CATALOGUE_LAYOUT,
     catalogues: Catalogues | None = None,
 ) -> Database:
     """The database that a folder's pointer names, if it is one of `catalogues` (None: of the environment).
@@ -157,8 +160,6 @@ def pointed_database(
     A folder that a stranger made must not have us connect, with the user's password, wherever it likes: raises
     StoreError for a server that is not trusted, as for a broken pointer.
     """
-    from sorvolo.store.site.postgres import PostgresDatabase, shown_url
-
     named, schema = _read_pointer(folder, pointer)
     url = (catalogues or Catalogues.of_environment()).find_trusted(named)
     if url is None:

@@ -15,20 +15,21 @@ from sorvolo.geometry.grid import TileIndex
 from sorvolo.store.atomic import TEMPORARY_PREFIX, atomic_write_bytes, sync_file, writing
 from sorvolo.store.exports.change_files import (
     BOXES_FILE,
+    CROPS,
     boxes_json,
     crop_files,
     mask_name,
+    object_crops,
     write_view_masks,
 )
 from sorvolo.store.exports.ground_files import frames_geojson
-from sorvolo.store.exports.object_files import CROPS, object_crops
 from sorvolo.store.exports.plain import features_name, geojson_bytes, json_bytes
 from sorvolo.store.freed_memory import give_back
 from sorvolo.store.images import ImageCache, jpeg_from_image
 from sorvolo.store.nofollow import read_below
 from sorvolo.store.rasters.geotiff import parse_crs
 from sorvolo.store.site import catalogue as records
-from sorvolo.store.site import change_records, object_records
+from sorvolo.store.site import change_records
 from sorvolo.store.site.catalogue import StoredKeyframe
 from sorvolo.store.site.tiles import GrowingTiles
 from sorvolo.store.site.upkeep import (
@@ -291,7 +292,7 @@ class FlightWriter:
             if changes is not None:
                 change_records.add_comparison(connection, self._run_id, self._version_id, found)
             if search is not None:
-                object_records.add_search(connection, self._run_id, search)
+                change_records.add_search(connection, self._run_id, search)
         self._is_open = False
         self.release_memory()
         forget_journals(self._files)

@@ -15,8 +15,7 @@ from sorvolo.geometry.grid import TileIndex
 from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, sync_file, writing
 from sorvolo.store.images import png_from_rgba, rgba_from_png
 from sorvolo.store.nofollow import read_below
-from sorvolo.store.site.names import checked_sha256, is_sha256
-from sorvolo.store.site.origin import Origin
+from sorvolo.store.site.files import Origin, checked_sha256, is_sha256
 
 _CACHE_BYTES = (
     96 << 20

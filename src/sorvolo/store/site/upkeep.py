@@ -18,21 +18,28 @@ from sorvolo.store.atomic import (
     temporary_beside,
     writing,
 )
-from sorvolo.store.exports.change_files import change_placemarks, changes_geojson, crop_names
+from sorvolo.store.exports.change_files import (
+    CROPS,
+    OBJECTS,
+    change_placemarks,
+    changes_geojson,
+    crop_names,
+    object_placemarks,
+    objects_geojson,
+)
 from sorvolo.store.exports.ground_files import COVERAGE
 from sorvolo.store.exports.map_pictures import Picture, pictures, small_map_of, write_small_maps
-from sorvolo.store.exports.object_files import CROPS, OBJECTS, object_placemarks, objects_geojson
-from sorvolo.store.exports.placemarks import Placemark, gpx_bytes, kml_bytes
+from sorvolo.store.exports.places import Placemark, gpx_bytes, kml_bytes
 from sorvolo.store.exports.plain import features_name, features_path, geojson_bytes
 from sorvolo.store.images import rgba_from_png
 from sorvolo.store.pages.changes import changes_page
 from sorvolo.store.rasters.geotiff import write_cog
 from sorvolo.store.site import catalogue as records
-from sorvolo.store.site import change_records, object_records
+from sorvolo.store.site import change_records
 from sorvolo.store.site.catalogue import OwedFiles, VersionEntry
+from sorvolo.store.site.change_records import StoredObject
 from sorvolo.store.site.files import JOURNAL, STAGED, DamagedError, HeightFile
 from sorvolo.store.site.journal import is_journal_after
-from sorvolo.store.site.object_records import StoredObject
 
 if TYPE_CHECKING:
     from sorvolo.store.site.archive import Archive
@@ -60,10 +67,10 @@ def repair(files: "Archive") -> None:
             waiting.append(other.submit(_write_map_files, files, newest))
         for each in owed:
             _write_flight_files(files, each)
-        searches = files.catalogue_rows(object_records.load_searches)
+        searches = files.catalogue_rows(change_records.load_searches)
         if owed or bool(searches) != features_path(files.folder, OBJECTS).is_file():
             # the newest of each place; none where no flight was ever searched
-            newest_of_each = object_records.newest_objects(files.objects(), searches)
+            newest_of_each = change_records.newest_objects(files.objects(), searches)
             with files.replacing(*(f"{OBJECTS}{ending}" for ending in _ENDINGS)):
                 _write_objects(files, files.folder, newest_of_each if searches else None)
         for written in waiting:
@@ -152,7 +159,7 @@ def _write_flight_files(files: "Archive", owed: OwedFiles) -> None:
         files.document_path(owed.flight_id, name)  # refuses one that could lie elsewhere
     with files.catalogue.reading() as connection:
         is_compared = change_records.is_compared(connection, owed.run_id)
-        is_searched = object_records.is_searched(connection, owed.run_id)
+        is_searched = change_records.is_searched(connection, owed.run_id)
     staged = folder / STAGED / str(owed.run_id)
     lists = (f"{name}{ending}" for name in ("changes", OBJECTS) for ending in _ENDINGS)
     pictures = (name for name in STAGED_FOLDERS if (staged / name).is_dir())
