@@ -50,8 +50,9 @@ def number_of(image: Any) -> int:
     return round((float(np.argmax(image[48, :, 0].astype(float) > 128))) / 4)
 
 
-def packet_of(index: int) -> bytes:
-    """The metadata of frame `index`: flying north at 60 m above ground at 100 m."""
+def packet_of(index: int, north_m: float | None = None) -> bytes:
+    """The metadata of frame `index`: flying north at 60 m above ground at 100 m, or `north_m` from the start."""
+    north_m = 5.0 * index / RATE if north_m is None else north_m
     return encode(
         EPOCH_NS + index * 10**9 // RATE,
         {
@@ -61,7 +62,7 @@ def packet_of(index: int) -> bytes:
             "sensor_relative_azimuth_deg": 0.0,
             "sensor_relative_elevation_deg": -90.0,
             "sensor_relative_roll_deg": 0.0,
-            "sensor_latitude_deg": 46.5 + 5.0 * index / RATE / 111_320,
+            "sensor_latitude_deg": 46.5 + north_m / 111_320,
             "sensor_longitude_deg": 11.3,
             "sensor_true_altitude_m": 160.0,
             "frame_center_elevation_m": 100.0,

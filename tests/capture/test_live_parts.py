@@ -74,17 +74,8 @@ def test_times_of_frames_always_increase() -> None:
     assert clock.frame_utc_ns(100) == first + 1
 
 
-def test_the_newest_frame_wins() -> None:
-    queue = FrameQueue(holds_all=False, most_bytes=10**9, blocks=False)
-    for index in range(5):
-        queue.put(arrived(index))
-    taken = queue.take(0)
-    assert taken is not None and taken.index == 4 and queue.skipped == 4
-    assert queue.take(0.01) is None
-
-
 def test_every_frame_waits_until_memory_ends() -> None:
-    queue = FrameQueue(holds_all=True, most_bytes=45_000, blocks=False)
+    queue = FrameQueue(most_bytes=45_000, blocks=False)
     for index in range(5):
         queue.put(arrived(index))
     assert queue.holds_any
@@ -94,7 +85,7 @@ def test_every_frame_waits_until_memory_ends() -> None:
 
 
 def test_a_file_waits_for_its_reader() -> None:
-    queue = FrameQueue(holds_all=True, most_bytes=30_000, blocks=True)
+    queue = FrameQueue(most_bytes=30_000, blocks=True)
     writer = threading.Thread(
         target=lambda: [queue.put(arrived(index)) for index in range(6)], daemon=True
     )

@@ -184,9 +184,10 @@ def test_a_stop_ends_well_with_everything_written(
             time.sleep(0.01)
         os.kill(running.pid, signal_number)
         printed, err = running.communicate(timeout=60)
-    assert running.returncode == 0, err
+    assert running.returncode == 3, err
     (watch,) = json.loads(printed)["watches"]
     assert watch["ended"] == "stopped on demand"
     assert 0 < watch["frames"]["detected"] < 1500
+    assert watch["looked_at"]["share"] < 0.9 and not watch["headline"]["complete"]
     assert watch["objects"]["total"] >= 1
     assert (out / "annotated.mp4").exists() and (out / "report.html").exists()

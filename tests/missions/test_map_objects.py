@@ -7,21 +7,25 @@ import threading
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
+from rich.console import Console
 from truth_detector import Knowing
 
 from small_flights import simulate_into, small_flight
+from sorvolo.cli.printing import announce_people
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.camera import Camera
 from sorvolo.lab.evaluation.changes import evaluate_changes
 from sorvolo.lab.evaluation.objects import evaluate_objects
 from sorvolo.lab.simulation.settings import OutputSettings
+from sorvolo.missions import worker
 from sorvolo.missions.compare.classes import ChangeClasses, object_at, seen_at
 from sorvolo.missions.compare.flights import compare_flights
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
@@ -34,6 +38,7 @@ from sorvolo.survey.findings import Change, ChangeKind, Patch
 from sorvolo.survey.flight import CameraPrior, Frame, PosedFrame
 from sorvolo.survey.map_objects import MapObject
 from sorvolo.survey.objects import Detections, Sighting, no_detections
+from sorvolo.survey.wording import counted
 
 
 @pytest.fixture(scope="module")
@@ -113,6 +118,33 @@ def test_report_crops_and_site_file(mapped: Path) -> None:
     page = (mapped / "flights/flight1/report.html").read_text()
     assert "Objects on the map" in page
     assert own[0]["id"] in page
+
+
+def test_the_headline_counts_what_was_looked_at_and_people_are_events(
+    mapped: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of a map as of a watch: what was found in how much ground, and each person told by name and place."""
+    report = report_of(mapped, "flight1")
+    text, objects = report["headline"]["text"], report["objects"]
+    found = objects["classes"]
+    assert f"; {counted(found['person'], 'person')}" in text and "100 % for person" in text
+    assert text.endswith(objects["headline"]["text"])
+    assert objects["looked_at"]["classes"]["person"]["share"] > 0.99
+    assert not objects["headline"]["complete"]  # half of the ground in pixels too coarse for a bag
+    assert (mapped / "flights/flight1/searched.geojson").is_file()
+
+    lines = BytesIO()
+    worker._mapped(worker.Journal(lines), mapped, 0, [])
+    events = [json.loads(each) for each in lines.getvalue().splitlines()]
+    people = [row for row in objects["list"] if row["class"] == "person"]
+    assert [each["type"] for each in events] == [worker.PERSON_FOUND] * len(people) != []
+    assert {each["data"]["feature"]["properties"]["id"] for each in events} >= {
+        row["id"] for row in people
+    }
+
+    announce_people(objects, mapped, Console(force_terminal=True, width=200))
+    shown = capsys.readouterr().out
+    assert shown.count("\a") == shown.count("PERSON FOUND") == len(people)
 
 
 def test_compare_names_changes(simulated: Path, compared: Path) -> None:

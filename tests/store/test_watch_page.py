@@ -17,6 +17,7 @@ _REPORT: dict[str, Any] = {
     "ended": "the source ended",
     "looked_for": ["person", "car"],
     "objects": {"total": 2, "by_class": {"person": 1, "car": 1}},
+    "headline": {"text": "1 car; 13 of 331 pictures, 38 % of the ground looked at"},
     "frames": {
         "read": 100,
         "detected": 50,
@@ -68,8 +69,8 @@ def test_a_page_states_what_where_and_how_sure() -> None:
     way_m = np.column_stack([np.linspace(0, 50, 9), np.zeros(9)])
     page = checked(watch_page(_REPORT, tracks, {1: b"\xff\xd8picture"}, way_m))
     text = " ".join(page.text)
-    assert "Objects found: 1 car, 1 person." in text
-    assert "50 frames were searched for person, car." in text
+    assert "1 car; 13 of 331 pictures, 38 % of the ground looked at." in text
+    assert "Looked for: person, car." in text
     assert (
         "41.900000, 12.600000" in text
         and "1.2 m" in text
@@ -119,7 +120,7 @@ def test_a_day_is_given_once_in_a_row() -> None:
 
 def test_nothing_found_and_nothing_known_is_a_page_too() -> None:
     text = " ".join(checked(watch_page({"flight": "x"}, [], {}, np.zeros((0, 2)))).text)
-    assert "Objects found: nothing." in text
+    assert "Looked for: objects." in text
     only_way = checked(watch_page(_REPORT, [], {}, np.array([[0.0, 0.0], [40.0, 10.0]])))
     assert "polyline" in only_way.names and "circle" not in only_way.names
 

@@ -31,6 +31,7 @@ from sorvolo.cli.options import (
 )
 from sorvolo.cli.printing import (
     TO_CHECK,
+    announce_people,
     place_heading,
     place_words,
     read_json,
@@ -219,6 +220,7 @@ def show_results(
 
     for result in results:
         _show_result(result, console, form)
+        announce_people(result.get("objects", {}), site, console)
         folder = site / "flights" / result["flight"]
         show_path("page", folder / "changes.html", console)
         show_path("list", features_path(folder, "changes"), console)

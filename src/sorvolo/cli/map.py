@@ -31,7 +31,13 @@ from sorvolo.cli.options import (
     names,
     wanted_classes,
 )
-from sorvolo.cli.printing import TO_CHECK, read_json, show_notices_and_warnings, show_path
+from sorvolo.cli.printing import (
+    TO_CHECK,
+    announce_people,
+    read_json,
+    show_notices_and_warnings,
+    show_path,
+)
 from sorvolo.cli.progress import show_progress
 from sorvolo.cli.sites import ended_by_signal, opened_site, run_on_site
 from sorvolo.survey.wording import counted, counted_list
@@ -228,6 +234,7 @@ def show_reports(reports: Sequence[Mapping[str, Any]], site: Path, console: Cons
             if text:
                 table.add_row(name, text)
         console.print(escape(report["headline"]["text"]), style="bold", highlight=False)
+        announce_people(report["objects"], site, console)
         console.print(table)
         show_notices_and_warnings(report, console)
     for name, path in _map_files(site).items():

@@ -59,6 +59,10 @@ Classes = Annotated[
         help="What to look for, such as person,car.", show_default="what the model usually reports"
     ),
 ]
+EnoughLookedAt = Annotated[
+    float,
+    typer.Option(help="Exit code 3 where a smaller share of the flown ground was looked at."),
+]
 GiveUp = Annotated[
     float, typer.Option(help="End a live source after this many seconds without a picture.")
 ]

@@ -25,6 +25,29 @@ STOPPED = 130
 """Exit code: stopped by Ctrl-C, as shells count it."""
 
 
+def announce_person(words: str, console: Console) -> None:
+    """Print that a person was found, with the terminal's bell."""
+    console.bell()
+    console.print(
+        f"[bold red]PERSON FOUND[/bold red]  {escape(words)}", highlight=False, soft_wrap=True
+    )
+
+
+def announce_people(objects: Mapping[str, Any], folder: Path, console: Console) -> None:
+    """Print each person that a map shows, by a report's part on objects; `folder` has the site."""
+    import numpy as np
+
+    from sorvolo.survey.objects import PERSON
+
+    people = [row for row in objects.get("list", ()) if row["class"] == PERSON]
+    if not people:
+        return
+    words = place_words(site_of(folder), PlaceFormat.LATLON)
+    for row in people:
+        place = words(np.array([row["east_m"], row["north_m"], 0.0]))
+        announce_person(f"{row['id']} at {place}, score {row['score']:.2f}", console)
+
+
 def show_path(name: str, path: Path, console: Console) -> None:
     """Print where a file is."""
     # in one piece, however long: people copy it

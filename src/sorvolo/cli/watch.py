@@ -21,6 +21,7 @@ from sorvolo.cli.options import (
     Cot,
     CotAuthority,
     CotCertificate,
+    EnoughLookedAt,
     GiveUp,
     GroundElevation,
     LeastScore,
@@ -37,6 +38,8 @@ from sorvolo.cli.options import (
     wanted_classes,
 )
 from sorvolo.cli.printing import (
+    TO_CHECK,
+    announce_person,
     place_heading,
     read_json,
     show_notices_and_warnings,
@@ -84,19 +87,23 @@ def watch_command(
     ground_elevation: GroundElevation = None,
     height_model: HeightModel = "",
     give_up: GiveUp = 30.0,
+    enough_looked_at: EnoughLookedAt = 0.9,
     coordinates: PlaceFormatOption = PlaceFormat.LATLON,
     as_json: AsJson = False,
 ) -> None:
     """Find people, cars and small objects in a flight, live or recorded, and where on the ground they are.
 
-    Ends with the source or with Ctrl-C. Either way all results are written, and the exit code is 0, whether anything
-    was found or not. detections.jsonl grows while the watch runs. After a crash or a power cut, give the same command
-    again: it continues where it was, and sends no alert twice.
+    Ends with the source or with Ctrl-C, and writes all results either way. While a drone flies, frames of new ground are
+    searched first; the others are kept and searched once it has landed, or after Ctrl-C (again: stop at once).
+    The first line counts the ground that was looked at; exit code 3: less than was asked for, so what else is there is
+    not known. detections.jsonl grows while the watch runs. After a crash or a power cut, give the same command again:
+    it continues where it was, and sends no alert twice.
 
     Example: sorvolo watch DJI_0042.MP4 --classes person
 
     Example: sorvolo watch rtsp://192.168.1.10/live --telemetry udp://:10110 --cot udp://239.2.3.1:6969
     """
+    from sorvolo.capture.live.addresses import is_live_address
     from sorvolo.capture.live.reconnect import LiveSettings
     from sorvolo.missions.watch.cot_sender import CotTls
     from sorvolo.missions.watch.flights import watch
@@ -110,6 +117,7 @@ def watch_command(
         offset_s=offset,
         ground_elevation_m=ground_elevation,
         height_model=height_model,
+        enough_looked_at=enough_looked_at,
     )
     outputs = WatchOutputs(
         out,
@@ -122,7 +130,8 @@ def watch_command(
     )
     warn_of_interpreted(alert_command)
     # before the first frame there is nothing to keep
-    stop = Stop(is_running=False)
+    words = "landed: the frames that wait are searched; press Ctrl-C again to stop at once"
+    stop = Stop(is_running=False, words=words if is_live_address(source) else "")
     watching = watch(
         source,
         settings,
@@ -146,6 +155,8 @@ def watch_command(
             _show_result(result, Console(), coordinates)
     if not results:
         Console(stderr=True).print("stopped before the first frame was searched")
+    if not results or not all(each["headline"]["complete"] for each in results):
+        raise typer.Exit(TO_CHECK)
 
 
 def warn_of_interpreted(alert_command: str) -> None:
@@ -164,6 +175,7 @@ def _show_progress(
     """Take all updates, printing each new object; yield the folder of each."""
     from sorvolo.geometry.coordinates import Coordinates
     from sorvolo.missions.watch.run import found_words
+    from sorvolo.survey.objects import PERSON
 
     resumed = Resumed(console)
     with ProgressReport(console) as progress:
@@ -172,12 +184,15 @@ def _show_progress(
             resumed.take(update.frames_detected, is_resumed=update.is_resumed)
             for track in () if is_quiet or update.is_resumed else update.new:
                 name, rest = found_words(track, update.site, Coordinates(form.value))
-                console.print(
-                    f"[bold]{escape(name)}[/bold]  {rest}", highlight=False, soft_wrap=True
-                )
+                if track.label == PERSON:
+                    announce_person(f"{name}  {rest}", console)
+                else:
+                    console.print(
+                        f"[bold]{escape(name)}[/bold]  {rest}", highlight=False, soft_wrap=True
+                    )
             delay = f"{1000 * update.latency_s:.0f} ms delay"
             progress.show(
-                "watching, frame",
+                "landed, searching the rest, frame" if update.has_landed else "watching, frame",
                 update.frames_read,
                 max(update.frames_expected, update.frames_read) if update.frames_expected else None,
                 f"{rate_words(update.frames_detected, update.seconds)}{delay}, {counted_list(update.counts)}",
@@ -196,16 +211,14 @@ def _result(folder: Path) -> dict[str, Any]:
 def _show_result(result: Mapping[str, Any], console: Console, form: PlaceFormat) -> None:
     tracks = [feature["properties"] for feature in result["tracks"]["features"]]
     console.print(
-        f"Watch of {escape(result['flight'])}: {escape(counted_list(result['objects']['by_class']))} found",
+        f"Watch of {escape(result['flight'])}: {escape(result['headline']['text'])}",
         style="bold",
         highlight=False,
     )
     if tracks:
         _show_tracks(tracks, console, form, on_ground=result["georeferenced"])
     frames, latency = result["frames"], result["latency_s"]
-    skipped = (
-        f", {frames['skipped']:,} skipped to keep up with the source" if frames["skipped"] else ""
-    )
+    skipped = f", {frames['skipped']:,} left that were to be searched" if frames["skipped"] else ""
     console.print(
         f"{frames['detected']:,} of {counted(frames['read'], 'frame')} searched at "
         f"{result['frames_per_second'] or 0.0:.1f} frames/s{skipped}; delay {1000 * (latency['median'] or 0):.0f} ms "
@@ -217,6 +230,7 @@ def _show_result(result: Mapping[str, Any], console: Console, form: PlaceFormat)
     show_path("report", folder / "report.html", console)
     if result["georeferenced"]:
         show_path("GeoJSON", folder / "tracks.geojson", console)
+        show_path("searched", folder / "searched.geojson", console)
     else:
         show_path("list", folder / "tracks.json", console)
         console.print(f"  {result['tracks']['note']}", style="dim", highlight=False)

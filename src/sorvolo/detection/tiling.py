@@ -82,6 +82,15 @@ def scale_for(
     return min(1.0, max(least, most))
 
 
+def coarsest_m_per_px(label: str, info: ModelInfo) -> float:
+    """The most ground that a pixel may cover for a class to be recognised: by Johnson's criteria, at its smallest
+    decisive side; infinite for a class of unknown size."""
+    if label not in TYPICAL_SIZE_M:
+        return math.inf
+    critical_m = BOTTOM_CRITICAL_M if label == "person" else TYPICAL_SIZE_M[label][1]
+    return critical_m / TASK.pixels if label in info.classes else critical_m
+
+
 def is_too_small(name: str, m_per_px: float) -> bool:
     """Whether a person from straight above fills fewer pixels, each covering `m_per_px`, than `TASK` takes (eq. 3.9).
 

@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 FINISHED, FAILED, STOPPED = "run.finished", "run.failed", "run.stopped"
 """The types of a mission's last line. Its data has `exit_code`, `headline` and `error`."""
 
+PERSON_FOUND = "person.found"
+"""The type of the line that a person was found, by whatever mission; its data as of "object.found"."""
+
 BOXES, MOTION = "frame.boxes", "frame.motion"
 """Lines for a live video alone: the boxes of one frame, and how the picture moved since another."""
 
@@ -211,7 +214,7 @@ def run_map(
         for update in _noting(updates, known):
             _add_frame(journal, update.view, update.frame_name, update.status.value)
             journal.progress(_flight_progress(update, update.keyframes, update.by_vision))
-    return _mapped(site, before, known)
+    return _mapped(journal, site, before, known)
 
 
 def run_compare(order: Order, journal: Journal, until: threading.Event) -> Done:
@@ -249,14 +252,13 @@ def run_compare(order: Order, journal: Journal, until: threading.Event) -> Done:
         journal.add(
             "change.withdrawn", {"id": change_id, "why": "not confirmed by the whole flight"}
         )
-    return _mapped(site, before, known)
+    return _mapped(journal, site, before, known)
 
 
 def run_watch(order: Order, journal: Journal, until: threading.Event) -> Done:
     """Search a flight's frames for people and things."""
     from sorvolo.missions.watch.flights import watch
     from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
-    from sorvolo.survey.wording import counted, counted_list
 
     updates = watch(
         order.source,
@@ -280,6 +282,8 @@ def run_watch(order: Order, journal: Journal, until: threading.Event) -> Done:
                     "frames": update.frames_read,
                     "frames_expected": update.frames_expected or None,
                     "searched": update.frames_detected,
+                    "to_search": update.frames_asked,
+                    "landed": update.has_landed,
                     "objects": dict(update.counts),
                     "seconds": update.seconds,
                     "latency_s": update.latency_s,
@@ -287,12 +291,11 @@ def run_watch(order: Order, journal: Journal, until: threading.Event) -> Done:
                 }
             )
     if last is None:
-        return Done("stopped before the first frame was searched")
+        return Done("stopped before the first frame was searched", is_good=False)
     report = json.loads((last.folder / "report.json").read_bytes())
-    counts, searched = report["objects"]["by_class"], report["frames"]["detected"]
-    words = f"{counted_list(counts)} found in {counted(searched, 'frame')}"
     nowhere = "" if report["georeferenced"] else ", without a place on the ground"
-    return Done(words + nowhere, str(report["flight"]))
+    headline = report["headline"]
+    return Done(headline["text"] + nowhere, str(report["flight"]), headline["complete"])
 
 
 def run_search(order: Order, journal: Journal, until: threading.Event) -> Done:
@@ -386,9 +389,14 @@ def _noting(updates: Generator[T, None, Any], known: list[str]) -> Iterator[T]:
     known += [each.flight for each in (yield from updates) or ()]
 
 
-def _mapped(site: Path, before: int, known: Sequence[str]) -> Done:
-    """How a flight's map, or its comparison, ended: as the reports state of the versions since, else of known flights."""
+def _mapped(journal: Journal, site: Path, before: int, known: Sequence[str]) -> Done:
+    """How a flight's map, or its comparison, ended: as the reports state of the versions since, else of known flights.
+
+    Writes each person that the new versions show.
+    """
+    from sorvolo.store.exports.object_files import objects_geojson
     from sorvolo.store.site.archive import Archive
+    from sorvolo.survey.objects import PERSON
 
     with Archive.open(site, write=False) as archive:
         since = [
@@ -396,6 +404,15 @@ def _mapped(site: Path, before: int, known: Sequence[str]) -> Done:
         ]
         flights = since or known
         reports = [archive.report(each) for each in flights]
+        people = [
+            each
+            for flight in since
+            for each in archive.objects(flight)
+            if each.thing.label == PERSON
+        ]
+        place = archive.site()
+    for feature in objects_geojson(people, place, crops_from_site=True)["features"]:
+        journal.add(PERSON_FOUND, {"feature": feature, "is_local": place.is_local})
     headlines = [(each.get("comparison") or each).get("headline") or {} for each in reports]
     texts = [str(each.get("text") or "") for each in headlines]
     is_good = all(each.get("quality") in ("map", "compared") for each in headlines)
@@ -450,6 +467,7 @@ def _add_changes(journal: Journal, update: "CompareUpdate", site: "Site") -> Non
 def _add_objects(journal: Journal, update: "WatchUpdate", stream: str) -> None:
     """Write a frame's boxes, and each object that it confirmed; of a watch that was killed, it has written them."""
     from sorvolo.store.exports.detection_files import tracks_collection
+    from sorvolo.survey.objects import PERSON
 
     if update.is_resumed:
         return
@@ -457,7 +475,10 @@ def _add_objects(journal: Journal, update: "WatchUpdate", stream: str) -> None:
     if not update.new:
         return
     for feature in tracks_collection(list(update.new), update.site, {})["features"]:
-        journal.add("object.found", {"feature": feature, "is_local": update.site.is_local})
+        found = {"feature": feature, "is_local": update.site.is_local}
+        journal.add("object.found", found)
+        if feature["properties"]["class"] == PERSON:
+            journal.add(PERSON_FOUND, found)
 
 
 def _add_early(journal: Journal, stream: str, found: "EarlyFound") -> None:

@@ -83,7 +83,11 @@ def cell_side_m(outlines_m: Sequence[PointsM]) -> float:
     """The side of cells so that not too many cover these outlines: 1, 2, 5, 10 ... metres."""
     points = np.concatenate([np.asarray(each) for each in outlines_m])
     wide_m = float(np.prod(np.maximum(np.ptp(points, axis=0), 1.0)))
-    least_m = max(_LEAST_M, (wide_m / _MOST) ** 0.5)
+    return round_side_m(max(_LEAST_M, (wide_m / _MOST) ** 0.5))
+
+
+def round_side_m(least_m: float) -> float:
+    """The least of 1, 2, 5, 10 ... metres, or of their tenths, that is no less."""
     power = 10.0 ** np.floor(np.log10(least_m))
     return float(next(step * power for step in (1, 2, 5, 10) if step * power >= least_m - 1e-9))
 

@@ -157,7 +157,7 @@ _CROWN_SHARE = 0.5  # of the views of a cell: crowns lean apart, ground does not
 _RAISED_M = 2.0  # above the ground: higher than people and cars
 _LEAST_SUN = 0.1  # sine of the sun's height: lower, shadows are longer than pictures; or its way along the ground
 _SPARE = 0.3  # of a frame's ground, beside it: its edges bend where the lens does
-_FARTHEST = 3.0  # tangent of the angle from straight down: beyond it nothing is measured
+FARTHEST = 3.0  # tangent of the angle from straight down: beyond it nothing is measured
 
 AboveGround: TypeAlias = Callable[[PointsM], tuple[Floats, Floats]]
 """How high the surface lies above the bare ground at places (N, 2), m, and its sigma, m; NaN where unknown."""
@@ -400,6 +400,6 @@ def _projected(
         shown = (
             near
             & ((pixels >= margin) & (pixels <= size - 1 - margin)).all(axis=1)
-            & (slant < _FARTHEST)
+            & (slant < FARTHEST)
         )
     return np.asarray(shown & (local[:, 2] > 0), bool), pixels, m_per_px, slant

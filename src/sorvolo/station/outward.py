@@ -134,7 +134,9 @@ def _place(folder: Path, address: str) -> Path:
     return folder / _FOLDER / f"{hashlib.sha256(address.encode()).hexdigest()[:16]}.json"
 
 
-WANTED = frozenset({"object.found", "change.announced", "change.withdrawn", "frame.placed"})
+WANTED = frozenset(
+    {"object.found", "person.found", "change.announced", "change.withdrawn", "frame.placed"}
+)
 """The events that a TAK server gets."""
 
 _DRONE_EVERY_S = 1.0  # by choice

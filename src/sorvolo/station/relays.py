@@ -28,6 +28,7 @@ from sorvolo.store.atomic import atomic_write_bytes
 PASSED_ON = frozenset(
     {
         "object.found",
+        "person.found",
         "change.announced",
         "change.withdrawn",
         "review.changed",

@@ -203,7 +203,8 @@ class Runs:
             return run
 
     def stop(self, run_id: str) -> Run:
-        """Ask a mission to end: a live flight is finished and kept, a recorded one is left out; asked again, at once.
+        """Ask a mission to end: a live flight is finished (a watch searches what was left) and kept, a recorded one is
+        left out; asked again, at once.
 
         A process that takes longer to end than the settings allow is killed by `look`. Raises Problem (404, 409).
         """
@@ -219,7 +220,10 @@ class Runs:
             limits = self._settings.limits
             is_finishing = _is_live(run) and not run.stop_asked
             within_s = limits.finish_within_s if is_finishing else limits.stop_within_s
-            asked = replace(run, stop_asked=True, kill_at=utc_after(within_s))
+            # a live watch then searches what was left, however long that takes
+            searches_rest = is_finishing and run.mission == "watch"
+            kill_at = None if searches_rest else utc_after(within_s)
+            asked = replace(run, stop_asked=True, kill_at=kill_at)
             self._keep(asked, [])
             return asked
 

@@ -12,6 +12,9 @@ from sorvolo.geometry.arrays import BoxesPx, Floats, Labels, Mask, Rows, TimesNs
 CLASSES = ("person", "car", "small object")
 """The classes of Sorvolo's own models, in the order of their labels; other models bring their own names."""
 
+PERSON = CLASSES[0]
+"""The class whose finding is told at once, by every mission."""
+
 TYPICAL_SIZE_M = {
     "person": (0.6, 0.5, 1.7),
     "car": (4.4, 1.8, 1.5),

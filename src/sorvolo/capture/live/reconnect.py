@@ -18,7 +18,7 @@ class LiveSettings:
     """How a live source is read."""
 
     keeps_all: bool = (
-        False  # every wanted frame waits for its turn (mapping); else the newest wins (watching)
+        False  # (mapping); else a slow computer leaves out what it cannot decode in time (watching)
     )
     silent_s: float = (
         3.0  # without a packet: the source counts as silent, which is reported, and is opened anew

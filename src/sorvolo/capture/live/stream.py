@@ -164,16 +164,12 @@ class Arrived:
 class FrameQueue:
     """A bounded queue. `put` and `take` change it, from one thread each; `skipped` counts what nobody looked at.
 
-    `holds_all`: frames wait for their turn until `most_bytes` are held; else only the newest waits. Where `blocks`
-    is set (a file that can wait), a full queue holds up the reader instead of dropping the oldest frame.
+    Frames wait for their turn until `most_bytes` are held. Where `blocks` is set (a file that can wait), a full queue
+    holds up the reader instead of dropping the oldest frame.
     """
 
-    def __init__(self, *, holds_all: bool, most_bytes: int, blocks: bool) -> None:
-        self._holds_all, self._most_bytes, self._blocks = (
-            holds_all,
-            most_bytes,
-            blocks and holds_all,
-        )
+    def __init__(self, *, most_bytes: int, blocks: bool) -> None:
+        self._most_bytes, self._blocks = most_bytes, blocks
         self._waiting: deque[Arrived] = deque()
         self._held_bytes = 0
         self._changed = threading.Condition()
@@ -185,7 +181,7 @@ class FrameQueue:
         with self._changed:
             if self._blocks:
                 self._changed.wait_for(lambda: self._is_over or self._fits(arrived))
-            while self._waiting and not (self._holds_all and self._fits(arrived)):
+            while self._waiting and not self._fits(arrived):
                 self._held_bytes -= self._waiting.popleft().size_bytes
                 self.skipped += 1
             self._waiting.append(arrived)
@@ -287,7 +283,7 @@ class LiveStream:
     """A flight that is going on; fulfils `capture.source.Source`, and its telemetry grows while it is read.
 
     A thread reads and decodes from the moment it is opened; what comes before `frames` is asked for waits where all
-    frames are kept, and is passed over where the newest wins (a growing file waits itself). Close it, or exhaust or
+    frames are kept, and is passed over elsewhere (a growing file waits itself). Close it, or exhaust or
     close `frames`, to end it. `until`, when set from any thread, ends the frames as the end of the stream would. Made
     by `open_stream`.
     """
@@ -306,9 +302,7 @@ class LiveStream:
         self._settings, self._until, self._is_file = settings, until, path is not None
         self._closing = threading.Event()
         most_bytes = settings.most_bytes_of_file if self._is_file else settings.most_bytes
-        self._queue = FrameQueue(
-            holds_all=settings.keeps_all, most_bytes=most_bytes, blocks=self._is_file
-        )
+        self._queue = FrameQueue(most_bytes=most_bytes, blocks=self._is_file)
         self._clock = StreamClock()
         self._log = TelemetryLog("nmea" if link else FORMAT, link or address.shown)
         self._link = NmeaLink(link, settings, self._fix) if link else None
@@ -430,7 +424,7 @@ class LiveStream:
 
     @property
     def skipped(self) -> int:
-        """Wanted frames that nobody looked at, because newer ones came or memory ran out."""
+        """Wanted frames that nobody took before memory ran out."""
         return self._queue.skipped
 
     def wait_for_first_fixes(self) -> None:
@@ -444,7 +438,7 @@ class LiveStream:
     def wait_for_telemetry(self, time_ns: int) -> None:
         """Wait for the sample that follows a frame, at most `fix_wait_s` from when the frame came.
 
-        Only where every frame is kept: where the newest wins, what is known so far has to do.
+        Only where every frame is kept; elsewhere what is known so far has to do.
         """
         if self._settings.keeps_all and self._log.version:
             self._log.wait_past(
@@ -509,7 +503,7 @@ class LiveStream:
     def frames(self, wanted: Callable[[int, int], bool]) -> Iterator[Frame | LostFrame]:
         """The wanted frames as they come, numbered from 0, until the stream ends for good; see `Source.frames`.
 
-        `wanted` is asked in the reading thread. Where the newest wins, older ones are counted as skipped.
+        `wanted` is asked in the reading thread. Frames that memory does not hold any more are counted as skipped.
         """
         for _, each in self.arrivals(wanted):
             yield each

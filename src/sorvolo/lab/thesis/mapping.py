@@ -256,7 +256,7 @@ class ThesisRun(FlightRun):
             [*notices, *self._detector_notices, *_drift(painter.exposure)],
             time.monotonic() - started_s,
         )
-        report["objects"] = self._search_summary(search)
+        self._add_search(report, search, placed)
         page = report_page(report, shown.rgba, crops_of(search), site)
         writer.commit(placed, painter.images, report, page, crs=self._settings.crs, search=search)
 

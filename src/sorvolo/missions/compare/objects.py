@@ -8,6 +8,7 @@ from sorvolo.change.reconcile import SearchedGround, on_one_date
 from sorvolo.change.views import ViewMaker, ViewOutcome
 from sorvolo.missions.compare.classes import ChangeClasses
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
+from sorvolo.missions.flight.looked_at import searched_document
 from sorvolo.missions.flight.map_objects import ObjectFinder, search_summary, why_not_searched
 from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.flight.settings import CompareSettings
@@ -15,7 +16,7 @@ from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.mosaic.selection import StretchSelection
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.findings import Change, ChangeKind
-from sorvolo.survey.flight import Notice, PosedFrame
+from sorvolo.survey.flight import Notice, PosedFrame, Site
 from sorvolo.survey.map_objects import MapObject, ObjectSearch
 from sorvolo.survey.mosaic import PlacedFrame
 
@@ -107,7 +108,11 @@ class ComparisonObjects:
             self._classes.final(each, search.objects, self._finder.sightings) for each in changes
         ]
 
-    def summary(self, search: ObjectSearch | None) -> dict[str, Any]:
-        """The report's part on objects."""
-        seconds = 0.0 if self._finder is None else self._finder.seconds
-        return search_summary(search, seconds, why_not_searched(self._model))
+    def summary(
+        self, search: ObjectSearch | None, placed: Sequence[PlacedFrame], site: Site
+    ) -> tuple[dict[str, Any], dict[str, bytes]]:
+        """The report's part on objects, and the outlines of the ground that was looked at."""
+        if self._finder is None:
+            return search_summary(None, None, 0.0, why_not_searched(self._model)), {}
+        looked, ground = self._finder.looked_at(placed, site)
+        return search_summary(search, looked, self._finder.seconds), searched_document(ground, site)

@@ -35,7 +35,7 @@ from sorvolo.missions.compare.report import (
 from sorvolo.missions.compare.whole_flight import WholeFlight
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.log import FlightLog, Stage
-from sorvolo.missions.flight.map_objects import crops_of
+from sorvolo.missions.flight.map_objects import crops_of, with_objects
 from sorvolo.missions.flight.report import FlightResult, build_report
 from sorvolo.missions.flight.request import REQUEST
 from sorvolo.missions.flight.result_cache import ResultCache
@@ -297,10 +297,12 @@ class CompareRun:
             started_s,
             ground,
         )
-        report["objects"] = self._objects.summary(search)
-        page = report_page(report, shown.rgba, crops_of(search), self._archive.site())
         site = self._archive.site()
-        documents = {
+        report["objects"], searched = self._objects.summary(search, placed, site)
+        comparison = report["comparison"]
+        comparison["headline"] = with_objects(report, comparison["headline"])
+        page = report_page(report, shown.rgba, crops_of(search), site)
+        documents = searched | {
             features_name(COVERAGE, is_local=site.is_local): geojson_bytes(
                 coverage_geojson(ground, site)
             )

@@ -15,19 +15,21 @@ from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.camera import Camera
 from sorvolo.missions.flight.detector_protocol import ObjectDetector, load_detector
+from sorvolo.missions.flight.looked_at import LookedAt, ground_for, looked_at
 from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.flight.settings import WAITING_MB
 from sorvolo.missions.flight.threads import lower_priority, made_at_low_priority
 from sorvolo.registration.lens import at_most
+from sorvolo.search.looked_ground import LookedGround, near_ground
 from sorvolo.store.exports.detection_files import crop_around
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.images import jpeg_from_image
 from sorvolo.store.site.spill import FrameOnDisk
-from sorvolo.survey.flight import Frame, Notice, PosedFrame
+from sorvolo.survey.flight import Frame, Notice, PosedFrame, Site
 from sorvolo.survey.map_objects import MapObject, ObjectSearch, SearchedFrames
 from sorvolo.survey.mosaic import PlacedFrame, Status
 from sorvolo.survey.objects import Detections, Sighting
-from sorvolo.tracking.laying import LaidSighting, lay_on_ground
+from sorvolo.tracking.laying import LaidSighting, lay_on_ground, pose_of
 from sorvolo.tracking.map_objects import objects_on_map
 from sorvolo.tracking.view_evidence import least_seen
 
@@ -192,6 +194,23 @@ class ObjectFinder:
             found.dropped,
         )
 
+    def looked_at(
+        self, placed: Sequence[PlacedFrame], site: Site
+    ) -> tuple[LookedAt, LookedGround | None]:
+        """How much of what the flight's frames show, by their final places, was looked at; the ground of a site with
+        metres."""
+        ground = None if site.is_local else ground_for(site, self._detector.info, self._classes)
+        for frame in placed if ground is not None else ():
+            pose, seen = pose_of(frame), self._seen.get(frame.index)
+            if pose is None or ground is None:
+                continue
+            camera_m = pose.translation_m
+            outline_m = near_ground(frame.outline_m, camera_m)
+            ground.show(outline_m)
+            if seen is not None:
+                ground.look(outline_m, float(camera_m[2]) / frame.camera.fx_px, seen.least)
+        return looked_at(ground, len(self._seen), len(placed)), ground
+
     def _least(self, frames: Sequence[PlacedFrame]) -> dict[str, float]:
         """From which score on each class is reported: where frames of two lights differ, the higher; of a class that no
         frame was searched for, from the model's own."""
@@ -231,10 +250,13 @@ class ObjectFinder:
 
 
 def search_summary(
-    search: ObjectSearch | None, seconds: float, why_not: str = ""
+    search: ObjectSearch | None,
+    looked: LookedAt | None,
+    seconds: float,
+    why_not: str = "",
 ) -> dict[str, Any]:
     """The report's part on objects; specified in docs/formats.md. `why_not`: why nothing was searched."""
-    if search is None:
+    if search is None or looked is None:
         return {"model": None, "why_not": why_not, "count": 0, "classes": {}, "list": []}
     counts = Counter(each.label for each in search.objects)
     return dict(
@@ -242,6 +264,10 @@ def search_summary(
             {
                 "model": search.model,
                 "looked_for": search.classes,
+                "headline": looked.headline(
+                    {name: counts[name] for name in search.classes}, search.classes
+                ),
+                "looked_at": looked.facts(),
                 "frames": search.looked,
                 "sightings": search.sightings,
                 "dropped": search.dropped,
@@ -253,6 +279,12 @@ def search_summary(
             }
         )
     )
+
+
+def with_objects(report: Mapping[str, Any], headline: Mapping[str, Any]) -> dict[str, Any]:
+    """A headline with what was found, and how much was looked at, by the report's part on objects."""
+    found = report["objects"].get("headline")
+    return {**headline, "text": f"{headline['text']}; {found['text']}"} if found else dict(headline)
 
 
 def why_not_searched(model: str) -> str:

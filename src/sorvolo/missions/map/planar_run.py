@@ -17,11 +17,13 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.level_ground import footprint, is_on_ground
 from sorvolo.missions.flight.control import FlightControl
 from sorvolo.missions.flight.log import Ending, FlightLog, Stage, nothing_placed
+from sorvolo.missions.flight.looked_at import searched_document
 from sorvolo.missions.flight.map_objects import (
     ObjectFinder,
     crops_of,
     search_summary,
     why_not_searched,
+    with_objects,
 )
 from sorvolo.missions.flight.report import FlightResult, MapShape, build_report
 from sorvolo.missions.flight.request import REQUEST
@@ -158,9 +160,20 @@ class FlightRun(ABC):
                 placed, self._setup.source.name, has_metres=not self._archive.site().is_local
             )
 
-    def _search_summary(self, search: ObjectSearch | None) -> dict[str, Any]:
+    def _add_search(
+        self, report: dict[str, Any], search: ObjectSearch | None, placed: Sequence[PlacedFrame]
+    ) -> dict[str, bytes]:
+        """Add what was searched for to a report and its headline; the outlines of the ground that was looked at."""
+        looked, ground, site = None, None, self._archive.site()
+        if self._finder is not None:
+            looked, ground = self._finder.looked_at(placed, site)
         seconds = 0.0 if self._finder is None else self._finder.seconds
-        return search_summary(search, seconds, why_not_searched(self._settings.model))
+        report["objects"] = search_summary(
+            search, looked, seconds, why_not_searched(self._settings.model)
+        )
+        if "headline" in report:
+            report["headline"] = with_objects(report, report["headline"])
+        return searched_document(ground, site)
 
     @property
     def _detector_notices(self) -> tuple[Notice, ...]:
@@ -445,9 +458,9 @@ class PlanarRun(FlightRun):
             [*notices, *self._archive.notices, *self._detector_notices],
             time.monotonic() - started_s,
         )
-        report["objects"] = self._search_summary(search)
+        documents = self._add_search(report, search, placed)
         page = report_page(report, shown.rgba, crops_of(search), self._archive.site())
-        documents = {} if self._control is None else dict(control_documents(self._control))
+        documents |= {} if self._control is None else control_documents(self._control)
         if self._coverage is not None:
             files, report["seen"] = self._coverage.conclude(self.pictures_on_ground())
             documents.update(files)

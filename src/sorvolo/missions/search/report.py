@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from sorvolo.detection.contract import ModelInfo
-from sorvolo.detection.tiling import TASK
+from sorvolo.detection.tiling import coarsest_m_per_px
 from sorvolo.geometry.arrays import Floats, ImageRGBA, PointsM
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid, TileIndex
-from sorvolo.geometry.planning import BOTTOM_CRITICAL_M
 from sorvolo.geometry.summary import calibration_bins, median_of_known, wilson
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.plan_flight import REFLY_LEAST_M2, REFLY_LOWEST_M, REFLY_MOST_HOLES, fly_again
@@ -163,7 +162,7 @@ def hole_numbers(
             each.chances,
             each.recall,
             enough=settings.enough,
-            needed_m_per_px=needed_m_per_px(label, info),
+            needed_m_per_px=coarsest_m_per_px(label, info),
             length_m=_length_m(label),
         )
         for each in own
@@ -175,12 +174,6 @@ def hole_numbers(
         searched.cells,
         settings.enough,
     )
-
-
-def needed_m_per_px(label: str, info: ModelInfo) -> float:
-    """The coarsest pixel at which a class is recognised: by Johnson's criteria, at its smallest decisive side."""
-    critical_m = BOTTOM_CRITICAL_M if label == "person" else TYPICAL_SIZE_M[label][1]
-    return critical_m / TASK.pixels if label in info.classes else critical_m
 
 
 def is_coarse(searched: Searched, settings: SearchSettings, info: ModelInfo) -> bool:
@@ -292,7 +285,8 @@ def _headline(
             f"{'and ' + counted(len(so_far.earlier), 'flight') + ' before it' if so_far.earlier else 'alone'}: "
         )
     )
-    text = f"{by}probability of detection of a {label} anywhere in the area: {chance}"
+    looked = f"; {row['seen_m2'] / area_m2:.0%} of the area looked at" if area_m2 else ""
+    text = f"{by}probability of detection of a {label} anywhere in the area: {chance}{looked}"
     total = sum(shares.values())
     is_complete = total <= _MOST_HOLES
     text += (
@@ -380,7 +374,7 @@ def write_refly(
     area = Area(tuple(_rings(large, grid)), "holes of the search")
     camera, height_m = searched.camera, searched.height_m
     if is_coarse(searched, settings, info):
-        needed = needed_m_per_px(searched.labels[0], info)
+        needed = coarsest_m_per_px(searched.labels[0], info)
         height_m = max(REFLY_LOWEST_M, min(height_m, 0.9 * needed * camera.fx_px))
     plan = fly_again(area, camera, height_m, files, dji_drone=dji_drone)
     return Refly(

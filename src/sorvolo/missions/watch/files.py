@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from sorvolo.geometry.arrays import Floats, ImageRGB
+from sorvolo.missions.watch.announced import SightingKey, sighting_key
 from sorvolo.missions.watch.settings import WatchOutputs
 from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.exports.annotated import AnnotatedVideo, annotated, write_annotated
@@ -67,7 +68,7 @@ class WatchFiles:
     def __init__(self, folder: Path, outputs: WatchOutputs, site: Site) -> None:
         self.folder = folder
         self._outputs, self._site = outputs, site
-        self._crops: OrderedDict[tuple[int, bytes], ImageRGB] = OrderedDict()
+        self._crops: OrderedDict[SightingKey, ImageRGB] = OrderedDict()
         self._best: dict[int, Sighting] = {}
         self.crop_names: dict[int, str] = {}
         self.segments: dict[int, int] = {}  # by track
@@ -118,7 +119,7 @@ class WatchFiles:
         Where the view's picture is gone, the crop is the one that was written when it was there.
         """
         if self._best.get(track.id) is not track.best:
-            crop = self._crops.get(_key(track.best))
+            crop = self._crops.get(sighting_key(track.best))
             name = (
                 written_crop(self.folder, track.id)
                 if crop is None
@@ -131,7 +132,7 @@ class WatchFiles:
 
     def keep_crops_of(self, tracks: Iterable[Track]) -> None:
         """Of the crops in memory keep those of all these tracks' best views; no other can become a track's best."""
-        best = {_key(track.best) for track in tracks}
+        best = {sighting_key(track.best) for track in tracks}
         self._crops = OrderedDict((key, crop) for key, crop in self._crops.items() if key in best)
 
     def forget(self, track_ids: Iterable[int]) -> None:
@@ -246,7 +247,7 @@ class WatchFiles:
             raise error
 
     def _keep_crop(self, sighting: Sighting, crop: ImageRGB) -> None:
-        self._crops[_key(sighting)] = crop
+        self._crops[sighting_key(sighting)] = crop
         held = sum(each.nbytes for each in self._crops.values())
         while held > _CROPS_BYTES and len(self._crops) > 1:
             _, dropped = self._crops.popitem(last=False)
@@ -257,10 +258,6 @@ def _file_name(frame: Frame) -> str:
     """The frame's name without ending; a video's frames are numbered, and sort by it."""
     stem = Path(frame.name).stem
     return f"{int(stem):06d}" if stem.isdecimal() else stem
-
-
-def _key(sighting: Sighting) -> tuple[int, bytes]:
-    return sighting.frame_index, sighting.box_px.tobytes()
 
 
 def _rows(seen: SeenFrame, site: Site) -> list[dict[str, Any]]:

@@ -3,9 +3,11 @@
 import threading
 import time
 import warnings
+from collections import deque
 from collections.abc import Callable, Generator
 from contextlib import ExitStack, closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +32,13 @@ from sorvolo.missions.watch.cot_sender import check_host, cot_place
 from sorvolo.missions.watch.places import Places, over_heights, places_of
 from sorvolo.missions.watch.run import EarlyFound, WatchRun, WatchUpdate, utc_ns
 from sorvolo.missions.watch.settings import DEFAULT_FRAMES_PER_SECOND, WatchOutputs, WatchSettings
+from sorvolo.missions.watch.waiting import WaitingFrames
 from sorvolo.mosaic.selection import every
 from sorvolo.store.exports.detection_files import JOURNAL, claimed_folder
 from sorvolo.store.site.journal import RunJournal, content_sha256
-from sorvolo.survey.flight import Frame, LostFrame
+from sorvolo.survey.flight import Frame
 from sorvolo.tracking.image_motion import SMALL_WIDTH_PX, STEP_S, PictureStep, PictureSteps
+from sorvolo.tracking.laying import GroundHeight
 
 _AHEAD = 4  # decoded frames that wait for the detector
 _STOPPED = "stopped on demand"
@@ -57,9 +61,9 @@ def watch(
 
     `source`, `telemetry` and `camera` are those of `map_flights`; a folder of several videos is watched one after
     another, each into a folder of its own. `detector` is one that is loaded already; else `settings.model` is. Every
-    wanted frame of a recorded flight is searched; of a live one, read with the settings `live`, the newest, so that
-    latency stays bounded, and the others are counted. Objects are placed on the ground where telemetry allows it, else
-    followed in the picture.
+    wanted frame is searched. Of a live flight, read with the settings `live`, frames that show new ground come first;
+    what is left is searched once it has ended, from the pictures that were kept. Objects are placed on the ground where
+    telemetry allows it, else followed in the picture.
 
     `moved` is given how the picture of a live video moved, ten times a second of flight, in the thread that reads it:
     while a frame is searched, its last boxes can follow the picture (see `PictureSteps`). Times are those of updates.
@@ -69,7 +73,8 @@ def watch(
     A watch that was killed goes on where it was when the same is asked for again, with a live stream within
     `live.same_flight_s`: what was found is not searched for again, and alerts that were sent are not sent again.
 
-    Set `until`, close the generator, or press Ctrl-C, to end early: all that was found until then is written. Raises
+    Set `until` to end a live flight, whose rest is then searched, or a recorded one at once; close the generator, or
+    press Ctrl-C, to end at once: all that was found until then is written. Raises
     InputError, SettingsError or StoreError with what to do.
     """
     until = until or threading.Event()
@@ -176,19 +181,14 @@ def _watch_one(
 ) -> Generator[WatchUpdate]:
     folder, is_live = outputs.folder, isinstance(source, LiveSource)
     assert folder is not None
-    setup, places = _prepared(source, settings, detector, telemetry_named=telemetry_named)
+    setup, ground = _prepared(source, settings, telemetry_named=telemetry_named)
+    places = _places(setup, settings, detector, ground)
     request = request_of(setup, settings, None, detector, *_asked(settings, outputs))
     journal = _journal(folder, request)
     if why_not := journal.why_not:
         text = f"{folder}: a watch that was stopped cannot continue: {why_not}"
         warnings.warn(text, SorvoloWarning, stacklevel=2)
-    wanted, passed = _wanted(source, settings), 0
-
-    def is_wanted(index: int, time_ns: int) -> bool:
-        nonlocal passed
-        passed = index + 1
-        return wanted(index, time_ns)
-
+    passed = _Passed(_wanted(source, settings))
     with ExitStack() as stack:
         goes = goes_on if is_live else journal.is_begun
         stack.enter_context(
@@ -205,32 +205,136 @@ def _watch_one(
             _give_steps(source, setup, moved)
         ended = _STOPPED
         try:
-            with closing(_arrivals(source, is_wanted, memo)) as arrivals:
-                for arrived_s, frame in arrivals:
-                    if isinstance(frame, Frame):
-                        yield run.add(frame, arrived_s)
-                    else:
-                        run.lose(frame)
-                    if until.is_set():
-                        break
-            if not until.is_set():
-                ended = "the source ended"
-                if not is_live:
-                    run.log.read = passed  # also those after the last one that was searched
+            if isinstance(source, LiveSource):
+                waiting = stack.enter_context(WaitingFrames(source, passed.is_wanted, folder))
+                yield from _live(run, waiting, passed, memo)
+                ended = _STOPPED if until.is_set() else "the source ended"
+                new_places = partial(_places, setup, settings, detector, ground)
+                yield from _rest(run, waiting, lambda: ResultCache(journal, source), new_places)
+            else:
+                yield from _recorded(run, source, passed, until)
+                if not until.is_set():
+                    ended = "the source ended"
+                    run.log.read = passed.count  # also those after the last one that was searched
         except KeyboardInterrupt:
-            pass  # the usual way to end a live watch: what was found is written below
+            ended = _STOPPED  # what was found is written below
         except Exception as error:
             ended = f"stopped by an error: {error}"
             raise
         finally:
+            if ended == _STOPPED and not is_live:
+                passed.note_unread(run, source)
             if run.log.detected or ended == _STOPPED:
-                skipped = source.skipped if isinstance(source, LiveSource) else 0
-                run.finish(ended=ended, skipped=skipped)
+                run.finish(ended=ended)
         if ended != _STOPPED and not run.log.detected:
             reason = next(iter(run.log.lost), "the source holds none")
             raise InputError(
                 f"no frame of {source.name} could be searched: {reason}; see `sorvolo inspect`"
             )
+
+
+class _Passed:
+    """Which of a source's frames are to be searched, asked in the thread that reads it; notes those that show ground."""
+
+    def __init__(self, wanted: Callable[[int, int], bool]) -> None:
+        self._wanted, self._shows = wanted, every(1 / DEFAULT_FRAMES_PER_SECOND)
+        self._showing: deque[tuple[int, int]] = deque()
+        self.count = 0
+        self.earlier = 0
+        """How many frames a killed watch had searched."""
+        self._asked = 0
+
+    def is_wanted(self, index: int, time_ns: int) -> bool:
+        """Whether this frame is to be searched."""
+        self.count = index + 1
+        is_wanted = self._wanted(index, time_ns)
+        self._asked += is_wanted
+        if self._shows(index, time_ns) and not is_wanted:
+            self._showing.append((index, time_ns))
+        return is_wanted
+
+    def note(self, run: WatchRun) -> None:
+        """Tell the watch how many frames were to be searched so far, and what ground the others show."""
+        run.log.asked = self._asked + self.earlier
+        while self._showing:
+            index, time_ns = self._showing.popleft()
+            run.show(Frame.unseen(index, str(index), time_ns, (0, 0)))
+
+    def note_unread(self, run: WatchRun, source: Source) -> None:
+        """Tell the watch what a recorded flight would have shown after the frame at which it was stopped."""
+        if source.kind == "photos":
+            self._asked += max(0, source.frame_count - self.count)
+            run.forget_ground()
+        else:
+            for index in range(self.count, source.frame_count):
+                time_ns = source.start_ns + round(index * 1e9 / source.frame_rate_hz)
+                if self.is_wanted(index, time_ns):
+                    self._showing.append((index, time_ns))
+        self.note(run)
+
+
+def _recorded(
+    run: WatchRun, source: Source, passed: _Passed, until: threading.Event
+) -> Generator[WatchUpdate]:
+    """Search every wanted frame of a flight that is over."""
+    with closing(read_ahead(source.frames(passed.is_wanted), _AHEAD)) as frames:
+        for frame in frames:
+            passed.note(run)
+            if isinstance(frame, Frame):
+                yield run.add(frame, time.monotonic())
+            else:
+                run.lose(frame)
+            if until.is_set():
+                return
+    passed.note(run)
+
+
+def _live(
+    run: WatchRun, waiting: WaitingFrames, passed: _Passed, memo: ResultCache
+) -> Generator[WatchUpdate]:
+    """Search what a killed watch had searched of the stream, then new ground as it comes, until the flight ends."""
+    for each in memo.kept_frames():
+        passed.earlier += 1
+        yield run.add(each.frame, time.monotonic())
+    with closing(waiting.live(run.show, run.new_share)) as arrivals:
+        for arrived_s, arrived in arrivals:
+            passed.note(run)
+            if isinstance(arrived, Frame):
+                yield run.add(arrived, arrived_s)
+            else:
+                run.lose(arrived)
+    passed.note(run)
+
+
+def _rest(
+    run: WatchRun,
+    waiting: WaitingFrames,
+    new_memo: Callable[[], ResultCache],
+    new_places: Callable[[], Places],
+) -> Generator[WatchUpdate]:
+    """Search what was left while the flight was live; the whole flight again, where that was not in order of time.
+
+    What was searched is not searched again. Closed early, it still takes in all that was searched.
+    """
+    run.has_landed = True
+    if waiting.is_in_order:
+        for frame in waiting.in_order(set(waiting.left()).__contains__):
+            yield run.add(frame, time.monotonic())
+        return
+    memo = new_memo()
+    run.search_again(new_places(), memo)
+    own = set(waiting.kept())
+    for each in memo.kept_frames():  # of an earlier process, without pictures
+        if each.index not in own:
+            run.add(each.frame, time.monotonic())
+    done = -1
+    try:
+        for frame in waiting.in_order(lambda _: True):
+            done = frame.index
+            yield run.add(frame, time.monotonic())
+    finally:
+        for frame in waiting.in_order(lambda index: index > done and memo.has_ended(index)):
+            run.add(frame, time.monotonic())
 
 
 def _give_steps(
@@ -248,9 +352,9 @@ def _give_steps(
 
 
 def _prepared(
-    source: Source, settings: WatchSettings, detector: ObjectDetector, *, telemetry_named: bool
-) -> tuple[FlightSetup, Places]:
-    """The flight as it is set up, and where what is found in it will lie."""
+    source: Source, settings: WatchSettings, *, telemetry_named: bool
+) -> tuple[FlightSetup, GroundHeight | None]:
+    """The flight as it is set up, and the ground's heights where a model has them."""
     mapping = MapSettings(
         offset_s=settings.offset_s, ground_elevation_m=settings.ground_elevation_m
     )
@@ -259,45 +363,34 @@ def _prepared(
         return prepare(source, mapping, None, telemetry_named=telemetry_named)
 
     if settings.height_model:
-        setup, ground = over_heights(prepared, mapping, Path(settings.height_model))
-    else:
-        setup, ground = prepared(mapping), None
+        return over_heights(prepared, mapping, Path(settings.height_model))
+    return prepared(mapping), None
+
+
+def _places(
+    setup: FlightSetup,
+    settings: WatchSettings,
+    detector: ObjectDetector,
+    ground: GroundHeight | None,
+) -> Places:
+    """Where what is found in the flight will lie."""
     thresholds = detector.info.thresholds
     least = (
         thresholds
         if settings.least_score is None
         else dict.fromkeys(thresholds, settings.least_score)
     )
-    return setup, places_of(setup, least, ground)
-
-
-def _arrivals(
-    source: Source, wanted: Callable[[int, int], bool], memo: ResultCache
-) -> Generator[tuple[float, Frame | LostFrame]]:
-    """The frames, each with when it came, or when its turn came, by the monotonic clock.
-
-    First those that a killed watch searched of a stream. A live source has a thread of its own, in which newer frames
-    take the place of older ones.
-    """
-    for kept in memo.kept_frames():
-        yield time.monotonic(), kept.frame
-    if isinstance(source, LiveSource):
-        yield from source.arrivals(wanted)
-    else:
-        with closing(read_ahead(source.frames(wanted), _AHEAD)) as frames:
-            for each in frames:
-                yield time.monotonic(), each
+    return places_of(setup, least, ground)
 
 
 def _wanted(source: Source, settings: WatchSettings) -> Callable[[int, int], bool]:
     """Which frames are searched: all photos, every N-th frame, or a number a second of flight.
 
-    Of a live source every frame is offered; when behind, old ones are dropped.
+    Of a live source those that the detector is too slow for wait until it has landed.
     """
     if settings.every is not None:
         step = settings.every
         return lambda index, _: index % step == 0
     if settings.frames_per_second is not None:
         return every(1 / settings.frames_per_second)
-    takes_all = source.kind == "photos" or isinstance(source, LiveSource)
-    return every(0.0 if takes_all else 1 / DEFAULT_FRAMES_PER_SECOND)
+    return every(0.0 if source.kind == "photos" else 1 / DEFAULT_FRAMES_PER_SECOND)

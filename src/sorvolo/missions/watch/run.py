@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import math
 import statistics
 import time
 from collections import Counter
@@ -16,9 +17,10 @@ from sorvolo.capture.sync import DATED_NS
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.scene import SceneMagnifier
 from sorvolo.detection.tiling import whole_m_per_px
-from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.geometry.arrays import ImageRGB, PointsM
 from sorvolo.geometry.coordinates import Coordinates, place_text
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
+from sorvolo.missions.flight.looked_at import LookedAt, ground_for, looked_at, searched_document
 from sorvolo.missions.flight.report import (
     camera_facts,
     peak_memory_mb,
@@ -29,10 +31,12 @@ from sorvolo.missions.flight.request import software
 from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.watch.alerts import interpreted_placeholder, interpreted_words
+from sorvolo.missions.watch.announced import Announced, SightingKey, sighting_key
 from sorvolo.missions.watch.files import SeenFrame, WatchFiles
 from sorvolo.missions.watch.notifier import Notifier
 from sorvolo.missions.watch.places import Places
 from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
+from sorvolo.search.looked_ground import near_ground
 from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.store.exports.detection_files import write_detections
 from sorvolo.store.exports.plain import json_bytes, utc_text
@@ -64,6 +68,7 @@ class WatchLog:
     found: Counter[str] = field(default_factory=Counter)  # detections by class
     placed: int = 0  # detections with a place on the ground
     latency_s: list[float] = field(default_factory=list)
+    asked: int = 0  # frames that were to be searched
     first_ns: int = -1
     last_ns: int = -1
     wall_s: dict[str, float] = field(default_factory=dict)
@@ -86,6 +91,17 @@ class WatchLog:
         self.placed += placed
         self.first_ns = time_ns if self.first_ns < 0 else self.first_ns
         self.last_ns = time_ns
+
+    def again(self) -> "WatchLog":
+        """The log of the same flight, which is searched again from its first frame."""
+        return WatchLog(
+            self.read,
+            lost=self.lost,
+            latency_s=self.latency_s,
+            asked=self.asked,
+            wall_s=self.wall_s,
+            started_s=self.started_s,
+        )
 
     @property
     def seconds(self) -> float:
@@ -151,11 +167,12 @@ class WatchUpdate:
 
     `detections` are all of the frame's; `sightings` those that have a place; `new` the tracks that this frame
     confirmed, `tracks` all confirmed ones that it saw. `counts` are the objects so far, by class. `latency_s` is from
-    a live frame's arrival to this update, and of a recorded one how long it took. `frames_expected` is 0 for a live
-    source. `size_px` is the frame's width and height, `clip_ns` its time after the source's first frame, `view` what
+    a live frame's arrival to this update, and of a recorded one how long it took. `frames_asked` were to be searched so
+    far; `frames_expected` is 0 for a live source. `size_px` is the frame's width and height, `clip_ns` its time after the source's first frame, `view` what
     ground it shows by telemetry. Places are metres of `site`; where it is local, pixels of the first frame of their
     `segment`, which counts from 1.
-    `is_resumed`: a watch that was killed had searched the frame.
+    `is_resumed`: a watch that was killed had searched the frame. `has_landed`: a live flight has ended, and the frames
+    that were left are searched.
     """
 
     frame_name: str
@@ -168,6 +185,7 @@ class WatchUpdate:
     latency_s: float
     frames_read: int
     frames_detected: int
+    frames_asked: int
     frames_expected: int
     seconds: float
     folder: Path
@@ -177,6 +195,7 @@ class WatchUpdate:
     clip_ns: int
     view: FrameView | None
     is_resumed: bool
+    has_landed: bool
 
 
 def utc_ns(setup: FlightSetup, frame_ns: int) -> int:
@@ -214,6 +233,13 @@ class WatchRun:
             info.name: count for info, count in detector.others
         }  # at another flight's pictures
         self.log = WatchLog()
+        self.has_landed = False
+        """Whether the frames that come are those that were left while the flight was live."""
+        self._ground = (
+            None if places.site.is_local else ground_for(places.site, detector.info, self._classes)
+        )
+        self._announced: Announced | None = None  # once the flight is searched again
+        self._seen: dict[SightingKey, int] = {}  # by which track, while live
         self._stack = ExitStack()
         self._files = self._stack.enter_context(WatchFiles(folder, outputs, places.site))
         self._notifier = Notifier(
@@ -295,34 +321,88 @@ class WatchRun:
             if info.name not in self._others and count > self._looks_before.get(info.name, 0)
         )
 
+    def search_again(self, places: Places, memo: ResultCache) -> None:
+        """From here on the flight's frames come once more, from the first one, with those that were left out.
+
+        `places` are the flight's, without anything in them yet; `memo` has what was found so far. Objects keep the ids
+        under which they were announced.
+        """
+        self._announced = Announced(
+            self._places.follower.tracks(), self._seen, by_place=not places.site.is_local
+        )
+        self._places, self._memo, self._early = places, memo, None
+        self._files.close()
+        self._files = self._stack.enter_context(
+            WatchFiles(self._folder, self._outputs, places.site)
+        )
+        self.log = self.log.again()
+
+    def forget_ground(self) -> None:
+        """Count pictures alone: what ground the flight would have shown is not known."""
+        self._ground = None
+
+    def show(self, frame: Frame) -> PointsM | None:
+        """A frame shows ground, whether or not it is searched: (4, 2) site metres; None where that is not known."""
+        view = None if self._ground is None else self._places.view(frame)
+        if view is None or self._ground is None:
+            return None
+        outline_m = near_ground(view.outline_m, view.site_from_camera.translation_m)
+        self._ground.show(outline_m)
+        return outline_m
+
+    def new_share(self, outline_m: PointsM) -> float:
+        """The share, 0 to 1, of this ground that no frame was searched for."""
+        return 1.0 if self._ground is None else self._ground.new_share(outline_m)
+
+    def _look(self, frame: Frame) -> None:
+        """Note the ground of a frame that was searched."""
+        outline_m = self.show(frame)
+        if outline_m is not None and self._ground is not None:
+            m_per_px = self._places.m_per_px(frame)
+            self._ground.look(outline_m, math.inf if m_per_px is None else m_per_px, self._classes)
+
+    def looked_at(self) -> LookedAt:
+        """How much of what the flight showed was looked at so far."""
+        seen = max(self.log.asked, self.log.detected + self.log.lost.total())
+        return looked_at(self._ground, self.log.detected, seen, self._settings.enough_looked_at)
+
     def lose(self, lost: LostFrame) -> None:
         """A frame that cannot be used."""
-        self.log.read = lost.index + 1
+        self.log.read = max(self.log.read, lost.index + 1)
         self.log.lost[lost.reason] += 1
 
     def add(self, frame: Frame, arrived_s: float) -> WatchUpdate:
         """Search one frame, whose turn came at `arrived_s` of the monotonic clock, and take in what it shows."""
         log, memo, source = self.log, self._memo, self._setup.source
-        log.read = frame.index + 1
+        log.read = max(log.read, frame.index + 1)
         is_resumed = memo.has_ended(frame.index)
         with log.stage("detect"):
             found = self._found(frame, arrived_s)
         # a stream's pictures are not there any more, so where its detections lie is kept as well
-        located = memo.known(frame.index, "located", Located) if memo.is_of_stream else None
+        is_gone = memo.is_of_stream and not frame.image.size
+        located = memo.known(frame.index, "located", Located) if is_gone else None
         time_ns = utc_ns(self._setup, frame.time_ns) if located is None else located.time_ns
         with log.stage("track"):
             taken = self._places.take(frame, time_ns, found, located)
+        self._look(frame)
         if not is_resumed:
             if memo.is_of_stream:
                 memo.keep(frame, "located", taken.located)
             memo.end_frame(frame, keeps_picture=False)
         sighted = [each for each in taken.sightings if each is not None]
-        known = self._places.follower.tracks()
+        known: Sequence[Track] = self._places.follower.tracks()
+        left = list[Track]()
+        if self._announced is not None:
+            taken, known = self._announced.see(taken, known)
+            left = self._announced.left()
+        elif memo.is_of_stream:
+            ids = zip(taken.sightings, taken.track_ids)
+            self._seen |= {sighting_key(each): own for each, own in ids if each is not None}
         confirmed = [track for track in known if track.confirmed]
         seen_ids = set(taken.track_ids)
         seen = [track for track in confirmed if track.id in seen_ids]
         new = [track for track in confirmed if track.id in taken.new_ids]
-        counts = count_by_class(confirmed)
+        counts = count_by_class([*confirmed, *left])
         log.searched(time_ns, found, 0 if self._places.site.is_local else len(sighted))
         with log.stage("hand over"):
             files, notifier = self._files, self._notifier
@@ -344,9 +424,9 @@ class WatchRun:
             files.keep_crops_of(known)
             notifier.report(new, seen, files.crop_names, files.segments)
             notifier.withdraw(taken.merged)
-            files.show(confirmed)
+            files.show([*confirmed, *left])
         latency_s = time.monotonic() - arrived_s
-        if not is_resumed:
+        if not (is_resumed or self.has_landed):
             log.latency_s.append(latency_s)
         return WatchUpdate(
             frame.name,
@@ -359,6 +439,7 @@ class WatchRun:
             latency_s,
             log.read,
             log.detected,
+            log.asked,
             source.frame_count,
             log.seconds,
             self._folder,
@@ -367,18 +448,29 @@ class WatchRun:
             frame.image.shape[1::-1],
             frame.time_ns - source.start_ns,
             self._places.view(frame),
-            is_resumed,
+            is_resumed and self._announced is None,
+            self.has_landed,
         )
 
-    def finish(self, *, ended: str, skipped: int) -> None:
+    def finish(self, *, ended: str) -> None:
         """The last word on every track, the files for other programs, and the report."""
         with self.log.stage("finish"):
             known = {track.id for track in self._places.follower.tracks() if track.confirmed}
             tracks = [track for track in self._places.follower.finish() if track.confirmed]
+            late_ids = {track.id for track in tracks} - known
+            if self._announced is not None:
+                late_ids = {
+                    each.id
+                    for each in self._announced.named(
+                        each for each in tracks if each.id in late_ids
+                    )
+                }
+                tracks = self._announced.named(tracks)
+                self._notifier.withdraw(each.id for each in self._announced.left())
             for track in tracks:
                 self._files.crop_of(track)
             self._files.close()
-            late = [track for track in tracks if track.id not in known]
+            late = [track for track in tracks if track.id in late_ids]
             self._notifier.report(late, [], self._files.crop_names, self._files.segments)
             self._notifier.report_final(tracks)
             self._notifier.close(_LAST_ALERTS_S, _LAST_EVENTS_S)
@@ -387,16 +479,18 @@ class WatchRun:
             write_detections(self._folder, site)
             rows = self._files.write_tracks(tracks)
         self.log.wall_s["write, beside the rest"] = self._files.seconds
-        report = self._report(tracks, ended, skipped)
+        report = self._report(tracks, ended)
         crops = {
             track_id: (self._folder / name).read_bytes() for track_id, name in crop_names.items()
         }
+        for name, data in searched_document(self._ground, self._places.site).items():
+            atomic_write_bytes(self._folder / name, data)
         atomic_write_bytes(self._folder / "report.json", json_bytes(report))
         page = watch_page(report, rows, crops, self._places.follower.path_m())
         atomic_write_bytes(self._folder / "report.html", page.encode())
         self._memo.end(None)
 
-    def _report(self, tracks: Sequence[Track], ended: str, skipped: int) -> dict[str, Any]:
+    def _report(self, tracks: Sequence[Track], ended: str) -> dict[str, Any]:
         """Return report.json; its keys are specified in docs/formats.md. Numbers that are not known are None."""
         setup, log, detector, outputs = self._setup, self.log, self._detector, self._outputs
         total, seconds, is_local = sum(log.found.values()), log.seconds, self._places.site.is_local
@@ -404,7 +498,8 @@ class WatchRun:
         telemetry = telemetry_facts(setup)
         if is_local:  # how a map finds the ground's height is of no use then
             telemetry["height"] = telemetry["height"].split(",")[0]
-        lost = sum(log.lost.values())
+        lost, looked = log.lost.total(), self.looked_at()
+        counts = count_by_class(tracks)
         notices = [
             *self._places.notices(),
             *detector.notices,
@@ -419,19 +514,25 @@ class WatchRun:
             reasons = "; ".join(f"{count} x {reason}" for reason, count in log.lost.most_common(5))
             text = f"{counted(lost, 'frame')} could not be used: {reasons}"
             notices.append(Notice("lost_frames", lost, text))
+        gone = [] if self._announced is None else self._announced.left()
+        if gone:
+            text = f"{counted(len(gone), 'object')} announced while live: not confirmed by all frames, not counted"
+            notices.append(Notice("not_confirmed", len(gone), text))
         notices += self._notifier.notices()
         return {
             **report_head(setup, is_local=is_local),
             "first_frame": utc_text(log.first_ns) if log.first_ns >= 0 else None,
             "last_frame": utc_text(log.last_ns) if log.last_ns >= 0 else None,
             "ended": ended,
+            "headline": looked.headline(counts, self._classes),
             "looked_for": list(self._classes),
-            "objects": {"total": len(tracks), "by_class": count_by_class(tracks)},
+            "looked_at": looked.facts(),
+            "objects": {"total": len(tracks), "by_class": counts},
             "frames": {
                 "read": log.read,
                 "detected": log.detected,
                 "with_detections": log.with_detections,
-                "skipped": skipped,
+                "skipped": max(0, looked.seen - log.detected - lost),
                 "lost": lost,
                 "reasons": dict(log.lost.most_common()),
             },

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from sorvolo.errors import SettingsError
+from sorvolo.missions.flight.looked_at import ENOUGH_LOOKED_AT, check_enough
 from sorvolo.missions.flight.settings import check_offset
 from sorvolo.missions.watch import alerts
 from sorvolo.missions.watch.cot_sender import CotTls, cot_place
@@ -36,6 +37,7 @@ class WatchSettings:
     height_model: str = (
         ""  # a GeoTIFF of the ground's heights, in the same reference; empty: the ground is level
     )
+    enough_looked_at: float = ENOUGH_LOOKED_AT  # share of the ground, else the result is to check
 
     def __post_init__(self) -> None:
         if self.least_score is not None and not 0 <= self.least_score <= 1:
@@ -43,6 +45,7 @@ class WatchSettings:
         if isinstance(self.tiles, int) and not 64 <= self.tiles <= 16_384:
             raise SettingsError(f"tiles must be 64 to 16384 px wide, got {self.tiles}")
         self._check_frames()
+        check_enough(self.enough_looked_at)
         if self.height_model and self.ground_elevation_m is not None:
             raise SettingsError("give a height model or the ground's elevation, not both")
         check_offset(self.offset_s)

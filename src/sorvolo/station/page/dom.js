@@ -96,7 +96,7 @@ export function message(words, { kind = "note", todo = "", act = null } = {}) {
     act, el("button", { type: "button", class: "quiet", "aria-label": "Close message", on: { click: () => box.remove() } }, icon("close")));
   const shown = document.getElementById("messages");
   shown.append(box);
-  while (shown.children.length > 4) shown.firstElementChild.remove();
+  while (shown.children.length > 4) (shown.querySelector(".message:not(.person)") ?? shown.firstElementChild).remove(); // a person found stays
   if (kind === "note") setTimeout(() => box.remove(), 6000);
   return box;
 }

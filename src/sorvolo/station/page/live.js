@@ -33,6 +33,7 @@ class Live {
     on("run.progress", (data, event) => this.progressed(data, event));
     for (const type of ["run.finished", "run.failed", "run.stopped"]) on(type, (data, event) => this.ended(type, data, event));
     on("object.found", ({ feature }, event) => this.found("objects", watched(feature, event.run)));
+    on("person.found", ({ feature, is_local: local }, event) => this.person(feature, local, event.run));
     on("change.announced", ({ feature }) => this.found("changes", feature));
     on("change.withdrawn", ({ feature, id }) => screen.data.drop("changes", feature?.id ?? id));
     this.timer = setInterval(() => this.look(), STATUS_MS);
@@ -150,6 +151,18 @@ class Live {
     if (choices.get("sound")) beep();
   }
 
+  /** A person was found, by whatever mission: one banner a mission, which stays until it is closed. */
+  person(feature, local, run) {
+    const mission = this.of(run);
+    mission.people = (mission.people ?? 0) + 1;
+    mission.banner?.remove();
+    const many = mission.people > 1 ? `${mission.people} people found, the last: ` : "Person found: ";
+    const place = local || !feature.geometry ? "without a place on Earth" : words.place(middleOf(feature.geometry));
+    mission.banner = message(many + titleOf(feature), { kind: "alert person", todo: place,
+      act: local || !feature.geometry ? null : button("Show", () => this.screen.goTo(feature)) });
+    if (choices.get("sound")) beep();
+  }
+
   ended(type, data, event) {
     this.flown.delete(event.run);
     if (!this.flown.size) {
@@ -158,7 +171,7 @@ class Live {
     }
     this.show();
     if (type === "run.failed") message("The mission failed", { kind: "error", todo: data.error || data.headline || "See “Missions” for why." });
-    else if (data.state === "incomplete") message("The mission ended before its flight", { kind: "warning", todo: data.headline });
+    else if (data.state === "incomplete") message("Check this result before you use it", { kind: "warning", todo: data.headline });
     else message(data.headline || "The mission is done");
   }
 

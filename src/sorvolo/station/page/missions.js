@@ -158,11 +158,12 @@ class Missions {
 
   row(run) {
     const running = run.state === "running";
-    const { frames, frames_expected: expected } = run.progress ?? {};
+    const { frames, frames_expected: expected, searched, to_search: wanted, landed } = run.progress ?? {};
     return el("article", { class: `run ${run.state}` },
       el("header", {}, el("b", {}, KINDS[run.mission]?.[0] ?? run.mission), el("span", { class: "state" }, run.stop_asked && running ? "stopping" : run.state), el("span", { class: "soft" }, `${time(run.started_at)}${run.who ? `, ${run.who}` : ""}`)),
       run.input?.name || run.input?.stream || run.input?.stream_url ? el("p", { class: "soft" }, run.input.name ?? run.input.stream ?? run.input.stream_url) : null,
       running ? el("progress", { ...(expected ? { value: Math.min(frames, expected), max: expected } : {}), "aria-label": "Progress" }) : null,
+      running && wanted ? el("p", {}, `${landed ? "landed, searching the rest: " : ""}${searched} of ${wanted} pictures searched`) : null,
       running && frames ? el("p", {}, expected ? `frame ${frames} of ${expected}` : counted(frames, "frame")) : null,
       run.notice ? el("p", { class: "error", role: "status" }, run.notice) : null,
       run.headline ? el("p", {}, run.headline) : null,

@@ -47,6 +47,9 @@ DETECTIONS, TRACKS = "detections", "tracks"
 TRACKS_KML, TRACKS_GPX = "tracks.kml", "tracks.gpx"
 ANNOTATED_VIDEO, ANNOTATED_PICTURES, LABELS = "annotated.mp4", "annotated", "labels"
 
+SEARCHED = "searched.geojson"
+"""The outlines of the flown ground by what became of it: looked at, too coarse, skipped."""
+
 JOURNAL, REPORT = "run.journal", "report.json"
 """How far a watch is, until it is complete; what it found."""
 
@@ -69,6 +72,7 @@ _OURS = (
     LABELS,
     REPORT,
     "report.html",
+    SEARCHED,
 )
 _MADE_BY = "sorvolo watch"
 _OF_FIRST_PICTURE = (

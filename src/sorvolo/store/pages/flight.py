@@ -35,7 +35,6 @@ from sorvolo.store.pages.words import (
 )
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import Status
-from sorvolo.survey.wording import counted_list
 
 _TRACK_NUMBERS = (
     "east_m",
@@ -532,15 +531,9 @@ def objects_section(
 
 
 def _words(search: Mapping[str, Any]) -> str:
-    counts = at(search, "classes") or {}
-    if not any(counts.values()):
-        return f"No {' and no '.join(map(str, at(search, 'looked_for') or ['object']))} was found."
     moving = int(number_at(search, "moving") or 0)
-    return (
-        f"Objects found: {counted_list(counts)}"
-        + (f"; {moving} of them moved" if moving else "")
-        + "."
-    )
+    moved = f"; {moving} of them moved" if moving else ""
+    return f"{known(at(search, 'headline', 'text'))}{moved}."
 
 
 def _how(search: Mapping[str, Any], is_local: bool) -> str:

@@ -25,7 +25,6 @@ from sorvolo.store.pages.words import (
     seconds_words,
     with_unit,
 )
-from sorvolo.survey.wording import counted_list, most_first
 
 _WIDE_PX, _HIGH_PX, _RIM_PX = 940.0, 560.0, 36.0
 _LETTER_PX, _LINE_PX = 7.5, 12.0  # of the map's labels
@@ -59,8 +58,7 @@ def watch_page(
         flight=known(report.get("flight")),
         first=_when(report.get("first_frame")),
         last=_when(report.get("last_frame")),
-        counts=counted_list(most_first(str(each["class"]) for each in tracks)),
-        frames=known(at(report, "frames", "detected")),
+        headline=known(at(report, "headline", "text")),
         looked_for=", ".join(map(str, report.get("looked_for") or ["objects"])),
         warning_lines=report.get("warnings") or [],
         maps=_maps(report, tracks, drone_m),
@@ -275,7 +273,7 @@ def _course(report: Mapping[str, Any]) -> list[tuple[str, str]]:
         (
             "frames",
             f"{known(frames.get('detected'))} searched of {known(frames.get('read'))} read, "
-            f"{known(frames.get('skipped'))} skipped to keep up, {known(frames.get('lost'))} unusable",
+            f"{known(frames.get('skipped'))} left, {known(frames.get('lost'))} unusable",
         ),
         ("detections", _detections(report)),
         (
