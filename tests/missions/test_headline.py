@@ -1,6 +1,7 @@
 """The first line of a mapped flight: no map, a map to check, or a map; the exit code agrees."""
 
 import json
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,12 +11,14 @@ import pytest
 from PIL import Image
 
 from sorvolo.cli.main import main
+from sorvolo.errors import InputError
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import site_from_image_homography
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
 from sorvolo.lab.simulation.flight_files import video_writer
 from sorvolo.missions.flight.headline import MapQuality, _angle_warnings, map_headline, unlevelled
+from sorvolo.missions.map.flights import _refuse_view_aside
 from sorvolo.mosaic.consistency import Consistency
 from sorvolo.mosaic.flight_figures import flight_figures
 from sorvolo.mosaic.graph_report import GraphReport
@@ -203,3 +206,10 @@ def test_angles_that_nobody_stated_are_not_called_stated(has_angles: bool, words
         [placed(10.0 * k) for k in range(8)], report, has_angles=has_angles
     )
     assert warning.startswith(words)
+
+
+@pytest.mark.parametrize("tilt_deg", [20.0, 50.0])
+def test_an_orbit_whose_pictures_do_not_fit_is_given_up_after_a_few(tilt_deg: float) -> None:
+    setup = SimpleNamespace(source=SimpleNamespace(name="orbit"), usual_tilt_deg=tilt_deg)
+    with nullcontext() if tilt_deg < 35 else pytest.raises(InputError, match="first 8 pictures 1"):
+        _refuse_view_aside(setup, 1)  # type: ignore[arg-type]

@@ -258,3 +258,16 @@ def test_large_pictures_are_registered_small_and_residuals_are_of_the_full_size(
     assert all(
         value == pytest.approx(4 * small[k]) for k, value in mapper.residuals_px(camera).items()
     )
+
+
+def test_pictures_that_fit_nothing_cost_no_more_and_no_more():
+    """Eleven pictures of other things each: after the first ones hardly any is asked the dear way."""
+    rng = np.random.default_rng(3)
+    mapper, dear = PlanarMapper(PoseGraphSettings()), []
+    for k, pose in enumerate(flown(3)[:11]):
+        noise = cv2.GaussianBlur(rng.integers(0, 255, (120, 160, 3), np.uint8), (0, 0), 2.0)
+        found = mapper.register(k, CAMERA.resized(160, 120), noise, measured(pose, rng))
+        mapper.place(found)
+        dear.append(found.dear[0])
+    assert found.dear[1] == 0 and max(dear) > 4, dear
+    assert dear[-1] <= 2, dear

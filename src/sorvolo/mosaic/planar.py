@@ -179,6 +179,10 @@ _SPATIAL = 2  # further ones under the predicted view: they close loops between 
 _WANTED_LINKS = 4  # with fewer, pictures that refused are asked again with SIFT
 _LEAST_OVERLAP = 0.2  # of a view, for a spatial neighbour
 _RECOVERY = 30  # keyframes tried for a frame that is lost and has no GPS
+# Pictures that show no plane, such as an orbit's, would be asked the dear way over and over. By choice:
+_DEAR_TRIALS = 40  # dear fits of a flight after which it is known whether they are worth it
+_DEAR_WORTH = 0.1  # share of them that link, below which they are not
+_DEAR_BOUND = 2  # so many of them a frame are enough then
 
 
 @dataclass(frozen=True)
@@ -218,7 +222,8 @@ class Registered:
     """A keyframe and what ties it to the others, before it is one of them: all that placing it needs.
 
     `guess` is where it stands by that, None nowhere; `reason` is what failed. `met` are the keyframes of the known map
-    that were tried, in the order in which they were first met.
+    that were tried, in the order in which they were first met. `dear` are how many fits were tried the dear way, and
+    how many of these linked.
     """
 
     keyframe: Keyframe
@@ -227,6 +232,7 @@ class Registered:
     guess: Pose | None
     reason: str
     met: tuple[int, ...]
+    dear: tuple[int, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,6 +253,7 @@ class _Tie:
     guess: Pose | None
     links: list[Link] = field(default_factory=list)
     refusals: dict[int, _Refusal] = field(default_factory=dict)
+    dear: tuple[int, int] = (0, 0)  # asked the dear way, and linked by that
 
     @property
     def refusal_reason(self) -> str:
@@ -284,6 +291,7 @@ class PlanarMapper:
         ).reshape(-1, 3)
         self._colours = LinkedColours(settings.exposure.points_per_link, shelf)
         self._failures: dict[int, str] = {}
+        self._dear = 0, 0  # fits of the flight that were asked the dear way, and those that linked
         self._met: list[int] = []  # of the known map, in the order in which they were loaded
 
     def add(self, keyframe_id: int, camera: Camera, image: ImageRGB, prior: CameraPrior) -> Outcome:
@@ -301,9 +309,15 @@ class PlanarMapper:
         """Tie an undistorted picture to the map as it is; `place` is what adds it."""
         keyframe = self._keyframe(keyframe_id, camera, image, prior)
         before = len(self._met)
-        links, guess, reason = self._tie(keyframe)
+        tie, reason = self._tie(keyframe)
         return Registered(
-            keyframe, _thumbnail(image), tuple(links), guess, reason, tuple(self._met[before:])
+            keyframe,
+            _thumbnail(image),
+            tuple(tie.links),
+            tie.guess,
+            reason,
+            tuple(self._met[before:]),
+            tie.dear,
         )
 
     def can_place(self, new: Registered) -> bool:
@@ -319,6 +333,7 @@ class PlanarMapper:
         """Add a registered picture to the map."""
         for known in new.met:
             self._picture(known)
+        self._dear = self._dear[0] + new.dear[0], self._dear[1] + new.dear[1]
         keyframe = new.keyframe
         if new.guess is None:
             self._failures[keyframe.id] = new.reason
@@ -494,7 +509,7 @@ class PlanarMapper:
             keyframe_id, camera, gray, orb_features(gray, self._settings.links.features), prior
         )
 
-    def _tie(self, new: Keyframe) -> tuple[list[Link], Pose | None, str]:
+    def _tie(self, new: Keyframe) -> tuple[_Tie, str]:
         """The links of a new keyframe, where it stands by them or by telemetry, and what failed.
 
         All candidates are tried the cheap way first. Only where few of them link are those that refused tried
@@ -514,18 +529,20 @@ class PlanarMapper:
             # Ask the last pictures and some of all the flight until one links: nobody knows where
             # the new one is.
             for each in [*self._own[::-1][1:10], *self._own[:: max(1, len(self._own) // 20)]]:
-                if each not in tie.refusals and len(tie.refusals) < _RECOVERY and not tie.links:
+                if (
+                    each not in tie.refusals
+                    and len(tie.refusals) < _RECOVERY
+                    and not tie.links
+                    and self._is_worth(tie)
+                ):
                     self._ask(tie, each, None, Effort.ALL)
         if not self._own and tie.guess is None:
             tie.guess = Pose(new.prior.rotation, new.prior.position_m)
         reason = tie.refusal_reason
         if not tie.links and self._own and not new.prior.knows_place:
-            return (
-                [],
-                None,
-                f"no picture of the map fits it ({reason}) and telemetry reports no position",
-            )
-        return tie.links, tie.guess, reason
+            tie.guess = None
+            reason = f"no picture of the map fits it ({reason}) and telemetry reports no position"
+        return tie, reason
 
     def _ask(
         self, tie: _Tie, other: int, prediction: LinkPrediction | None, effort: Effort
@@ -534,6 +551,8 @@ class PlanarMapper:
         found = link(
             tie.new, self._picture(other), prediction, self._settings.links, self._cache, effort
         )
+        if effort is not Effort.CHEAP:
+            tie.dear = tie.dear[0] + 1, tie.dear[1] + isinstance(found, Link)
         if isinstance(found, NoLink):
             tie.refusals[other] = _Refusal(found.reason, prediction)
             return
@@ -558,12 +577,21 @@ class PlanarMapper:
 
     def _ask_dearly(self, tie: _Tie) -> None:
         for other, refusal in list(tie.refusals.items()):
+            if not self._is_worth(tie):
+                return
             self._ask(tie, other, refusal.prediction, Effort.DEAR)
             if not tie.links and other in tie.refusals and refusal.prediction is not None:
                 # telemetry may be plainly wrong (pictures turned by half a turn, a compass that hangs): ask them alone
                 self._ask(tie, other, None, Effort.ALL)
             if len(tie.links) >= _WANTED_LINKS:
                 return
+
+    def _is_worth(self, tie: _Tie) -> bool:
+        """Whether one more dear fit is: always, unless hardly any of the flight's linked so far and this frame had its
+        share of them."""
+        tried, linked = self._dear
+        seldom = tried >= _DEAR_TRIALS and linked < _DEAR_WORTH * tried
+        return not seldom or tie.dear[0] < _DEAR_BOUND
 
     def _guess_by_telemetry(self, new: Keyframe) -> Pose | None:
         prior = new.prior

@@ -4,11 +4,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from sorvolo.capture.flight_telemetry import (
     FlightTelemetry,
     TelemetryWishes,
     distance_m,
     duration_s,
+    frame_times_s,
     local_prior,
 )
 from sorvolo.capture.source import LiveSource, Source
@@ -68,6 +71,16 @@ class FlightSetup:
     def usual_height_m(self) -> float:
         """The median of the camera's height above the ground; NaN where telemetry does not give it."""
         return float("nan") if self.telemetry is None else self.telemetry.median_height_m
+
+    @property
+    def usual_tilt_deg(self) -> float:
+        """How far the camera looks from straight down, the median frame by its stated angles; 0 without any."""
+        if self.telemetry is None or self.telemetry.track.attitude == "none":
+            return 0.0
+        seconds = frame_times_s(self.source)
+        some = seconds[:: 1 + len(seconds) // 200].tolist()
+        up = [-each.rotation[2, 2] for each in self.telemetry.priors(some, 0.0, self.plan.smooth_s)]
+        return float(np.degrees(np.arccos(np.clip(np.median(up), -1, 1)))) if up else 0.0
 
     def prior(self, frame: Frame, *, first: bool) -> CameraPrior:
         """What telemetry gives of a frame's camera; without telemetry, only that it looks down."""

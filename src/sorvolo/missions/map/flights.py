@@ -15,11 +15,12 @@ from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.source import LiveSource, Source, opened_sources
 from sorvolo.capture.video import VideoSource
 from sorvolo.capture.video_spans import SparseReading
-from sorvolo.errors import SettingsError
+from sorvolo.errors import InputError, SettingsError
 from sorvolo.missions.flight.base_map import open_base
 from sorvolo.missions.flight.control import open_control
 from sorvolo.missions.flight.detector_protocol import FindsObjects, ObjectDetector, as_detector
 from sorvolo.missions.flight.disk import LiveRoom, check_room
+from sorvolo.missions.flight.headline import OBLIQUE_DEG
 from sorvolo.missions.flight.map_objects import ObjectFinder, open_detector
 from sorvolo.missions.flight.opened import OpenedFlight, opened_flights
 from sorvolo.missions.flight.request import AlreadyDone
@@ -58,6 +59,7 @@ if TYPE_CHECKING:  # `map` alone has no use for what plants and searches
     from sorvolo.missions.search.while_flying import SearchWhileFlying
 
 _AHEAD = 2  # decoded frames that wait to be placed
+_FEW = 8  # selected frames after which a recorded flight is given up that cannot become a map; by choice
 
 
 def map_flights(
@@ -199,6 +201,8 @@ def _map_one(
         for selected in itertools.chain(_kept(memo), _selected(setup, settings, area)):
             frame = selected if isinstance(selected, LostFrame) else selected.posed.frame
             status, reason, painted = run.take(selected)
+            if run.selected == _FEW and run.by_vision <= _FEW // 4 and method is None:
+                _refuse_view_aside(setup, run.by_vision)
             room.look(run.selected)
             coverage.show(run.pictures_on_ground)
             if search is not None and status is not Status.REJECTED:
@@ -222,6 +226,17 @@ def _map_one(
         if search is not None:
             search.land()
         run.finish(source.notices(), started_s)
+
+
+def _refuse_view_aside(setup: FlightSetup, matched: int) -> None:
+    """Raise InputError for a recorded flight that looks to the side all along and whose pictures do not fit."""
+    tilt_deg = 0.0 if isinstance(setup.source, LiveSource) else setup.usual_tilt_deg
+    if tilt_deg > OBLIQUE_DEG:
+        raise InputError(
+            f"{setup.source.name}: the camera looks {tilt_deg:.0f} deg away from straight down (an orbit?), and of the "
+            f"first {_FEW} pictures {matched} fit: this makes no map; fly strips with the camera straight down, or give "
+            "the photos that look down"
+        )
 
 
 def _kept(memo: ResultCache) -> Iterator[Selected | LostFrame]:
