@@ -76,9 +76,9 @@ def test_a_folder_of_videos_is_as_many_flights(tmp_path: Path) -> None:
 
 
 def test_equal_names_get_their_folder_before_them(tmp_path: Path) -> None:
-    for card in ("card1", "card2"):
+    for seed, card in enumerate(("card1", "card2")):
         (tmp_path / card).mkdir()
-        write_video(tmp_path / card / "DJI_0001.mp4")
+        write_video(tmp_path / card / "DJI_0001.mp4", seed)
     found = open_sources([tmp_path / "card1" / "DJI_0001.mp4", tmp_path / "card2" / "DJI_0001.mp4"])
     assert [source.name for source in found] == ["card1_DJI_0001", "card2_DJI_0001"]
 

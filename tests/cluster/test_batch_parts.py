@@ -37,7 +37,7 @@ def test_flights_are_videos_and_folders_of_photos_however_deep(tmp_path: Path) -
         tmp_path / "site" / "site.db",
         tmp_path / "site" / "flights" / "k" / "v.mp4",
         tmp_path / "maps" / "x" / "y.mp4",
-        tmp_path / "a" / "GL01.LRV",
+        tmp_path / "a" / "DJI_1.LRV",
     )
     (tmp_path / "e").symlink_to(tmp_path / "a")
     found = find_flights([tmp_path, tmp_path / "b"], tmp_path / "maps")

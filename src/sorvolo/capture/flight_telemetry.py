@@ -15,6 +15,8 @@ from sorvolo.capture.sync import (
     tie_clocks,
     track_from_telemetry,
 )
+from sorvolo.capture.video import VideoSource
+from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, PointsM
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import LocalFrame
@@ -204,6 +206,9 @@ def tied_clock(source: Source, samples: Telemetry, offset_s: float | None = None
             source.start_ns,
             is_per_photo=is_per_photo,
         )
+    doubt = source.start_doubt if isinstance(source, VideoSource) else ""
+    if doubt and offset_s is None and not (samples.video_time_ns >= 0).all():
+        raise InputError(doubt)
     return tie_clocks(
         samples,
         frame_times_s(source),

@@ -30,6 +30,7 @@ from sorvolo.capture.live.stream import LiveStream, open_stream
 from sorvolo.capture.photo_metadata import PhotoMetadata
 from sorvolo.capture.photo_positions import is_position_file
 from sorvolo.capture.photos import Album, PhotoSource, read_album
+from sorvolo.capture.recordings import ChapteredVideo, Recording, recordings
 from sorvolo.capture.telemetry import (
     find_telemetry_beside,
     is_telemetry,
@@ -136,7 +137,7 @@ def open_sources(
     addresses = [live_address(text) for text in map(str, inputs) if is_live_address(text)]
     videos, albums = _sort_inputs(_recorded(inputs))
     names = _distinct_names(
-        [*(path.resolve() for path in videos), *(album.place for album in albums)]
+        [*(each.chapters[0].resolve() for each in videos), *(album.place for album in albums)]
     )
     # Raises InputError where telemetry was given for more than one flight.
     flights = len(names) + len(addresses)
@@ -147,7 +148,7 @@ def open_sources(
         )
     log = _telemetry_file(telemetry, is_live=bool(addresses))
     sources: list[VideoSource | PhotoSource | LiveSource] = [
-        *(_open_video(path, name, log, camera) for path, name in zip(videos, names)),
+        *(_open_recording(each, name, log, camera) for each, name in zip(videos, names)),
         *(
             _open_photos(album, name, log, camera)
             for album, name in zip(albums, names[len(videos) :])
@@ -209,22 +210,24 @@ class _AlbumInput:
     others: Sequence[Path] = ()
 
 
-def _sort_inputs(inputs: Sequence[Path]) -> tuple[list[Path], list[_AlbumInput]]:
-    """The videos and the albums among the inputs."""
+def _sort_inputs(inputs: Sequence[Path]) -> tuple[list[Recording], list[_AlbumInput]]:
+    """The recordings and the albums among the inputs."""
+    found: list[Recording] = []
     videos: list[Path] = []
     albums: list[_AlbumInput] = []
     single: list[Path] = []
     for path in dict.fromkeys(inputs):
         if path.is_dir():
             films, album = _flights_in(path)
-            videos += films
+            found += recordings(films)
             albums += album
         else:
             (single if path.suffix.lower() in PHOTO_SUFFIXES else videos).append(path)
+    found += recordings(videos, with_siblings=True)
     if single:
         place = single[0].resolve() if len(single) == 1 else single[0].resolve().parent
         albums.append(_AlbumInput(place, single))
-    return videos, albums
+    return found, albums
 
 
 def _flights_in(folder: Path) -> tuple[list[Path], list[_AlbumInput]]:
@@ -302,6 +305,19 @@ def _free_name(name: str, fingerprint: str, taken: Mapping[str, str]) -> str:
     """The name, or the name and a number where another flight has it."""
     candidates = [name, *(f"{name}-{number}" for number in range(2, len(taken) + 3))]
     return next(each for each in candidates if taken.get(each, fingerprint) == fingerprint)
+
+
+def _open_recording(
+    recording: Recording, name: str, telemetry: Path | None, camera: Path | str | None
+) -> VideoSource:
+    opened = [_open_video(path, name, telemetry, camera) for path in recording.chapters]
+    source = first = opened[0]
+    first.note(*recording.notices)
+    if len(opened) > 1:
+        source = ChapteredVideo(name, opened, has_own_logs=telemetry is None)
+        source.ground_elevation_m = first.ground_elevation_m
+    source.start_doubt = recording.start_doubt
+    return source
 
 
 def _open_video(

@@ -50,6 +50,7 @@ VIDEO_SUFFIXES = frozenset(
         ".265",
         ".hevc",
         ".lrv",
+        ".lrf",
         ".insv",
         ".ogv",
     }
@@ -99,6 +100,8 @@ class VideoSource:
 
     kind = "video"
     ground_elevation_m = float("nan")
+    start_doubt = ""
+    """Why `start_ns` is not when the first frame was taken; "" where nothing speaks against it."""
 
     def __init__(
         self,
@@ -112,12 +115,17 @@ class VideoSource:
         self.name, self.fingerprint, self.info = name, fingerprint, info
         self.camera, self.telemetry = camera, telemetry
         self.inputs: tuple[str, ...] = (info.path.name,)
+        self.files: tuple[Path, ...] = (info.path,)
         self.frame_count, self.frame_rate_hz = info.frame_count, info.frame_rate_hz
         self.start_ns, self.start_origin = info.start_ns, info.start_origin
         self._notices = tuple(notices)
         self._found: tuple[Notice, ...] = tuple(_cut_notice(info.is_cut))
         self.reading = Reading()
         """How the frames were read; complete when `frames` is exhausted."""
+
+    def note(self, *notices: Notice) -> None:
+        """Add what was found before the video was opened."""
+        self._notices = (*notices, *self._notices)
 
     def notices(self) -> tuple[Notice, ...]:
         """What was found so far; complete when `frames` is exhausted."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sorvolo.capture.decoding import PHOTO_SUFFIXES
+from sorvolo.capture.recordings import recordings
 from sorvolo.capture.source import safe_name
 from sorvolo.capture.video import VIDEO_SUFFIXES
 from sorvolo.errors import InputError, StoreError
@@ -18,7 +19,6 @@ from sorvolo.store.site.catalogue_place import is_site
 from sorvolo.survey.wording import counted
 
 _PHOTOS = PHOTO_SUFFIXES - {".png"}  # of a camera: PNGs are masks, screenshots, maps
-_VIDEOS = VIDEO_SUFFIXES - {".lrv"}  # the small copy of a video beside it
 _NEAR_M = 50.0  # from a site's ground: a drone sees no less than half of that beside its track
 
 Box = tuple[float, float, float, float]
@@ -50,11 +50,12 @@ def find_flights(places: Sequence[Path], root: Path) -> list[FlightFiles]:
             continue
         for folder, paths in _folders(place.resolve(), root.resolve()):
             files += len(paths)
-            videos = [path for path in paths if path.suffix.lower() in _VIDEOS]
+            videos = [path for path in paths if path.suffix.lower() in VIDEO_SUFFIXES]
             photos = [path for path in paths if path.suffix.lower() in _PHOTOS]
             beside = sorted({*paths} - {*videos, *photos})  # a video's telemetry may be here
-            for path in videos:
-                found[path] = FlightFiles(path, _stamp([path, *beside]))
+            for each in recordings(videos):
+                path = each.chapters[0]
+                found[path] = FlightFiles(path, _stamp([*each.chapters, *beside]))
             if photos:
                 few = f"a single photo ({photos[0].name}): a flight needs 2 or more"
                 found[folder] = FlightFiles(folder, _stamp(photos), few if not photos[1:] else "")

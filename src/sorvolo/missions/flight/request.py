@@ -114,4 +114,4 @@ def _files(setup: FlightSetup) -> list[Path]:
         found.append(ground.file.path if isinstance(ground, FlightControl) else ground.base.path)
     if isinstance(source, PhotoSource):
         return [*found, *(each.path for each in source.album.photos)]
-    return [*found, source.info.path] if isinstance(source, VideoSource) else found
+    return [*found, *source.files] if isinstance(source, VideoSource) else found
