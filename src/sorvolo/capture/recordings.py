@@ -250,13 +250,10 @@ class ChapteredVideo(VideoSource):
             first, count = self._first_frames[number], chapter.info.frame_count
             later_ns = self.start_ns + self._begins_ns[number] - chapter.start_ns
 
-            def shifted(
-                ask: Callable[[int, int], bool], first: int = first, later_ns: int = later_ns
-            ) -> Callable[[int, int], bool]:
-                return lambda index, time_ns: ask(first + index, time_ns + later_ns)
-
-            reading = None if sparse is None else replace(sparse, wanted=shifted(sparse.wanted))
-            for each in chapter.frames(shifted(wanted), reading):
+            reading = None
+            if sparse is not None:
+                reading = replace(sparse, wanted=_later(sparse.wanted, first, later_ns))
+            for each in chapter.frames(_later(wanted, first, later_ns), reading):
                 if each.index < count:  # more than its header states would be counted twice
                     index = first + each.index
                     yield replace(
@@ -279,6 +276,17 @@ class ChapteredVideo(VideoSource):
             )
             for frame in chapter.sample_frames(len(share))
         ]
+
+
+def _later(
+    ask: Callable[[int, int], bool], first: int, later_ns: int
+) -> Callable[[int, int], bool]:
+    """A question about a recording's frames as one about those of a chapter that begins later in it."""
+
+    def asked(index: int, time_ns: int) -> bool:
+        return ask(first + index, time_ns + later_ns)
+
+    return asked
 
 
 def _joined(parts: Sequence[Telemetry], begins_ns: Sequence[int]) -> Telemetry:
