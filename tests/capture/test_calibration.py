@@ -12,7 +12,7 @@ from PIL import Image
 
 from real_data import real_data
 from sorvolo.capture.calibration import camera_from_option, camera_xml, guess_camera, read_camera
-from sorvolo.capture.camera_presets import CAMERA_PRESETS, find_presets
+from sorvolo.capture.camera_presets import _SOLD_AS, CAMERA_PRESETS, find_presets
 from sorvolo.errors import InputError
 from sorvolo.geometry.camera import Camera
 
@@ -271,7 +271,15 @@ def test_any_text_is_read_or_refused(tmp_path_factory, text):
         read_camera(path, 1920, 1080)
 
 
-@pytest.mark.parametrize("model", ["FC300S", "FC300S\0\0\0", "DJI FC300S", "fc300s", "Phantom 3"])
+def test_full_names_of_drones_name_presets_that_there_are():
+    for sold, preset in _SOLD_AS.items():
+        assert find_presets(f"DJI {sold}") == find_presets(preset) != []
+
+
+@pytest.mark.parametrize(
+    "model",
+    ["FC300S", "FC300S\0\0\0", "DJI FC300S", "fc300s", "DJI Phantom 3 Advanced"],
+)
 def test_presets_are_found_however_they_are_written(model):
     found = guess_camera(4000, 3000, make="DJI\0\0", model=model)
     assert "Phantom 3" in found.origin

@@ -10,6 +10,8 @@ from real_data import real_data
 from sorvolo.capture.photos import PhotoSource
 from sorvolo.capture.source import open_sources, safe_name
 from sorvolo.errors import InputError
+from sorvolo.geometry.camera import Camera
+from sorvolo.lab.simulation.flight_files import write_camera
 from sorvolo.survey.flight import Frame
 
 av = pytest.importorskip("av")
@@ -140,6 +142,16 @@ def test_the_camera_fits_the_frames_as_delivered(tmp_path: Path) -> None:
     assert "GUESS" in lying.origin and lying.focal_sigma >= 0.1
     given = open_sources([tmp_path / "a.mp4"], camera="aov=60")[0].camera
     assert given.camera.angle_of_view_deg[0] == pytest.approx(60)
+
+
+def test_the_calibration_beside_a_flight_is_used_unless_another_is_named(tmp_path: Path) -> None:
+    video = write_video(tmp_path / "a.mp4")
+    (guessed,) = open_sources([video])
+    write_camera(tmp_path / "camera.xml", Camera.from_angle_of_view(96, 64, 47.0))
+    (own,) = open_sources([video])
+    (named,) = open_sources([video], camera="aov=60")
+    assert "camera.xml" in own.camera.origin and "camera.xml" not in guessed.camera.origin
+    assert named.camera.camera.fx_px < own.camera.camera.fx_px
 
 
 def test_what_is_missing_is_named(tmp_path: Path) -> None:

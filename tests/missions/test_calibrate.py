@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sorvolo.capture.calibration import read_camera
-from sorvolo.capture.checkerboard import Board, BoardView, NoBoard, find_board
+from sorvolo.capture.checkerboard import Board, BoardView, NoBoard, _rounded_down, find_board
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.pose import Pose, rotation_from_vector
@@ -186,3 +186,8 @@ def test_a_board_of_another_size_is_not_taken_for_this_one(rays):
 def test_a_board_that_is_none_is_refused(text):
     with pytest.raises(SettingsError):
         parse_board(text)
+
+
+def test_too_little_never_reads_as_enough():
+    assert _rounded_down(100 * 0.3999) == "39.9"
+    assert _rounded_down(9.97) == "9.9"

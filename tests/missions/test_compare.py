@@ -657,13 +657,17 @@ def test_ground_beside_the_map_extends_it(surveyed, tmp_path, monkeypatch):
     assert f"shown by {extension['frames']} frames" in page
 
 
-def test_the_command_prints_the_changes_as_json(flown, site, capsys):
+def test_the_command_prints_the_changes_as_json(flown, site, capsys, tmp_path):
     camera = str(flown / "camera.xml")
     flight = str(flown / "flight2")
-    options = ["--camera", camera, "--json", "--model", "none"]
+    masks = tmp_path / "masks"
+    options = ["--camera", camera, "--json", "--model", "none", "--masks", str(masks)]
     assert main(["compare", flight, "--site", str(site), *options]) == 0
     printed = json.loads(capsys.readouterr().out)["flights"][0]
     assert printed["flight"] == "flight2"
+    assert (
+        len(list((masks / "flight2").glob("*.png"))) == printed["comparison"]["views"]["compared"]
+    )
     assert len(printed["changes"]["features"]) == sum(printed["comparison"]["changes"].values()) > 0
     assert not set(printed["withdrawn"]) & {
         each["properties"]["id"] for each in printed["changes"]["features"]
@@ -671,7 +675,9 @@ def test_the_command_prints_the_changes_as_json(flown, site, capsys):
 
 
 @pytest.mark.long  # kills at each step, and going on after one, have tests of their own
-def test_killed_half_way_the_site_stays_whole_and_the_same_command_ends_well(compared, flown, site):
+def test_killed_half_way_the_site_stays_whole_and_the_same_command_ends_well(
+    compared, flown, site, tmp_path
+):
     command = [
         sys.executable,
         "-m",
@@ -683,6 +689,7 @@ def test_killed_half_way_the_site_stays_whole_and_the_same_command_ends_well(com
         "--camera",
         str(flown / "camera.xml"),
         "--masks",
+        str(tmp_path / "masks"),
         "--model",
         "none",
     ]

@@ -2,6 +2,7 @@
 
 import json
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,6 +18,7 @@ from sorvolo.geometry.homography import site_from_image_homography
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
 from sorvolo.lab.simulation.flight_files import video_writer
+from sorvolo.missions.compare.report import views_notices
 from sorvolo.missions.flight.headline import MapQuality, _angle_warnings, map_headline, unlevelled
 from sorvolo.missions.map.flights import _refuse_view_aside
 from sorvolo.mosaic.consistency import Consistency
@@ -213,3 +215,19 @@ def test_an_orbit_whose_pictures_do_not_fit_is_given_up_after_a_few(tilt_deg: fl
     setup = SimpleNamespace(source=SimpleNamespace(name="orbit"), usual_tilt_deg=tilt_deg)
     with nullcontext() if tilt_deg < 35 else pytest.raises(InputError, match="first 8 pictures 1"):
         _refuse_view_aside(setup, 1)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("apart_m", "views"), [(2.0, None), (9.0, None), (12.0, 1)])
+def test_too_few_views_for_the_votes_are_named(apart_m: float, views: int | None) -> None:
+    """Frames of 20 m: the middle of one is in its neighbours where these are less than 10 m apart."""
+    camera = Camera.from_angle_of_view(640, 480, 60)
+    square_m = np.array([[-10.0, 10], [10, 10], [10, -10], [-10, -10]])
+    placed = [
+        replace(
+            PlacedFrame.rejected(n, str(n), 0, "", camera),
+            outline_m=square_m + np.array([n * apart_m, 0]),
+        )
+        for n in range(20)
+    ]
+    found = views_notices(placed, votes=3)
+    assert [each.count for each in found] == ([] if views is None else [views])

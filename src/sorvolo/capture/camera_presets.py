@@ -126,18 +126,41 @@ CAMERA_PRESETS = (
 )
 
 
+_SOLD_AS = {
+    "Phantom 3 Advanced": "Phantom 3",
+    "Phantom 3 Professional": "Phantom 3",
+    "Phantom 3 Standard": "Phantom 3",
+    "Phantom 3 SE": "Phantom 3",
+    "Phantom 4 Advanced": "Phantom 4 Pro",
+    "Phantom 4 Pro V2.0": "Phantom 4 Pro",
+    "Inspire 1": "Zenmuse X3",
+    "Mavic Pro Platinum": "Mavic Pro",
+    "Mavic 3 Classic": "Mavic 3",
+    "Mavic 3 Cine": "Mavic 3",
+    "Mavic 3 Pro": "Mavic 3",
+    "Mavic 3 Enterprise": "M3E",
+    "Mavic 3 Thermal": "M3T",
+    "Mavic 3 Multispectral": "M3M",
+    "Matrice 30T": "M30T",
+    "Matrice 4 Enterprise": "M4E",
+    "Matrice 4 Thermal": "M4T",
+}
+"""Full names of drones that have a preset's camera: the preset's name or its code in EXIF."""
+
+
 def find_presets(name: str) -> list[CameraPreset]:
-    """The presets with this name or EXIF code, several where a drone has several cameras.
+    """The presets with this name, a drone's full name or EXIF code; several where a drone has several cameras.
 
     Case, blanks, hyphens and "DJI" before it do not matter.
     """
-    wanted = _plain(name)
-    found = []
-    for preset in CAMERA_PRESETS:
-        known = {_plain(preset.name), *(_plain(code) for code in preset.codes)}
-        if wanted in known or (wanted.startswith("dji") and wanted[3:] in known):
-            found.append(preset)
-    return found
+    plain = _plain(name)
+    wanted = {plain, plain.removeprefix("dji")}
+    wanted |= {_plain(preset) for sold, preset in _SOLD_AS.items() if _plain(sold) in wanted}
+    return [
+        preset
+        for preset in CAMERA_PRESETS
+        if wanted & {_plain(preset.name), *(_plain(code) for code in preset.codes)}
+    ]
 
 
 def preset_names() -> str:

@@ -141,6 +141,11 @@ def select_views(views: Sequence[BoardView], width_px: int, height_px: int) -> l
     return chosen
 
 
+def _rounded_down(value: float) -> str:
+    """To a tenth, so that too little never reads as enough."""
+    return f"{np.floor(10 * value) / 10:.1f}"
+
+
 def calibrate(
     views: Sequence[BoardView], board: Board, width_px: int, height_px: int
 ) -> Calibration:
@@ -157,7 +162,7 @@ def calibrate(
     coverage = _coverage(used, board, width_px, height_px)
     _need(
         coverage >= LEAST_COVERAGE,
-        f"the boards fill {coverage:.0%} of the picture, {LEAST_COVERAGE:.0%} are needed",
+        f"the boards fill {_rounded_down(100 * coverage)} % of the picture, {LEAST_COVERAGE:.0%} are needed",
     )
     dropped: list[str] = []
     fit = _fit(used, board, width_px, height_px)
@@ -169,7 +174,7 @@ def calibrate(
     spread_deg = float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1.0, 1.0))).max())
     _need(
         spread_deg >= LEAST_TILT_SPREAD_DEG,
-        f"the boards are tilted by no more than {spread_deg:.1f} deg against each other, "
+        f"the boards are tilted by no more than {_rounded_down(spread_deg)} deg against each other, "
         f"{LEAST_TILT_SPREAD_DEG:.0f} deg are needed",
     )
     _need(

@@ -331,6 +331,7 @@ def _open_video(
         if inside is None or inside.lens is None
         else camera_of(inside.lens, info.width_px, info.height_px)
     )
+    camera = camera or _camera_beside(path.parent)
     if camera is None:
         model = stated or _video_camera(info)
     else:
@@ -339,6 +340,12 @@ def _open_video(
     if inside is not None and found is inside.telemetry:
         source.ground_elevation_m = inside.ground_elevation_m
     return source
+
+
+def _camera_beside(folder: Path) -> Path | None:
+    """The calibration that lies with a flight, `camera.xml` in its folder."""
+    path = folder / "camera.xml"
+    return path if path.is_file() else None
 
 
 def _metadata_inside(path: Path, container: str) -> FileMetadata | None:
@@ -412,6 +419,7 @@ def _open_photos(
     if found is not album.telemetry:  # a log needs no positions in the photos
         kept = [each for each in album.notices if each.code != "photo_without_gps"]
         album = replace(album, notices=tuple(kept))
+    camera = camera or _camera_beside(folder)
     if camera is None:
         model = _guess(album.width_px, album.height_px, album.typical)
     else:

@@ -1,6 +1,7 @@
 """`sorvolo compare`: a later flight against the map; each change is printed as it is announced."""
 
 import json
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
@@ -72,8 +73,8 @@ MethodOption = Annotated[
     ChangeMethod,
     typer.Option(help="robust: copes with light, shadows and wind. thesis: the baseline."),
 ]
-WritesMasks = Annotated[
-    bool, typer.Option("--masks", help="Also write each frame's change mask and boxes.")
+MasksFolder = Annotated[
+    Path | None, typer.Option(help="Folder for each frame's change mask and boxes.")
 ]
 StepsFolder = Annotated[
     Path | None,
@@ -101,7 +102,7 @@ def compare(
     votes: Votes = 3,
     offset: Offset = None,
     ground_elevation: GroundElevation = None,
-    masks: WritesMasks = False,
+    masks: MasksFolder = None,
     steps: StepsFolder = None,
     update: UpdatesMap = True,
     trust_map: TrustsMap = False,
@@ -119,7 +120,7 @@ def compare(
 
     Example: sorvolo compare DJI_0057.MP4 --site field
 
-    Example: sorvolo compare photos/ --site field --masks --json
+    Example: sorvolo compare photos/ --site field --masks masks --json
     """
     from sorvolo.capture.live.reconnect import LiveSettings
     from sorvolo.missions.compare.flights import compare_flights
@@ -132,7 +133,7 @@ def compare(
         offset_s=offset,
         ground_elevation_m=ground_elevation,
         updates_map=update,
-        writes_masks=masks,
+        writes_masks=masks is not None,
         model=model,
         trusts_map=trust_map,
         classes=wanted_classes(classes),
@@ -152,12 +153,25 @@ def compare(
                 again=again,
             )
             results = read_results(comparing, place, coordinates)
+        if masks is not None:
+            _copy_masks([result["flight"] for result in results], place.folder, masks)
         if as_json:
             typer.echo(json.dumps({"site": str(place.folder), "flights": results}, indent=1))
         else:
             show_results(results, place.folder, Console(), coordinates)
     if any(result["comparison"]["headline"]["quality"] != "compared" for result in results):
         raise typer.Exit(TO_CHECK)
+
+
+def _copy_masks(flights: Sequence[str], site: Path, to: Path) -> None:
+    """Leave the masks that the site keeps of these flights in a folder as well, a folder for each flight."""
+    from sorvolo.store.atomic import writing
+
+    with writing(to):
+        for flight in flights:
+            made = site / "flights" / flight / "masks"
+            if made.is_dir():
+                shutil.copytree(made, to / flight, dirs_exist_ok=True)
 
 
 def _thesis() -> "PairMethod":

@@ -256,7 +256,7 @@ def _own_masks(site: Path, flight: str) -> Path:
     folder = site / "flights" / flight / "masks"
     if not has_masks(folder):
         raise InputError(
-            f"{site}: no masks of {flight} were written; run `sorvolo compare` again with --masks"
+            f"{site}: no masks of {flight} were written; run `sorvolo compare` again with --masks DIR"
         )
     return folder
 
@@ -275,7 +275,7 @@ def _evaluate(
         masks = compare_mask_folders(_own_masks(site, flight), true_folder / "changes", least_px)
     else:
         remarks.append(
-            "no masks were written: frames and pixels are judged after `sorvolo compare` with --masks"
+            "no masks were written: frames and pixels are judged after `sorvolo compare` with --masks DIR"
         )
     makers = _map_makers(site, flights, flight)
     map_from_truth, shift_m = flights.map_from_truth(makers)

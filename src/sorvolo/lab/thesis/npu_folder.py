@@ -13,15 +13,16 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-import cv2
 import numpy as np
 from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
 
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats
+from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.lab.datasets.text_files import read_text
+from sorvolo.lab.simulation.flight_files import write_camera
 from sorvolo.lab.thesis.umcd_folder import PICTURE_ENDINGS, UmcdVideo, videos_in
 from sorvolo.store.atomic import atomic_write_bytes, writing
 
@@ -162,12 +163,8 @@ def _camera(config: str, path: Path) -> Path | None:
     if len(numbers) < 6:
         return None
     width, height, fx, fy, cx, cy, *distortion = numbers
-    store = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    store.write("image_width", int(width))
-    store.write("image_height", int(height))
-    store.write("camera_matrix", np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
-    store.write("distortion_coefficients", np.array([*distortion, 0, 0, 0, 0, 0][:5]))
-    store.release()
+    k = np.array([*distortion, 0, 0, 0, 0, 0][:5], np.float64)
+    write_camera(path, Camera(int(width), int(height), fx, fy, cx, cy, k))
     return path
 
 

@@ -5,6 +5,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import cv2
+import numpy as np
+
 from sorvolo.change.coverage import (
     GroundCoverage,
     coverage_summary,
@@ -18,13 +21,16 @@ from sorvolo.heights.volumes import height_changes
 from sorvolo.missions.compare.extension import NIGHT
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.heights.measure import flight_with_heights, own_surface, read_field
+from sorvolo.mosaic.selection import evenly
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.files import HeightFile
 from sorvolo.survey.coverage import CoveredGround, Gap
 from sorvolo.survey.findings import Change, ChangeKind, ViewStatus
 from sorvolo.survey.flight import Notice
-from sorvolo.survey.wording import area_text, plural
+from sorvolo.survey.mosaic import PlacedFrame
+from sorvolo.survey.wording import area_text, counted, plural
 
+_SAMPLED = 100  # frames, whose middle is looked for in their neighbours
 _DARK = 0.4  # times the map's brightness: less hides things
 _ALL_OVER = 0.1  # share of the compared ground: a day without changes has 0.01, other leaves 0.13, half snow 0.4
 _OTHER_GROUND = 0.5  # share of the compared ground that areas cover: more is no list of changes
@@ -162,6 +168,29 @@ def flight_notices(counts: ViewCounts, fit: FlightFit | None) -> list[Notice]:
         f"the flight together fit it, within {max(fit.residual_m, 0.1):.1f} m (median)"
     )
     return [Notice("placed_with_flight", counts.with_flight, text)]
+
+
+def views_notices(placed: Sequence[PlacedFrame], votes: int) -> list[Notice]:
+    """What a user should know where most ground is in fewer views than must show a change."""
+    outlines = [each.outline_m for each in placed if np.isfinite(each.outline_m).all()]
+    if len(outlines) < 2:
+        return []
+    seen = []
+    for number in evenly(len(outlines), _SAMPLED):
+        x, y = outlines[number].mean(axis=0).tolist()
+        near = outlines[max(0, number - 2 * votes) : number + 2 * votes + 1]
+        inside = [
+            cv2.pointPolygonTest(each.astype(np.float32)[:, None], (x, y), False) for each in near
+        ]
+        seen.append(sum(each >= 0 for each in inside))
+    usual = int(np.median(seen))
+    if usual >= votes:
+        return []
+    text = (
+        f"most ground is in {counted(usual, 'compared view')}, and {votes} must show a change: fly slower or take more "
+        f"pictures, or use --votes {usual}, which reports more false changes"
+    )
+    return [Notice("few_views", usual, text)]
 
 
 def comparison_headline(

@@ -30,6 +30,7 @@ from sorvolo.missions.compare.report import (
     comparison_warnings,
     flight_notices,
     flight_summary,
+    views_notices,
     with_height_changes,
 )
 from sorvolo.missions.compare.whole_flight import WholeFlight
@@ -373,6 +374,7 @@ class CompareRun:
             *self._archive.notices,
             *self._objects.notices,
             *flight_notices(self._counts, self._flight_fit),
+            *views_notices(placed, self._settings.votes),
         ]
         report = build_report(
             self._setup,
