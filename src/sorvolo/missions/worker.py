@@ -394,7 +394,7 @@ def _mapped(journal: Journal, site: Path, before: int, known: Sequence[str]) -> 
 
     Writes each person that the new versions show.
     """
-    from sorvolo.store.exports.object_files import objects_geojson
+    from sorvolo.store.exports.change_files import objects_geojson
     from sorvolo.store.site.archive import Archive
     from sorvolo.survey.objects import PERSON
 
