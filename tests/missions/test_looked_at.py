@@ -5,13 +5,15 @@ import json
 import numpy as np
 import pytest
 
+from sorvolo.capture.live.stream import BEGUN_LATE
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.missions.flight.looked_at import LookedAt, ground_for, looked_at, searched_document
+from sorvolo.missions.watch.run import headline_of_watch
 from sorvolo.missions.watch.settings import WatchSettings
 from sorvolo.search.looked_ground import ClassGround, LookedGround, near_ground
-from sorvolo.survey.flight import Site
+from sorvolo.survey.flight import Notice, Site
 
 _SITE = Site("field", Geodetic(46.5, 11.3, 0.0), "EPSG:32632", 1.0)
 _INFO = ModelInfo(
@@ -114,6 +116,13 @@ def test_a_headline_never_clears_ground_that_was_not_looked_at(
     headline = looked.headline(counts, tuple(looked.ground) or _BOTH)
     assert headline["text"] == text
     assert headline["complete"] == ("no person" in text or "98 %" in text)
+
+
+def test_a_watch_that_began_late_states_that() -> None:
+    whole = {"text": "1 car, no person; 9 of 9 pictures looked at", "complete": True}
+    assert headline_of_watch(whole, ()) == whole
+    late = headline_of_watch(whole, (Notice(BEGUN_LATE, 1, ""),))
+    assert "before the watch began was not looked at" in late["text"] and not late["complete"]
 
 
 def test_how_much_is_enough_is_a_share() -> None:

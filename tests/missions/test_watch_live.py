@@ -172,6 +172,8 @@ def test_new_ground_comes_first_and_all_of_it_in_the_end(tmp_path: Path) -> None
     flown_m = np.arange(-_REACH_M, _FLOWN_M + _REACH_M, 0.5)
     near_m = np.abs(flown_m[:, None] - np.array(looked_m)).min(axis=1)
     assert (near_m <= _REACH_M).mean() >= 0.8
+    # what was seen once is looked at again: both are announced while it flies
+    assert len({track.id for update in live for track in update.new}) == 2
 
     assert frames["skipped"] == 0 and frames["detected"] == 200
     assert detector.asked == frames["detected"]  # nothing twice

@@ -559,6 +559,16 @@ def test_of_two_missions_at_once_the_map_s_figures_are_shown(
         "run.progress",
         {"frames": 8, "searched": 2, "frames_per_second": 0.6, "latency_s": 1.2},
     )
+    for number in (1, 2):
+        person = {
+            "type": "Feature",
+            "id": number,
+            "properties": {"id": number, "class": "person", "score": 0.9},
+            "geometry": {"type": "Point", "coordinates": [12.5, 41.9]},
+        }
+        happens("run-watch", "person.found", {"feature": person, "is_local": False})
+    expect(page.locator(".message.person")).to_have_count(1)
+    expect(page.locator(".message.person")).to_contain_text("2 people found, the last: person")
     happens("run-watch", "run.finished", {"headline": "two cars found"})
     page.locator(".message", has_text="two cars found").wait_for()
     expect(page.locator(".figure", has_text="frames/s").locator("b")).to_have_text("7.5")

@@ -47,6 +47,10 @@ _YOUNG_NS = 2 * SECOND_NS  # the first frames come in a burst: until then the of
 _STATED_KEPT = 9  # of a stream's newest statements of UTC: their median counts
 
 
+BEGUN_LATE = "begun_late"
+"""The notice that a growing file was not read from its beginning."""
+
+
 class Tie(IntEnum):
     """The source of a frame's time, the better the higher."""
 
@@ -481,6 +485,11 @@ class LiveStream:
         return (
             *self._reader.notices(),
             *segment_notices(self.gaps_s),
+            *notice(
+                BEGUN_LATE,
+                int(self._is_file and not (self._is_whole or self.gaps_s)),
+                "the flight had begun; what was recorded before was not read: give the recording for all of it",
+            ),
             *notice("arrival_times", int(arrival), words),
             *notice(
                 "size_changed",

@@ -296,7 +296,7 @@ def _live(
     for each in memo.kept_frames():
         passed.earlier += 1
         yield run.add(each.frame, time.monotonic())
-    with closing(waiting.live(run.show, run.new_share)) as arrivals:
+    with closing(waiting.live(run.show, run.new_share, run.doubtful)) as arrivals:
         for arrived_s, arrived in arrivals:
             passed.note(run)
             if isinstance(arrived, Frame):
@@ -304,6 +304,7 @@ def _live(
             else:
                 run.lose(arrived)
     passed.note(run)
+    run.log.unkept = waiting.unkept
 
 
 def _rest(

@@ -13,6 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from sorvolo.capture.live.stream import BEGUN_LATE
 from sorvolo.capture.sync import DATED_NS
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.scene import SceneMagnifier
@@ -69,6 +70,7 @@ class WatchLog:
     placed: int = 0  # detections with a place on the ground
     latency_s: list[float] = field(default_factory=list)
     asked: int = 0  # frames that were to be searched
+    unkept: int = 0  # of a live flight, for want of disk
     first_ns: int = -1
     last_ns: int = -1
     wall_s: dict[str, float] = field(default_factory=dict)
@@ -99,6 +101,7 @@ class WatchLog:
             lost=self.lost,
             latency_s=self.latency_s,
             asked=self.asked,
+            unkept=self.unkept,
             wall_s=self.wall_s,
             started_s=self.started_s,
         )
@@ -196,6 +199,14 @@ class WatchUpdate:
     view: FrameView | None
     is_resumed: bool
     has_landed: bool
+
+
+def headline_of_watch(headline: dict[str, Any], notices: Sequence[Notice]) -> dict[str, Any]:
+    """A headline that also states that the flight's beginning was not read."""
+    if all(each.code != BEGUN_LATE for each in notices):
+        return headline
+    text = f"{headline['text']}; what was flown before the watch began was not looked at"
+    return {"text": text, "complete": False}
 
 
 def utc_ns(setup: FlightSetup, frame_ns: int) -> int:
@@ -353,6 +364,16 @@ class WatchRun:
     def new_share(self, outline_m: PointsM) -> float:
         """The share, 0 to 1, of this ground that no frame was searched for."""
         return 1.0 if self._ground is None else self._ground.new_share(outline_m)
+
+    def doubtful(self) -> dict[int, PointsM]:
+        """The places (2,), by track, of what was seen clearly but not often enough to be announced."""
+        if self._ground is None:
+            return {}
+        return {
+            track.id: track.position_m
+            for track in self._places.follower.tracks()
+            if not track.confirmed and track.score >= self._detector.info.thresholds[track.label]
+        }
 
     def _look(self, frame: Frame) -> None:
         """Note the ground of a frame that was searched."""
@@ -514,6 +535,9 @@ class WatchRun:
             reasons = "; ".join(f"{count} x {reason}" for reason, count in log.lost.most_common(5))
             text = f"{counted(lost, 'frame')} could not be used: {reasons}"
             notices.append(Notice("lost_frames", lost, text))
+        if log.unkept:
+            text = f"{counted(log.unkept, 'frame')} did not wait for the landing: the disk is full"
+            notices.append(Notice("disk_full", log.unkept, text))
         gone = [] if self._announced is None else self._announced.left()
         if gone:
             text = f"{counted(len(gone), 'object')} announced while live: not confirmed by all frames, not counted"
@@ -524,7 +548,7 @@ class WatchRun:
             "first_frame": utc_text(log.first_ns) if log.first_ns >= 0 else None,
             "last_frame": utc_text(log.last_ns) if log.last_ns >= 0 else None,
             "ended": ended,
-            "headline": looked.headline(counts, self._classes),
+            "headline": headline_of_watch(looked.headline(counts, self._classes), notices),
             "looked_for": list(self._classes),
             "looked_at": looked.facts(),
             "objects": {"total": len(tracks), "by_class": counts},

@@ -3,18 +3,22 @@
 import heapq
 import shutil
 import threading
-from collections.abc import Callable, Generator, Iterator
+from collections import Counter
+from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from sorvolo.capture.source import LiveSource
 from sorvolo.errors import StoreError
 from sorvolo.geometry.arrays import PointsM
+from sorvolo.geometry.polygons import points_inside
 from sorvolo.store.images import image_from_jpeg, jpeg_from_image
 from sorvolo.store.site.spill import SpillFile
 from sorvolo.survey.flight import Frame, LostFrame
 
 _LEVELS = 16  # of a frame's share of new ground: of those alike the newest is searched; below one, nothing is new
+_SECOND_LOOKS = 2  # at what was seen once: three views announce it
+_LATELY = 600  # frames among which those are looked for, a minute; by choice
 _LEAST_FREE = 2_000_000_000  # bytes that stay free on the disk: pictures that would not fit are not kept; by choice
 
 
@@ -51,6 +55,8 @@ class WaitingFrames:
         self._heap: list[tuple[int, int, _Kept]] = []
         self._given: set[int] = set()  # by `live`
         self._last, self._is_in_order = -1, True
+        self._looked_again: Counter[int] = Counter()
+        self._was_second = False
         self.unkept = 0
         """How many frames were not kept, as the disk was full."""
         self._thread = threading.Thread(target=self._collect, name="waiting frames", daemon=True)
@@ -68,11 +74,13 @@ class WaitingFrames:
         self,
         ground: Callable[[Frame], PointsM | None],
         new_share: Callable[[PointsM], float],
+        doubtful: Callable[[], Mapping[int, PointsM]],
     ) -> Generator[tuple[float, Frame | LostFrame]]:
         """Frames to search until the flight ends, each with when it came (monotonic clock).
 
         The one comes first that shows the largest share of new ground, by `new_share` of what `ground` gives of each
-        frame as it comes; the newest where none shows any. Raises what went wrong with the source.
+        frame as it comes; the newest where none shows any. Every second one shows what was seen but not often enough to
+        be announced: the places (2,), by id, of `doubtful`. Raises what went wrong with the source.
         """
         is_over = False
         while not is_over:
@@ -88,7 +96,7 @@ class WaitingFrames:
                     self._take(each, ground)
             if is_over:
                 return
-            kept = self._choose(new_share)
+            kept = self._second_look(doubtful()) or self._choose(new_share)
             if kept is None:
                 with self._changed:
                     self._changed.wait_for(lambda: self._came or self._is_over)
@@ -161,6 +169,27 @@ class WaitingFrames:
         self._kept.append(kept)
         if outline_m is not None:
             heapq.heappush(self._heap, (-_LEVELS, -kept.index, kept))
+
+    def _second_look(self, doubtful: Mapping[int, PointsM]) -> _Kept | None:
+        """A frame that shows one of these places in its middle; not twice in turn, and of each place a few times."""
+        if self._was_second:
+            self._was_second = False
+            return None
+        for name, place_m in doubtful.items():
+            if self._looked_again[name] >= _SECOND_LOOKS:
+                continue
+            showing = [
+                each
+                for each in self._kept[-_LATELY:]
+                if each.index not in self._given
+                and each.outline_m is not None
+                and points_inside([each.outline_m], place_m[None]).all()
+            ]
+            if showing:
+                self._looked_again[name] += 1
+                self._was_second = True
+                return showing[len(showing) // 2]
+        return None
 
     def _choose(self, new_share: Callable[[PointsM], float]) -> _Kept | None:
         """The frame with the most new ground. Its share only falls while others are searched, so one that still comes
