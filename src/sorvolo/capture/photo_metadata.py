@@ -24,7 +24,7 @@ from sorvolo.capture.decoding import (
     reduced_size_px,
     reduction_of,
 )
-from sorvolo.capture.telemetry.cleaning import sigma_from_hdop_m
+from sorvolo.capture.telemetry.cleaning import notice, sigma_from_hdop_m
 from sorvolo.errors import InputError
 from sorvolo.geometry.units import (
     KM_AN_HOUR_M_S,
@@ -32,6 +32,7 @@ from sorvolo.geometry.units import (
     M_PER_DEG_LATITUDE,
     MILE_AN_HOUR_M_S,
 )
+from sorvolo.survey.flight import Notice
 
 _Tags: TypeAlias = Mapping[int, Any]
 _XMP_TAG = 700  # TIFF's number (XMP specification, part 3)
@@ -53,6 +54,26 @@ class PlaceDoubt(StrEnum):
     SIGN_ASSUMED = "sign_assumed"
     SIGN_BY_XMP = "sign_by_xmp"
     CONTRADICTED = "position_contradicted"
+
+
+_DOUBTS = {
+    PlaceDoubt.VOID: "photos whose position is there, but marked void (V) by the camera, and not used: {}; if it "
+    "is right, mark it valid (exiftool -GPSStatus=A FOLDER) or give it in a geo.txt",
+    PlaceDoubt.VOID_BY_XMP: "photos whose EXIF position is marked void (V), placed by their XMP: {}",
+    PlaceDoubt.SIGN_ASSUMED: "photos whose position lacks its N or S, E or W, taken as north and east: {}; if it was "
+    "south or west, write the references (exiftool -GPSLatitudeRef=S FOLDER)",
+    PlaceDoubt.SIGN_BY_XMP: "photos whose EXIF position has another sign than their XMP's, which is taken: {}",
+    PlaceDoubt.CONTRADICTED: "photos whose XMP position is more than 10 m from that in EXIF, which is taken: {}",
+}
+
+
+def doubt_notices(doubts: Mapping[PlaceDoubt | None, int]) -> list[Notice]:
+    """The notices of so many photos with each doubt."""
+    return [
+        each
+        for doubt, words in _DOUBTS.items()
+        for each in notice(doubt, doubts.get(doubt, 0), words)
+    ]
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from sorvolo.capture.photo_metadata import (
     PhotoMetadata,
     PlaceDoubt,
     apart_m,
+    doubt_notices,
     read_photo_metadata,
 )
 from sorvolo.capture.photo_positions import read_positions
@@ -58,13 +59,6 @@ _OF_A_PLACE = {
     "orthometric_height_m",
     "horizontal_sigma_m",
     "vertical_sigma_m",
-}
-_DOUBTS = {
-    PlaceDoubt.VOID: "photos whose position is there, but marked void (V) by the camera, and not used: {}",
-    PlaceDoubt.VOID_BY_XMP: "photos whose EXIF position is marked void (V), placed by their XMP: {}",
-    PlaceDoubt.SIGN_ASSUMED: "photos whose position lacks its N or S, E or W, taken as north and east: {}",
-    PlaceDoubt.SIGN_BY_XMP: "photos whose EXIF position has another sign than their XMP's, which is taken: {}",
-    PlaceDoubt.CONTRADICTED: "photos whose XMP position is more than 10 m from that in EXIF, which is taken: {}",
 }
 
 
@@ -450,7 +444,7 @@ def _telemetry_of(photos: Sequence[Photo]) -> tuple[Telemetry, list[Notice]]:
             len(readable) - placed - doubts[PlaceDoubt.VOID],
             "photos without a GPS position: {}",
         ),
-        *(each for doubt, words in _DOUBTS.items() for each in notice(doubt, doubts[doubt], words)),
+        *doubt_notices(doubts),
     ]
     if not placed:
         return no_telemetry(), missing

@@ -21,6 +21,7 @@ _MOST_RATIO = 200  # unpacked over packed: photos hardly shrink
 _PHOTOS = (".jpg", ".jpeg", ".tif", ".tiff", ".dng", ".heic", ".png")
 _TEXTS = (
     ".srt",
+    ".ass",
     ".csv",
     ".gpx",
     ".txt",

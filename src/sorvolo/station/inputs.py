@@ -20,7 +20,10 @@ from sorvolo.station.sites import Folder, folders_below
 from sorvolo.station.uploads import VIDEO_ENDINGS, Uploads
 
 _PHOTO_ENDINGS = (".jpg", ".jpeg", ".dng", ".tif", ".tiff", ".heic")
-_SIDE_ENDINGS = (".csv", ".srt", ".gpx", ".txt", ".nmea", ".log", ".xml", ".yaml", ".yml", ".json")
+_SIDE_ENDINGS = (
+    *(".csv", ".srt", ".ass", ".gpx", ".txt", ".mrk", ".nmea", ".log"),
+    *(".xml", ".yaml", ".yml", ".json"),
+)
 _DEEPEST, _MOST_FOLDERS, _MOST = 4, 3000, 2000
 _LOOK_EVERY_S = 5.0  # through the folders; by choice
 

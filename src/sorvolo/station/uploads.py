@@ -34,6 +34,8 @@ VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".ts")
 
 TEXT_ENDINGS = (
     ".srt",
+    ".ass",
+    ".mrk",
     ".csv",
     ".gpx",
     ".txt",

@@ -3,7 +3,7 @@
 import hashlib
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from math import nan
 from pathlib import Path
@@ -15,7 +15,12 @@ from sorvolo.capture.decoding import PHOTO_SUFFIXES
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.segments import FlightSoFar
 from sorvolo.capture.live.telemetry_log import TelemetryLog
-from sorvolo.capture.photo_metadata import PhotoMetadata, read_photo_metadata
+from sorvolo.capture.photo_metadata import (
+    PhotoMetadata,
+    PlaceDoubt,
+    doubt_notices,
+    read_photo_metadata,
+)
 from sorvolo.capture.photos import read_picture
 from sorvolo.capture.picture_sizes import is_same_shape, other_size
 from sorvolo.capture.sync import FIX_DELAY_S, PHOTO_TIE
@@ -51,6 +56,7 @@ class GrowingFolder:
         self._log = TelemetryLog("exif", folder.name)
         self._heard_s = time.monotonic()
         self._count = self._corrupt = self._untimed = 0
+        self._doubts: Counter[PlaceDoubt | None] = Counter()
         self._last_ns = -1
         self._first = folder
         self.size_px = (0, 0)
@@ -133,6 +139,7 @@ class GrowingFolder:
                 self._untimed,
                 "photos without a time, timed by when they came: {}",
             ),
+            *doubt_notices(self._doubts),
         )
 
     def frames(self, wanted: Callable[[int, int], bool]) -> Iterator[Frame | LostFrame]:
@@ -239,6 +246,7 @@ class GrowingFolder:
         return Frame(index, path.name, time_ns, image)
 
     def _note_place(self, time_ns: int, metadata: PhotoMetadata) -> None:
+        self._doubts[metadata.place_doubt] += 1
         if metadata.columns:
             self._log.add(time_ns, metadata.columns)
 
