@@ -1,5 +1,6 @@
 """What is one recording: chapters that a camera cut are joined, small copies and duplicates are no flights."""
 
+import os
 import shutil
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -68,6 +69,8 @@ def of_notices(source: Source, code: str) -> list[str]:
         ("DJI_0001.MP4", "DJI_0001.LRF"),
         ("VID_20260501_124400_00_001.mp4", "LRV_20260501_124400_01_001.lrv"),
         ("flight.mp4", "flight_proxy.mp4"),
+        ("GX010373.MP4", "GL010373.MP4"),
+        ("DJI_0001.MP4", "for the phone.mp4"),
     ],
 )
 def test_a_small_copy_is_left_out_and_named(tmp_path: Path, whole: str, copy: str) -> None:
@@ -135,6 +138,39 @@ def test_chapters_are_one_flight(
     assert [each.path.name for each in flights] == [names[0]]
 
 
+def test_a_file_cut_at_4_gb_goes_on_though_both_state_one_start(tmp_path: Path) -> None:
+    first, other = (write_video(tmp_path / f"DJI_000{n}.MP4", n, frames=30) for n in (1, 2))
+    assert len(recordings([first, other])) == 2
+    os.truncate(first, 3_900_000_000)  # a sparse file
+    assert len(recordings([first, other])) == 1
+
+
+@pytest.mark.parametrize("logs", [("flight",), ("GX020106",), ("GX010106", "GX020106")])
+def test_one_log_is_of_all_chapters(tmp_path: Path, logs: tuple[str, ...]) -> None:
+    for number in (1, 2):
+        write_video(tmp_path / f"GX0{number}0106.MP4", number)
+    write_video(tmp_path / "GL010106.LRV", 1)
+    for number, name in enumerate(logs):
+        begin = BEGIN + timedelta(seconds=3 * number)
+        write_gpx(tmp_path / f"{name}.gpx", begin, 6 // len(logs))
+    (source,) = open_sources([tmp_path])
+    assert tied_clock(source, source.telemetry).sample_s.tolist() == [0, 1, 2, 3, 4, 5]
+
+
+def test_each_chapters_subtitles_count_from_its_own_start(tmp_path: Path) -> None:
+    for number in (0, 1):
+        name = f"DJI_000{number + 1}"
+        write_video(tmp_path / f"{name}.MP4", number, begin=BEGIN + timedelta(seconds=2 * number))
+        cues = (
+            f"{each + 1}\n00:00:0{each},000 --> 00:00:0{each + 1},000\n[latitude: 46.5] [longitude: -92.{number}{each}] "
+            "[rel_alt: 40.0 abs_alt: 240.0]\n"
+            for each in (0, 1)
+        )
+        (tmp_path / f"{name}.SRT").write_text("\n".join(cues))
+    (source,) = open_sources([tmp_path])
+    assert tied_clock(source, source.telemetry).sample_s.tolist() == [0, 1, 2, 3]
+
+
 def test_a_pause_makes_another_flight(tmp_path: Path) -> None:
     write_video(tmp_path / "DJI_0001.MP4", 1)
     write_video(tmp_path / "DJI_0002.MP4", 2, begin=BEGIN + timedelta(seconds=40))
@@ -148,6 +184,7 @@ def test_a_later_chapter_alone_is_tied_to_no_log_by_its_clock(tmp_path: Path) ->
     video = write_video(tmp_path / "GX020106.MP4")
     log = write_gpx(tmp_path / "GX020106.gpx", BEGIN - timedelta(seconds=5), 60)
     (source,) = open_sources([video], log)
+    assert len(of_notices(source, "later_chapter")) == 1
     with pytest.raises(InputError, match=r"is chapter 2 of a recording.*--offset SECONDS"):
         tied_clock(source, source.telemetry)
     assert tied_clock(source, source.telemetry, 17.8).sample_s[0] == pytest.approx(-5 - 17.8)

@@ -9,11 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
+from sorvolo.capture.sync import DATED_NS
 from sorvolo.capture.video import VIDEO_SUFFIXES, VideoInfo, VideoSource, read_video_info
 from sorvolo.capture.video_spans import SparseReading
 from sorvolo.capture.video_stream import opened_video
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import ImageGray
+from sorvolo.geometry.arrays import Floats, ImageGray, TimesNs
 from sorvolo.geometry.units import SECOND_NS
 from sorvolo.survey.flight import (
     TELEMETRY_COLUMNS,
@@ -28,6 +29,7 @@ _END_BYTES = 1 << 20  # of a file's begin and end, by which a copy is known
 _ALIKE = 0.02  # of a duration: so much two copies of one recording may differ
 _SAME_PICTURE = 0.95  # correlation of the first pictures of two copies; by choice
 _CUT_S = 2.0  # between the end of a chapter and the start of the next, as clocks state them
+_CUT_BYTES = 3_500_000_000  # at least, of a chapter on a card whose files end at 4 GB
 _GOPRO = re.compile(r"G[HXLS](\d\d)(\d{4})|GP(\d\d)(\d{4})|(GOPR)(\d{4})", re.IGNORECASE)
 _NUMBERED = re.compile(r"(.*?)(?:\d{14}_)?(\d{3,7})(_[A-Z])?", re.IGNORECASE)
 _MAKER_PREFIX = re.compile(r"^(G[HXLS](?=\d{6}$)|LRV_|VID_|PRO_)")
@@ -53,6 +55,11 @@ class Recording:
             names = ", ".join(path.name for path in self.copies)
             text = f"{names}: a copy of {self.chapters[0].name}, left out"
             found.append(Notice("left_out_copy", len(self.copies), text))
+        if self.start_doubt:
+            text = (
+                f"{self.chapters[0].name} is a later chapter: the times in it are the first one's"
+            )
+            found.append(Notice("later_chapter", 1, text))
         return tuple(found)
 
     @property
@@ -146,7 +153,8 @@ def _original(
             if lens and their_lens and lens[1] == "1" and their_lens[1] == "0":
                 return other  # the other lens of a camera that looks all around
         is_named_alike = stem.startswith(theirs) or theirs.startswith(stem)
-        if is_named_alike and _is_smaller_twin(film, other, header):
+        is_named_alike |= _base(stem) == _base(theirs)
+        if _is_smaller_twin(film, other, header, is_named_alike=is_named_alike):
             return other
         is_as_large = film.stat().st_size == other.stat().st_size
         if str(other) < str(film) and is_as_large and _ends(film) == _ends(other):
@@ -158,15 +166,24 @@ def _base(stem: str) -> str:
     return _LENS.sub("", _MAKER_PREFIX.sub("", stem))
 
 
-def _is_smaller_twin(film: Path, other: Path, header: Callable[[Path], VideoInfo | None]) -> bool:
-    """Whether two videos are as long and begin with the same picture, and this has fewer pixels, or fewer bytes."""
+def _is_smaller_twin(
+    film: Path,
+    other: Path,
+    header: Callable[[Path], VideoInfo | None],
+    *,
+    is_named_alike: bool,
+) -> bool:
+    """Whether two videos with like names, or the same start, are as long and begin with the same picture, and this has
+    fewer pixels, or fewer bytes."""
     mine, theirs = header(film), header(other)
     if mine is None or theirs is None or min(mine.duration_s, theirs.duration_s) <= 0:
+        return False
+    if not (is_named_alike or (mine.start_ns and mine.start_ns == theirs.start_ns)):
         return False
     if abs(mine.duration_s - theirs.duration_s) > _ALIKE * theirs.duration_s:
         return False
     sizes = [
-        (info.width_px * info.height_px, path.stat().st_size, str(path))
+        (info.width_px * info.height_px, path.stat().st_size)
         for info, path in ((mine, film), (theirs, other))
     ]
     if sizes[0] >= sizes[1]:
@@ -190,28 +207,43 @@ def _ends(path: Path) -> bytes:
         return hashlib.sha256(begin + file.read()).digest()
 
 
-def _follows(film: Path, before: Path, header: Callable[[Path], VideoInfo | None]) -> bool:
-    """Whether a video goes on where another one was cut: by GoPro's names, or by the next number and the clock."""
-    if film.parent != before.parent or film.suffix.lower() != before.suffix.lower():
-        return False
-    if film.suffix.lower() not in VIDEO_SUFFIXES:
-        return False
+def _is_next(film: Path, before: Path) -> bool:
+    """Whether a video's name counts on from another one's."""
     mine, theirs = _gopro_chapter(film), _gopro_chapter(before)
     if mine is not None or theirs is not None:
         return mine is not None and theirs is not None and mine == (theirs[0], theirs[1] + 1)
     own, last = (_NUMBERED.fullmatch(each.stem) for each in (film, before))
     if own is None or last is None or (own[1], own[3]) != (last[1], last[3]):
         return False
-    if int(own[2]) != int(last[2]) + 1:
+    return int(own[2]) == int(last[2]) + 1
+
+
+def _follows(film: Path, before: Path, header: Callable[[Path], VideoInfo | None]) -> bool:
+    """Whether a video goes on where another one was cut: by GoPro's names, or by the next number and the clock.
+
+    Its clock states the end of the other one, or, where a file of 4 GB was cut, the same start: no camera records twice
+    at once.
+    """
+    if film.parent != before.parent or film.suffix.lower() != before.suffix.lower():
+        return False
+    if film.suffix.lower() not in VIDEO_SUFFIXES or not _is_next(film, before):
         return False
     here, there = header(film), header(before)
-    if here is None or there is None or not here.start_ns or not there.start_ns:
+    if here is None or there is None:
         return False
-    is_alike = (here.codec, here.width_px, here.height_px) == (
-        there.codec, there.width_px, there.height_px,
-    )  # fmt: skip
-    gap_s = (here.start_ns - there.start_ns) / SECOND_NS - there.duration_s
-    return is_alike and abs(gap_s) <= _CUT_S
+    if (here.codec, here.width_px, here.height_px) != (
+        there.codec,
+        there.width_px,
+        there.height_px,
+    ):
+        return False
+    if _gopro_chapter(film) is not None:
+        return True
+    if not here.start_ns or not there.start_ns:
+        return False
+    later_s = (here.start_ns - there.start_ns) / SECOND_NS
+    is_same_start = abs(later_s) <= _CUT_S and before.stat().st_size >= _CUT_BYTES
+    return is_same_start or abs(later_s - there.duration_s) <= _CUT_S
 
 
 class ChapteredVideo(VideoSource):
@@ -240,7 +272,8 @@ class ChapteredVideo(VideoSource):
 
     def notices(self) -> tuple[Notice, ...]:
         """What was found so far, chapter by chapter; complete when `frames` is exhausted."""
-        return tuple(found for each in self._chapters for found in each.notices())
+        found = (notice for each in self._chapters for notice in each.notices())
+        return tuple(dict.fromkeys(found))
 
     def frames(
         self, wanted: Callable[[int, int], bool], sparse: SparseReading | None = None
@@ -290,20 +323,26 @@ def _later(
 
 
 def _joined(parts: Sequence[Telemetry], begins_ns: Sequence[int]) -> Telemetry:
-    """The chapters' telemetry as one: each counts from its own chapter's start; a log beside the first covers all."""
-    first = parts[0]
-    later = [
-        (part, begin_ns)
-        for part, begin_ns in zip(parts[1:], begins_ns[1:])
-        if len(part) and part.format == first.format and (part.video_time_ns >= 0).all()
-    ]
-    if not later or not (first.video_time_ns >= 0).all():
-        return first
-    times, videos, columns = [first.time_ns], [first.video_time_ns], [first.columns]
-    for part, begin_ns in later:
-        keep = part.time_ns > times[-1][-1]
-        times.append(part.time_ns[keep])
-        videos.append(part.video_time_ns[keep] + begin_ns)
+    """The chapters' telemetry as one: what counts from its own chapter's start is moved there, and each log goes on
+    where the one before it ends."""
+    placed = [(part, begin_ns) for part, begin_ns in zip(parts, begins_ns) if part.has_fixes]
+    if not placed:
+        return parts[0]
+    first = placed[0][0]
+    is_of_video = bool((first.video_time_ns >= 0).all())
+    times: list[TimesNs] = []
+    videos: list[TimesNs] = []
+    columns: list[dict[str, Floats]] = []
+    for part, begin_ns in placed:
+        if (part.video_time_ns >= 0).all() != is_of_video:
+            continue
+        is_undated = part.time_ns[0] < DATED_NS
+        time_ns = part.time_ns + (begin_ns if is_undated and is_of_video else 0)
+        keep = time_ns > (times[-1][-1] if times else -1)
+        if not keep.any():
+            continue  # the same log, found beside each chapter
+        times.append(time_ns[keep])
+        videos.append(part.video_time_ns[keep] + (begin_ns if is_of_video else 0))
         columns.append({name: part[name][keep] for name in TELEMETRY_COLUMNS})
     return replace(
         first,

@@ -310,7 +310,8 @@ def _free_name(name: str, fingerprint: str, taken: Mapping[str, str]) -> str:
 def _open_recording(
     recording: Recording, name: str, telemetry: Path | None, camera: Path | str | None
 ) -> VideoSource:
-    opened = [_open_video(path, name, telemetry, camera) for path in recording.chapters]
+    same = [*recording.chapters, *recording.copies]
+    opened = [_open_video(path, name, telemetry, camera, same) for path in recording.chapters]
     source = first = opened[0]
     first.note(*recording.notices)
     if len(opened) > 1:
@@ -321,11 +322,15 @@ def _open_recording(
 
 
 def _open_video(
-    path: Path, name: str, telemetry: Path | None, camera: Path | str | None
+    path: Path,
+    name: str,
+    telemetry: Path | None,
+    camera: Path | str | None,
+    same_flight: Sequence[Path],
 ) -> VideoSource:
     info = _video_info(path)
     inside = _metadata_inside(path, info.container)
-    found, notices = _video_telemetry(path, telemetry, inside)
+    found, notices = _video_telemetry(path, telemetry, inside, same_flight)
     stated = (
         None
         if inside is None or inside.lens is None
@@ -473,17 +478,20 @@ def _unused(logs: Sequence[Path], why: str) -> list[Notice]:
 
 
 def _video_telemetry(
-    video: Path, telemetry: Path | None, inside: FileMetadata | None
+    video: Path,
+    telemetry: Path | None,
+    inside: FileMetadata | None,
+    same_flight: Sequence[Path],
 ) -> tuple[Telemetry, list[Notice]]:
     """The telemetry, and notices of files that cannot be used; only a file that was asked for must be readable."""
     if telemetry is not None:
         return read_telemetry(telemetry), []
     if inside is not None and inside.telemetry.has_fixes:
-        beside = find_telemetry_beside(video)
+        beside = find_telemetry_beside(video, same_flight)
         why = "the telemetry inside the video is"
         return inside.telemetry, [] if beside is None else _unused([beside], why)
     notices = [_not_used(each) for each in unusable_files_beside(video)]
-    beside = find_telemetry_beside(video)
+    beside = find_telemetry_beside(video, same_flight)
     if beside is None:
         why = "it is not clear which is the flight's"
         return no_telemetry(), [*notices, *_unused(logs_beside(video), why)]

@@ -75,20 +75,21 @@ def is_telemetry(path: Path) -> bool:
         return False
 
 
-def find_telemetry_beside(video: Path) -> Path | None:
+def find_telemetry_beside(video: Path, same_flight: Sequence[Path] = ()) -> Path | None:
     """The telemetry file that belongs to a video or to a folder of photos; None where there is no clear one.
 
     First a file of the video's name with another suffix (any case), then one called like
-    "<name>_telemetry", then, where the folder holds no other video, the only telemetry file in it. Only
-    files that a reader recognises count.
+    "<name>_telemetry", then, where the folder holds no other video but chapters and copies of the `same_flight`, the
+    only telemetry file in it. Only files that a reader recognises count.
     """
     files = _files_beside(video)
     candidates = [each for each in files if each.suffix.lower() in _SUFFIXES]
     if named := _named_like(video, candidates):
         return named
-    if any(each.suffix.lower() in _VIDEO_SUFFIXES for each in files):
+    videos = {each.name for each in files if each.suffix.lower() in _VIDEO_SUFFIXES}
+    if videos - {each.name for each in same_flight}:
         return None
-    return _only_one(list(filter(is_telemetry, candidates)))
+    return _only_one(logs_beside(video))
 
 
 def logs_beside(video: Path) -> list[Path]:

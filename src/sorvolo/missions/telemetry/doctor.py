@@ -405,8 +405,10 @@ def _written(
 
 
 def _video(source: Source) -> Path | None:
-    """The video file of a flight; None for photos."""
-    return source.info.path if isinstance(source, VideoSource) else None
+    """The video file of a flight; None for photos, and for chapters, which are several files."""
+    if not isinstance(source, VideoSource) or len(source.files) > 1:
+        return None
+    return source.info.path
 
 
 def _samples(
