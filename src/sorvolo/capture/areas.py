@@ -141,20 +141,27 @@ def _segment(
         raise InputError(
             f"{path}: {name} needs the property poa, the probability (0 to 1) that the missing is there"
         )
-    polygons = _geojson_polygons(path, feature, to_wgs84)
+    polygons, _ = _geojson_shapes(path, feature, to_wgs84)
     return name, Area(tuple(polygons), name), stated[0]
 
 
-def _geojson_polygons(
-    path: Path, feature: Any, to_wgs84: Callable[[Floats], Floats]
-) -> list[Rings]:
+def _geojson_shapes(
+    path: Path, tree: Any, to_wgs84: Callable[[Floats], Floats]
+) -> tuple[list[Rings], list[Floats]]:
+    """The polygons and the lines of a GeoJSON object."""
     polygons: list[Rings] = []
-    for geometry in _geometries(feature):
-        if geometry["type"] == "Polygon":
-            polygons.append(_geojson_rings(path, geometry["coordinates"]))
-        elif geometry["type"] == "MultiPolygon":
-            polygons += [_geojson_rings(path, each) for each in geometry["coordinates"]]
-    return [tuple(map(to_wgs84, rings)) for rings in polygons]
+    lines: list[Floats] = []
+    for geometry in _geometries(tree):
+        kind, coordinates = geometry["type"], geometry["coordinates"]
+        if kind in ("Polygon", "LineString"):
+            coordinates = [coordinates]
+        if kind in ("Polygon", "MultiPolygon"):
+            polygons += [
+                tuple(to_wgs84(_positions(path, ring)) for ring in rings) for rings in coordinates
+            ]
+        elif kind in ("LineString", "MultiLineString"):
+            lines += [to_wgs84(_positions(path, line)) for line in coordinates]
+    return polygons, lines
 
 
 def _kml_in_kmz(path: Path, raw: bytes) -> bytes:
@@ -179,17 +186,7 @@ def _from_geojson(path: Path, text: str) -> list[Rings]:
         tree = json.loads(text)
         if tree.get("fileType") == "Plan":
             return _from_plan(path, tree)
-        polygons, lines = [], []
-        for geometry in _geometries(tree):
-            kind, coordinates = geometry["type"], geometry["coordinates"]
-            if kind == "Polygon":
-                polygons.append(_geojson_rings(path, coordinates))
-            elif kind == "MultiPolygon":
-                polygons += [_geojson_rings(path, each) for each in coordinates]
-            elif kind == "LineString":
-                lines.append(_positions(path, coordinates))
-            elif kind == "MultiLineString":
-                lines += [_positions(path, each) for each in coordinates]
+        polygons, lines = _geojson_shapes(path, tree, _wgs84_from_stated(path, tree))
     except (
         ValueError,
         RecursionError,
@@ -197,21 +194,13 @@ def _from_geojson(path: Path, text: str) -> list[Rings]:
         raise InputError(f"{path}: broken GeoJSON: {error}") from error
     except (KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: GeoJSON without the expected member: {error}") from error
-    to_wgs84 = _wgs84_from_stated(path, tree)
-    return _polygons_or_corridors(
-        path,
-        [tuple(map(to_wgs84, rings)) for rings in polygons],
-        list(map(to_wgs84, lines)),
-    )
+    return _polygons_or_corridors(path, polygons, lines)
 
 
 def _wgs84_from_stated(path: Path, tree: Any) -> Callable[[Floats], Floats]:
     """From the positions, (N, 2), of a GeoJSON file to WGS84, by its member `crs`, which files before 2016 have."""
     stated = tree.get("crs")
-    if stated is None:
-        return lambda lonlat: _checked(path, lonlat, _LONGITUDE_FIRST)
-    properties = stated.get("properties") if isinstance(stated, dict) else None
-    name = str(properties.get("name", "") if isinstance(properties, dict) else "")
+    name = "CRS84" if stated is None else str(stated["properties"]["name"])
     if re.search(r"CRS84h?$", name):
         return lambda lonlat: _checked(path, lonlat, _LONGITUDE_FIRST)
     code = re.fullmatch(r"(?:urn:ogc:def:crs:)?EPSG:(?:[\d.]*:)?(\d+)", name)
@@ -252,10 +241,6 @@ def _geometries(tree: Any) -> Iterator[Any]:
             yield from _geometries(geometry)
     else:
         yield tree
-
-
-def _geojson_rings(path: Path, coordinates: Sequence[Any]) -> Rings:
-    return tuple(_positions(path, ring) for ring in coordinates)
 
 
 def _positions(path: Path, positions: Sequence[Any]) -> Floats:

@@ -25,6 +25,7 @@ _MRK_LINE = re.compile(
     r"\s+(\d[\d.]*),\s*(\d[\d.]*),\s*(\d[\d.]*)\s+(\d+),Q",
     re.MULTILINE,
 )
+_CRS = re.compile(r"EPSG:|WGS ?84|\+proj", re.IGNORECASE)
 _NUMBER_OF_PHOTO = re.compile(r"(\d{3,5})(?:_[A-Za-z]+)?$")
 _GPS_EPOCH_NS = int(datetime(1980, 1, 6, tzinfo=UTC).timestamp()) * SECOND_NS
 _WEEK_NS = 7 * 86_400 * SECOND_NS
@@ -45,7 +46,7 @@ def is_position_file(path: Path) -> bool:
         return False
     lines = list(_lines(text))
     return _MRK_LINE.search(text) is not None or (
-        len(lines) > 1 and _is_geo_row(lines[1][1]) and _crs_or_none(lines[0][1]) is not None
+        len(lines) > 1 and _CRS.match(lines[0][1]) is not None and _is_geo_row(lines[1][1])
     )
 
 
@@ -167,13 +168,6 @@ def _is_geo_row(row: str) -> bool:
         and not isfinite(_float(fields[0]))
         and all(isfinite(_float(each)) for each in fields[1:3])
     )
-
-
-def _crs_or_none(words: str) -> object:
-    try:
-        return crs_from_words(words)
-    except GeometryError:
-        return None
 
 
 def _plain_stem(name: str) -> str:

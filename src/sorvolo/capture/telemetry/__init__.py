@@ -136,16 +136,13 @@ def _only_one(known: Sequence[Path]) -> Path | None:
 
 def unusable_files_beside(video: Path) -> list[Path]:
     """Files named as the video's telemetry would be that no reader recognises, empty ones of failed cards included."""
-    if not video.parent.is_dir():
-        return []
     stem = video.stem.lower()
     names = {stem, video.name.lower(), *(pattern.format(stem) for pattern in _BESIDE)}
     return sorted(
         each
-        for each in video.parent.iterdir()
+        for each in _files_beside(video)
         if each.suffix.lower() in (*_SUFFIXES, *_UNREAD_SUFFIXES)
         and each.stem.lower() in names
-        and each.is_file()
         and not is_telemetry(each)
     )
 
