@@ -88,12 +88,7 @@ def test_a_flight_comes_back_whole(folder: Path) -> None:
         assert flight.frames == {"vision": 4, "gps-only": 0, "rejected": 1}
         assert flight.started_utc <= flight.finished_utc
         (entry,) = archive.versions()
-        assert (entry.id, entry.flight_id, entry.tiles, entry.complete) == (
-            version,
-            "morning",
-            4,
-            True,
-        )
+        assert (entry.id, entry.flight_id, entry.tiles) == (version, "morning", 4)
         tiles = archive.tiles()
         assert set(tiles) == {(-1, 0), (0, 0), (1, 0), (2, 0)}
         assert np.array_equal(tiles[2, 0], tile(23))

@@ -113,7 +113,7 @@ def run_on_site(
     newest = 0
     if is_site(place.folder):
         with Archive.open(place.folder, write=False, catalogues=catalogues) as archive:
-            newest = max((entry.id for entry in archive.versions() if entry.complete), default=0)
+            newest = max((entry.id for entry in archive.versions()), default=0)
     updates = place.sent(mission)
     repeated: list[AlreadyDone] = []
 
@@ -128,9 +128,7 @@ def run_on_site(
             f"{flight.flight} is {done} already ({moment} UTC); --again repeats it", err=True
         )
     with Archive.open(place.folder, write=False, catalogues=catalogues) as archive:
-        made = [
-            entry.flight_id for entry in archive.versions() if entry.complete and entry.id > newest
-        ]
+        made = [entry.flight_id for entry in archive.versions() if entry.id > newest]
         return [
             archive.flight_folder(name) for name in (*made, *(each.flight for each in repeated))
         ]

@@ -112,7 +112,7 @@ def existing_site(folder: Path, *, with_ground: bool = False) -> ExistingSite | 
     try:
         with Archive.open(folder, write=False) as archive:
             flights = {each.id: each.fingerprint for each in archive.flights()}
-            founder = next((each.flight_id for each in archive.versions() if each.complete), "")
+            founder = next((each.flight_id for each in archive.versions()), "")
             ground = _ground(archive) if with_ground else None
             return ExistingSite(frozenset(flights.values()), flights.get(founder, ""), ground)
     except StoreError:  # the flights that go there will state why

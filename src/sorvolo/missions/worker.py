@@ -381,7 +381,7 @@ def _newest_version(site: Path) -> int:
     if not is_site(site):
         return 0
     with Archive.open(site, write=False) as archive:
-        return max((each.id for each in archive.versions() if each.complete), default=0)
+        return max((each.id for each in archive.versions()), default=0)
 
 
 def _noting(updates: Generator[T, None, Any], known: list[str]) -> Iterator[T]:
@@ -399,9 +399,7 @@ def _mapped(journal: Journal, site: Path, before: int, known: Sequence[str]) -> 
     from sorvolo.survey.objects import PERSON
 
     with Archive.open(site, write=False) as archive:
-        since = [
-            each.flight_id for each in archive.versions() if each.complete and each.id > before
-        ]
+        since = [each.flight_id for each in archive.versions() if each.id > before]
         flights = since or known
         reports = [archive.report(each) for each in flights]
         people = [

@@ -314,7 +314,7 @@ def _objects(archive: Archive) -> list[Feature]:
 
 def _changes(archive: Archive) -> list[Feature]:
     stored = archive.changes()
-    versions = {each.flight_id: each for each in archive.versions() if each.complete}
+    versions = {each.flight_id: each for each in archive.versions()}
     features = []
     for change, each in zip(
         stored, changes_geojson(stored, on_earth(archive.site()))["features"], strict=True
@@ -445,7 +445,7 @@ def _content(archive: Archive) -> object:
             for flight in _flights(archive)
             for name in names
         ],
-        [each.id for each in archive.versions() if each.complete],
+        [each.id for each in archive.versions()],
         [(each.change_id, each.verdict, each.at_utc, each.note) for each in archive.reviews()],
         _modified(archive, _POD_FILE),
         _modified(archive, LIVE_COVERAGE),

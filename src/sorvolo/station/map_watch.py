@@ -81,7 +81,7 @@ class MapWatch:
         if before is not None and before.mark == mark:
             return
         state = self._tiles.live(site_id) if archive.has_site else None
-        versions = sum(each.complete for each in archive.versions())
+        versions = len(archive.versions())
         self._seen[site_id] = _Seen(mark, state, versions)
         if before is None:
             self._reviews.settle(site_id)  # those that waited when the station was ended

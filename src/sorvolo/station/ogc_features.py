@@ -414,7 +414,7 @@ def _assets(
 
 
 def _complete(archive: Archive) -> Sequence[VersionEntry]:
-    return [each for each in archive.versions() if each.complete]
+    return archive.versions()
 
 
 def _bbox(archive: Archive, version: int | None) -> list[float] | None:

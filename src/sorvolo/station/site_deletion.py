@@ -151,7 +151,7 @@ class SiteDeletion:
                 410, f"the site {site_id!r} was deleted meanwhile; /api/sites lists the others"
             ) from error
         try:
-            complete = [each for each in self._shelf.open(site_id).versions() if each.complete]
+            complete = self._shelf.open(site_id).versions()
         except (
             StoreError,
             Problem,

@@ -157,7 +157,7 @@ def site_summary(site_id: str, archive: Archive) -> dict[str, Any]:
             "m_per_px": None,
         }
     site = archive.site()
-    complete = [each for each in archive.versions() if each.complete]
+    complete = archive.versions()
     bounds = bounds_lonlat(list(archive.live_tiles()), archive.site_grid())
     center = None if bounds is None else [(bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2]
     return {
@@ -179,7 +179,7 @@ def site_detail(site_id: str, archive: Archive) -> dict[str, Any]:
     compared = {each.flight_id for each in versions if each.id in comparisons}
     return {
         **site_summary(site_id, archive),
-        "versions": [version_row(each) for each in versions if each.complete],
+        "versions": [version_row(each) for each in versions],
         "flights": [
             _flight_row(each, archive, versions, compared)
             for each in archive.flights()
@@ -206,11 +206,7 @@ def _flight_row(
 ) -> dict[str, Any]:
     frames: Mapping[str, Any] = archive.report(flight.id).get("frames") or {}
     flown = next(
-        (
-            each.flown_utc
-            for each in reversed(versions)
-            if each.flight_id == flight.id and each.complete
-        ),
+        (each.flown_utc for each in reversed(versions) if each.flight_id == flight.id),
         "",
     )
     reasons = frames.get("reasons")

@@ -287,7 +287,7 @@ class WebTiles:
         )
 
     def _version(self, site_id: str, archive: Archive, number: int) -> TilePyramid:
-        if number not in {each.id for each in archive.versions() if each.complete}:
+        if number not in {each.id for each in archive.versions()}:
             raise Problem(
                 404, f"the map has no version {number}; /api/sites/{site_id} lists those there are"
             )
@@ -315,9 +315,8 @@ class WebTiles:
 
 def _is_exported(archive: Archive, name: str) -> bool:
     """Whether a state, a version's number or `live`, is the one that the map's GeoTIFF shows."""
-    versions = archive.versions()
-    newest = max((each.id for each in versions if each.complete), default=0)
-    shown = newest if name == "live" and all(each.complete for each in versions) else name
+    newest = max((each.id for each in archive.versions()), default=0)
+    shown = newest if name == "live" and not archive.is_growing else name
     return str(shown) == str(newest) and newest == archive.exported_version
 
 
@@ -537,7 +536,6 @@ def document(archive: Archive, base: str) -> str:
                 each.id
             ): f"version {each.id}, {each.flown_utc or each.created_utc}, {each.flight_id}"
             for each in archive.versions()
-            if each.complete
         }
         bounds = bounds_lonlat(list(archive.live_tiles()), archive.site_grid())
         layers = [

@@ -363,7 +363,7 @@ def _begun(
 
 def _base_version(archive: Archive, source: Source) -> tuple[int, bool]:
     """The version to compare with, and whether the flight may paint: the newest, or the one before its own."""
-    complete = [version for version in archive.versions() if version.complete]
+    complete = archive.versions()
     own = next(
         (version for version in reversed(complete) if version.flight_id == source.name), None
     )

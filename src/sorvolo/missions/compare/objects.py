@@ -42,11 +42,7 @@ class ComparisonObjects:
         self._classes: ChangeClasses | None = None
         self._before = SearchedGround()
         if detector is not None:
-            before = {
-                each.flight_id
-                for each in archive.versions()
-                if each.complete and each.id <= base_version
-            }
+            before = {each.flight_id for each in archive.versions() if each.id <= base_version}
             known = [each.thing for each in archive.newest_objects(before - {self._name})]
             searched = [
                 each.frames

@@ -270,9 +270,7 @@ def cache_of_run(
         key = _live_key(archive, request)
     else:
         site = archive.site() if archive.has_site else None
-        versions = [
-            (each.id, each.run_id, each.flight_id) for each in archive.versions() if each.complete
-        ]
+        versions = [(each.id, each.run_id, each.flight_id) for each in archive.versions()]
         key = content_sha256(request, setup.plan, setup.frame.origin, site, versions)
     journal = archive.journal(setup.source.name, key, build(), anew=anew)
     return ResultCache(journal, setup.source)
@@ -290,5 +288,5 @@ def go_on_live(source: Source, archive: Archive, asked: tuple[Any, ...], most_ga
 
 def _live_key(archive: Archive, request: str) -> str:
     """Return a key that is known before anything is known of the flight."""
-    versions = [(each.id, each.run_id) for each in archive.versions() if each.complete]
+    versions = [(each.id, each.run_id) for each in archive.versions()]
     return content_sha256(request, versions)

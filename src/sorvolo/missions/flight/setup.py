@@ -291,7 +291,7 @@ def repeated(archive: Archive, source: Source, done: str) -> tuple[Notice, ...]:
     name the same flight counts twice."""
     if not archive.has_site:
         return ()
-    versions = {each.flight_id: each.id for each in archive.versions() if each.complete}
+    versions = {each.flight_id: each.id for each in archive.versions()}
     notices = [
         Notice(
             "same_flight",
@@ -316,7 +316,7 @@ def repeated(archive: Archive, source: Source, done: str) -> tuple[Notice, ...]:
 
 def founds_site(archive: Archive, flight: str) -> bool:
     """Whether the site shows this flight alone."""
-    return {each.flight_id for each in archive.versions() if each.complete} == {flight}
+    return {each.flight_id for each in archive.versions()} == {flight}
 
 
 def known_ground_m(archive: Archive) -> PointsM | None:

@@ -308,7 +308,7 @@ def _map_warnings(mapped: Mapping[str, Any]) -> list[str]:
 
 def newest_flight(archive: Archive) -> str:
     """The flight that made the newest map. Raises InputError while there is none."""
-    complete = [each for each in archive.versions() if each.complete]
+    complete = archive.versions()
     if not complete:
         raise InputError(
             f"{archive.folder} has no flight yet; map one: sorvolo map INPUT --site {archive.folder}"

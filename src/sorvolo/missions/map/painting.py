@@ -74,7 +74,7 @@ class KnownKeyframes:
         self.stored: list[StoredKeyframe] = []
         self._ranks: list[int] = []
         if archive.has_site:
-            newest = next((v for v in reversed(archive.versions()) if v.complete), None)
+            newest = next(reversed(archive.versions()), None)
             left_out = flight if newest is not None and newest.flight_id == flight else None
             self.stored = [each for each in archive.sound_keyframes() if each.flight_id != left_out]
             rank_of = {each.id: each.rank for each in archive.flights()}

@@ -40,7 +40,7 @@ def flights_to_search(archive: Archive, wanted: Sequence[str]) -> list[str]:
 
 
 def _mapped(archive: Archive) -> list[str]:
-    complete = {each.flight_id for each in archive.versions() if each.complete}
+    complete = {each.flight_id for each in archive.versions()}
     return [each.id for each in archive.flights() if each.id in complete]
 
 

@@ -50,7 +50,7 @@ class HistoryEntry:
 def site_history(site: Path) -> list[HistoryEntry]:
     """Every complete version of the map, oldest first. Raises StoreError when the folder is no site."""
     with Archive.open(site, write=False) as archive:
-        versions = [version for version in archive.versions() if version.complete]
+        versions = archive.versions()
         last_of = {version.flight_id: version.id for version in versions}
         comparisons = archive.comparisons()
         verdicts = [(each.flight_id, each.verdict) for each in archive.changes()]
@@ -99,11 +99,9 @@ def find_version(archive: Archive, at: str) -> VersionEntry:
     Raises InputError when there is none, SettingsError when `at` is neither.
     """
     if at.isdecimal() and len(at) < 8:  # eight digits are an ISO date without dashes
-        found = [
-            version for version in archive.versions() if version.complete and version.id == int(at)
-        ]
+        found = [version for version in archive.versions() if version.id == int(at)]
         if not found:
-            numbers = [str(version.id) for version in archive.versions() if version.complete]
+            numbers = [str(version.id) for version in archive.versions()]
             raise InputError(
                 f"{archive.folder} has no version {at} of its map; it has {', '.join(numbers) or 'none'}"
             )
@@ -121,7 +119,7 @@ def export_version(
     """
     _check_target(path)
     with Archive.open(site, write=False) as archive:
-        complete = [version for version in archive.versions() if version.complete]
+        complete = archive.versions()
         if not complete:
             raise InputError(f"{site} has no map yet; map a flight into it first")
         version = complete[-1] if at is None else find_version(archive, at)

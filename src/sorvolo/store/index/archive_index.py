@@ -128,7 +128,7 @@ def site_state(archive: Archive) -> IndexedState:
 def flight_rows(archive: Archive, wanted: Collection[str]) -> Iterator[FlightRows]:
     """The rows of these flights; a broken frames.geojson counts as missing. Raises StoreError as `Archive` does."""
     site, compared = archive.site(), archive.comparisons()
-    versions = {each.flight_id: each for each in archive.versions() if each.complete}
+    versions = {each.flight_id: each for each in archive.versions()}
     for each in _complete(archive):
         if each.id not in wanted:
             continue

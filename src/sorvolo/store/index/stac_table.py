@@ -195,7 +195,7 @@ def site_items(
     if not archive.has_site or archive.site().is_local:
         return
     site = archive.site()
-    versions = [version for version in archive.versions() if version.complete]
+    versions = archive.versions()
     grounds = {version.id: _ground(archive, version.id) for version in versions}
     shown = [(version, place) for version in versions if (place := grounds[version.id]) is not None]
     if shown:

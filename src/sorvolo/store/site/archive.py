@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -171,7 +172,7 @@ class Archive:
         A flight whose clock has no date counts from when its map was made. Raises InputError when there was no map yet.
         """
         utc = moment.replace(tzinfo=UTC) if moment.tzinfo is None else moment.astimezone(UTC)
-        complete = [entry for entry in self.versions() if entry.complete]
+        complete = self.versions()
         known = [entry for entry in complete if entry.moment <= utc]
         if not known:
             earliest = min((entry.moment for entry in complete), default=None)
@@ -307,6 +308,11 @@ class Archive:
             )
         newest = self.catalogue_rows(records.newest_version)
         return self.version_tiles(newest if version is None else version)
+
+    @property
+    def is_growing(self) -> bool:
+        """Whether a version of the map is being made."""
+        return self.catalogue_rows(partial(records.newest_version, complete=False)) > 0
 
     def live_tiles(self) -> TileView:
         """The tiles of the map that is being made, as of its last flush; else of the newest complete one."""
@@ -583,7 +589,7 @@ class Archive:
         return SiteGrid.at(site.origin, site.m_per_px, site.crs)
 
     def versions(self) -> list[VersionEntry]:
-        """Every state of the map, oldest first."""
+        """Every state of the map, oldest first; not one that is being made."""
         return self.catalogue_rows(records.list_versions)
 
     def version_tiles(self, version_id: int) -> TileView:

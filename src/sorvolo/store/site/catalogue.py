@@ -83,7 +83,6 @@ class VersionEntry:
     flight_id: str
     created_utc: str
     tiles: int
-    complete: bool
     export_crs: str
     run_id: int
     flown_ns: int = -1
@@ -268,7 +267,7 @@ def _named(row: Row[Any], record: Any, *without: str) -> dict[str, Any]:
 
 
 def list_versions(connection: Connection) -> list[VersionEntry]:
-    """Every version, oldest first."""
+    """Every version, oldest first; not one that is being made."""
     tiles = func.count(schema.version_tiles.c.sha256)
     flown = schema.checked_rows(connection, schema.flown, select(schema.flown))
     flown_ns = {row.version_id: row.first_ns for row in flown}
@@ -276,6 +275,7 @@ def list_versions(connection: Connection) -> list[VersionEntry]:
     rows = connection.execute(
         select(schema.versions, tiles.label("tiles"))
         .outerjoin(schema.version_tiles, schema.version_tiles.c.version_id == schema.versions.c.id)
+        .where(schema.versions.c.complete.is_(True))
         .group_by(schema.versions.c.id)
         .order_by(schema.versions.c.id)
     )
@@ -381,7 +381,7 @@ def begin_run(
             "files_written": False,
         },
     )
-    newest = next((v for v in reversed(list_versions(connection)) if v.complete), None)
+    newest = next(reversed(list_versions(connection)), None)
     base_id = (
         0 if newest is None else newest.parent_id if newest.flight_id == flight_id else newest.id
     )

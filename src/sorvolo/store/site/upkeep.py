@@ -60,7 +60,7 @@ def repair(files: "Archive") -> None:
     with files.catalogue.reading() as connection:
         owed = records.owed_files(connection)
         shown = records.derived_version(connection)
-    newest = next((each for each in reversed(files.versions()) if each.complete), None)
+    newest = next(reversed(files.versions()), None)
     with ThreadPoolExecutor(1, thread_name_prefix="map files") as other:
         waiting: list[Future[None]] = []
         if newest is not None and not _is_shown(files, newest, shown):
