@@ -14,7 +14,8 @@ from sorvolo.errors import SettingsError
 from sorvolo.station.app import station_app
 from sorvolo.station.settings import StationSettings
 from sorvolo.station.sites import bounds_lonlat
-from sorvolo.station.tiles import BytesCache, TilePyramid, render
+from sorvolo.station.tiles import TilePyramid, render
+from sorvolo.store.images import BytesCache
 from sorvolo.store.site.archive import Archive
 from waiting import wait_for
 

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sorvolo.station.tiles import BytesCache, MapOverview, TilePyramid, halved
+from sorvolo.station.tiles import MapOverview, TilePyramid, halved
+from sorvolo.store.images import BytesCache
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.tiles import TileView
 

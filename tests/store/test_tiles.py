@@ -204,7 +204,7 @@ def test_the_image_cache_is_bounded_in_bytes() -> None:
 
 def test_tiles_read_from_disk_take_no_more_memory_than_is_allowed(tmp_path: Path) -> None:
     blobs = TileBlobs(tmp_path)
-    blobs.cache_bytes = 2 * SIDE * SIDE * 4
+    blobs.cache.most_bytes = 2 * SIDE * SIDE * 4
     hashes = [blobs.save(flat(colour)) for colour in (1, 2, 3)]
     first, second, third = (blobs.load(each) for each in hashes)
     assert blobs.load(hashes[2]) is third

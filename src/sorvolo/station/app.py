@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import uvicorn
-from fastapi import APIRouter, Body, Depends, FastAPI, Request, Response
+from fastapi import APIRouter, Body, FastAPI, Request, Response
 from fastapi.responses import FileResponse, JSONResponse
 from starlette.staticfiles import StaticFiles
 
@@ -232,7 +232,7 @@ def _about_routes(station: Station) -> APIRouter:
             "base_map_url": None if station.settings.base_map is None else _BASE_MAP,
         }
 
-    @router.get(_BASE_MAP, dependencies=[Depends(needs(Role.VIEW))], response_class=FileResponse)
+    @router.get(_BASE_MAP, dependencies=[needs(Role.VIEW)], response_class=FileResponse)
     def base_map() -> Response:
         """The base map as PMTiles, read in ranges; 404 where the station was given none."""
         path = station.settings.base_map
@@ -281,9 +281,7 @@ def _about_routes(station: Station) -> APIRouter:
 
 
 def _site_routes(station: Station) -> APIRouter:
-    router = APIRouter(
-        prefix="/api/sites", tags=["sites"], dependencies=[Depends(needs(Role.VIEW))]
-    )
+    router = APIRouter(prefix="/api/sites", tags=["sites"], dependencies=[needs(Role.VIEW)])
 
     @router.get("")
     def sites() -> list[dict[str, Any]]:

@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 from anyio import CapacityLimiter, to_thread
-from fastapi import APIRouter, Depends, Response
+from fastapi import APIRouter, Response
 from fastapi.responses import FileResponse
 
 from sorvolo.child_process import python_command
@@ -20,10 +20,9 @@ from sorvolo.station.inputs import Inputs
 from sorvolo.station.problems import Problem
 from sorvolo.station.security import needs
 from sorvolo.station.sites import SiteShelf
-from sorvolo.station.tiles import BytesCache
 from sorvolo.station.tokens import Role
 from sorvolo.store.exports.change_files import CROPS, crop_name, crop_names
-from sorvolo.store.images import jpeg_from_image, rgba_from_png
+from sorvolo.store.images import BytesCache, jpeg_from_image, rgba_from_png
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import StoredKeyframe
 
@@ -44,7 +43,7 @@ def crop_routes(shelf: SiteShelf, findings: Findings) -> APIRouter:
     """Pictures by the id of what they show; never by a path."""
     cutting = CapacityLimiter(_AT_ONCE)
     router = APIRouter(
-        prefix="/api/sites/{site}/crops", tags=["crops"], dependencies=[Depends(needs(Role.VIEW))]
+        prefix="/api/sites/{site}/crops", tags=["crops"], dependencies=[needs(Role.VIEW)]
     )
 
     @router.get("/change/{change_id}/{n}.jpg", response_class=JpegResponse)
@@ -170,9 +169,7 @@ class FlightVideos:
 
 def video_routes(shelf: SiteShelf, collections: SiteCollections, videos: FlightVideos) -> APIRouter:
     """A flight's video, and pictures of a place cut from it."""
-    router = APIRouter(
-        prefix="/api/sites/{site}", tags=["memory"], dependencies=[Depends(needs(Role.VIEW))]
-    )
+    router = APIRouter(prefix="/api/sites/{site}", tags=["memory"], dependencies=[needs(Role.VIEW)])
     cutting = CapacityLimiter(_VIDEOS_AT_ONCE)
     cache = BytesCache[tuple[Any, ...], bytes](_CACHE_BYTES, len)
 

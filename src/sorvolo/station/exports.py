@@ -119,7 +119,7 @@ def tilejson_address(site: str, cog: Cog) -> str:
 def cog_routes(shelf: SiteShelf) -> list[APIRouter]:
     """The list of a site's rasters, and titiler's routes below each."""
     listing = APIRouter(
-        prefix="/api/sites/{site}/cogs", tags=["rasters"], dependencies=[Depends(needs(Role.VIEW))]
+        prefix="/api/sites/{site}/cogs", tags=["rasters"], dependencies=[needs(Role.VIEW)]
     )
 
     @listing.get("")
@@ -140,7 +140,7 @@ def cog_routes(shelf: SiteShelf) -> list[APIRouter]:
         render_func=_rendered,
         environment_dependency=lambda: dict(_GDAL),
         router=APIRouter(
-            tags=["rasters"], dependencies=[Depends(needs(Role.VIEW)), Depends(_within_bounds)]
+            tags=["rasters"], dependencies=[needs(Role.VIEW), Depends(_within_bounds)]
         ),
     )
     below = APIRouter()
@@ -233,7 +233,7 @@ class ExportFile:
 def export_routes(shelf: SiteShelf, collections: SiteCollections) -> APIRouter:
     """What can be taken away, each by its id; a profile of heights."""
     router = APIRouter(
-        prefix="/api/sites/{site}", tags=["exports"], dependencies=[Depends(needs(Role.VIEW))]
+        prefix="/api/sites/{site}", tags=["exports"], dependencies=[needs(Role.VIEW)]
     )
 
     @router.get("/exports")

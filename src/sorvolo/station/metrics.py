@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from fastapi import APIRouter, Depends, Response
+from fastapi import APIRouter, Response
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
@@ -71,7 +71,7 @@ def metrics_routes(metrics: StationMetrics) -> APIRouter:
     """`/metrics`, for whoever may view the station."""
     router = APIRouter(tags=["station"])
 
-    @router.get("/metrics", dependencies=[Depends(needs(Role.VIEW))], response_class=Response)
+    @router.get("/metrics", dependencies=[needs(Role.VIEW)], response_class=Response)
     def show_metrics() -> Response:
         """All figures in Prometheus' text format."""
         return Response(generate_latest(metrics.registry), media_type=CONTENT_TYPE_LATEST)

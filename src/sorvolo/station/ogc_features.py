@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 from typing import Any
 from urllib.parse import quote, urlencode
 
-from fastapi import APIRouter, Depends, Query, Request
+from fastapi import APIRouter, Query, Request
 from fastapi.responses import JSONResponse
 
 from sorvolo.station.collections import TITLES, Collection, Feature, SiteCollections
@@ -49,7 +49,7 @@ def landing_links(request: Request, site: str) -> list[dict[str, str]]:
 def feature_routes(collections: SiteCollections, reviews: Reviews) -> APIRouter:
     """Conformance, collections and items of each site."""
     router = APIRouter(
-        prefix="/api/sites/{site}", tags=["features"], dependencies=[Depends(needs(Role.VIEW))]
+        prefix="/api/sites/{site}", tags=["features"], dependencies=[needs(Role.VIEW)]
     )
 
     @router.get("/conformance")
@@ -302,7 +302,7 @@ _VERSION = "1.1.0"
 
 def stac_routes(shelf: SiteShelf) -> APIRouter:
     """The catalogue of all sites, the collection of each, the items of its versions."""
-    router = APIRouter(prefix="/api/stac", tags=["STAC"], dependencies=[Depends(needs(Role.VIEW))])
+    router = APIRouter(prefix="/api/stac", tags=["STAC"], dependencies=[needs(Role.VIEW)])
 
     @router.get("")
     def catalogue() -> dict[str, Any]:

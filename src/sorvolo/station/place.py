@@ -8,7 +8,7 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
-from fastapi import APIRouter, Depends, Query
+from fastapi import APIRouter, Query
 from shapely import Point
 
 from sorvolo.errors import StoreError
@@ -117,7 +117,7 @@ def place_routes(
     index: PlaceIndex,
 ) -> APIRouter:
     """What is remembered of a place."""
-    router = APIRouter(prefix="/api", tags=["memory"], dependencies=[Depends(needs(Role.VIEW))])
+    router = APIRouter(prefix="/api", tags=["memory"], dependencies=[needs(Role.VIEW)])
 
     @router.get("/place")
     def place_of_all(

@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Depends, Query
+from fastapi import APIRouter, Query
 from pydantic import BaseModel, ConfigDict, Field
 
 from sorvolo.errors import SorvoloError, StoreError
@@ -217,7 +217,7 @@ def review_routes(reviews: Reviews, shelf: SiteShelf) -> APIRouter:
     """Verdicts listed and given."""
     router = APIRouter(prefix="/api/sites/{site}/reviews", tags=["reviews"])
 
-    @router.get("", dependencies=[Depends(needs(Role.VIEW))])
+    @router.get("", dependencies=[needs(Role.VIEW)])
     def history(
         site: str,
         kind: Literal["", "object", "change", "finding"] = "",
@@ -227,9 +227,7 @@ def review_routes(reviews: Reviews, shelf: SiteShelf) -> APIRouter:
         return [asdict(each) for each in reviews.history(site, kind, id)]
 
     @router.post("", status_code=201)
-    def give(
-        site: str, wish: ReviewWish, holder: Holder = Depends(needs(Role.REVIEW))
-    ) -> dict[str, Any]:
+    def give(site: str, wish: ReviewWish, holder: Holder = needs(Role.REVIEW)) -> dict[str, Any]:
         """Confirm or reject an object, a change or a finding, or withdraw a verdict. 409 where another came first."""
         return asdict(reviews.give(site, wish, holder.name))
 
@@ -371,12 +369,12 @@ def drawing_routes(drawings: Drawings) -> APIRouter:
     """Drawings read and kept."""
     router = APIRouter(prefix="/api/sites/{site}/drawings", tags=["drawings"])
 
-    @router.get("", dependencies=[Depends(needs(Role.VIEW))])
+    @router.get("", dependencies=[needs(Role.VIEW)])
     def get(site: str) -> dict[str, Any]:
         """Areas of interest, alert zones and waypoints of a site."""
         return drawings.get(site)
 
-    @router.put("", dependencies=[Depends(needs(Role.REVIEW))])
+    @router.put("", dependencies=[needs(Role.REVIEW)])
     def put(site: str, wish: DrawingsWish) -> dict[str, Any]:
         """Put all drawings of a site; 409 where they changed since they were read."""
         return drawings.put(site, wish)

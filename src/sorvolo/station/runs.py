@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from fastapi import APIRouter, Depends, Query
+from fastapi import APIRouter, Query
 
 from sorvolo.child_process import python_command
 from sorvolo.missions.worker import BOXES, MOTION, TO_CHECK
@@ -676,12 +676,12 @@ def run_routes(runs: Runs, inputs: Inputs, ingest: Ingest) -> APIRouter:
     """Missions by the API, as from the command line."""
     router = APIRouter(tags=["runs"])
 
-    @router.get("/api/inputs", dependencies=[Depends(needs(Role.VIEW))])
+    @router.get("/api/inputs", dependencies=[needs(Role.VIEW)])
     def list_inputs() -> list[dict[str, Any]]:
         """Videos, folders of photos, telemetry and camera files below the station's folder."""
         return [input_row(each) for each in inputs.all()]
 
-    @router.get("/api/runs", dependencies=[Depends(needs(Role.VIEW))])
+    @router.get("/api/runs", dependencies=[needs(Role.VIEW)])
     def all_runs(
         site: str = Query("", max_length=200),
         limit: int = Query(200, ge=1, le=1000),
@@ -690,23 +690,21 @@ def run_routes(runs: Runs, inputs: Inputs, ingest: Ingest) -> APIRouter:
         return [run_row(each) for each in runs.all(limit, site)]
 
     @router.post("/api/runs", status_code=201)
-    def start(wish: RunWish, holder: Holder = Depends(needs(Role.OPERATE))) -> dict[str, Any]:
+    def start(wish: RunWish, holder: Holder = needs(Role.OPERATE)) -> dict[str, Any]:
         """Start a mission: map, compare, watch or search. 409 while another one writes into the site."""
         return run_row(runs.start(wish, holder.name))
 
-    @router.get("/api/runs/{run_id}", dependencies=[Depends(needs(Role.VIEW))])
+    @router.get("/api/runs/{run_id}", dependencies=[needs(Role.VIEW)])
     def one(run_id: str) -> dict[str, Any]:
         """A mission: its state (running, finished, incomplete, failed, stopped, lost), how far it is, how it ended."""
         return run_row(runs.get(run_id))
 
-    @router.post("/api/runs/{run_id}/stop", dependencies=[Depends(needs(Role.OPERATE))])
+    @router.post("/api/runs/{run_id}/stop", dependencies=[needs(Role.OPERATE)])
     def stop(run_id: str) -> dict[str, Any]:
         """Ask it to end: a live flight is finished and kept, a recorded one is left out."""
         return run_row(runs.stop(run_id))
 
-    @router.delete(
-        "/api/runs/{run_id}", status_code=204, dependencies=[Depends(needs(Role.OPERATE))]
-    )
+    @router.delete("/api/runs/{run_id}", status_code=204, dependencies=[needs(Role.OPERATE)])
     async def delete(run_id: str) -> None:
         """Take a mission that is over away: its record, what a watch found, the recording of its camera. The map that
         it made stays. 409 while it runs, 423 while another mission reads the recording."""

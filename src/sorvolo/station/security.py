@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from http.cookies import CookieError, SimpleCookie
 from typing import Any
 
+from fastapi import Depends
 from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -173,8 +174,8 @@ def holder_in(connection: HTTPConnection) -> Holder:
     return holder
 
 
-def needs(role: Role) -> Callable[[HTTPConnection], Awaitable[Holder]]:
-    """A route's demand: who asks has at least this role. Raises Problem (403)."""
+def needs(role: Role) -> Any:
+    """A route's dependency: who asks, as a Holder, has at least this role. Raises Problem (403)."""
 
     async def demanded(
         connection: HTTPConnection,
@@ -187,7 +188,7 @@ def needs(role: Role) -> Callable[[HTTPConnection], Awaitable[Holder]]:
             )
         return holder
 
-    return demanded
+    return Depends(demanded)
 
 
 def check_host(host: str, settings: StationSettings) -> None:

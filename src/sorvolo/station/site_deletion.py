@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Header, Response
+from fastapi import APIRouter, Header, Response
 
 from sorvolo.errors import StoreError
 from sorvolo.station.problems import Problem
@@ -194,9 +194,7 @@ class SiteDeletion:
 
 def site_deletion_routes(deletion: SiteDeletion) -> APIRouter:
     """What a site's deletion would take, and the deletion itself."""
-    router = APIRouter(
-        prefix="/api/sites", tags=["sites"], dependencies=[Depends(needs(Role.OPERATE))]
-    )
+    router = APIRouter(prefix="/api/sites", tags=["sites"], dependencies=[needs(Role.OPERATE)])
 
     @router.get("/{site}/deletion")
     def loss(site: str, response: Response) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Depends, Query, WebSocket
+from fastapi import APIRouter, Query, WebSocket
 from starlette.websockets import WebSocketDisconnect, WebSocketState
 
 from sorvolo.errors import InputError
@@ -22,20 +22,18 @@ def stream_routes(ingest: Ingest, runs: Runs) -> APIRouter:
     """`/api/streams`, `/api/ingest/{stream}` and `/api/streams/{stream}/video`."""
     router = APIRouter(tags=["streams"])
 
-    @router.get("/api/streams", dependencies=[Depends(needs(Role.VIEW))])
+    @router.get("/api/streams", dependencies=[needs(Role.VIEW)])
     def streams() -> list[dict[str, Any]]:
         """Every stream of which flights are kept, how many bytes those are, and what those do that are being sent."""
         return [each | {"bytes": ingest.kept_bytes(each["stream"])} for each in ingest.streams()]
 
-    @router.get("/api/streams/{stream}", dependencies=[Depends(needs(Role.VIEW))])
+    @router.get("/api/streams/{stream}", dependencies=[needs(Role.VIEW)])
     def one_stream(stream: str) -> dict[str, Any]:
         """One stream: its flights, and how the one goes that is being sent."""
         kept = {"viewers": ingest.viewers(stream), "bytes": ingest.kept_bytes(stream)}
         return ingest.state(stream) | kept | {"time_us": time.time_ns() // 1000}
 
-    @router.delete(
-        "/api/streams/{stream}", status_code=204, dependencies=[Depends(needs(Role.OPERATE))]
-    )
+    @router.delete("/api/streams/{stream}", status_code=204, dependencies=[needs(Role.OPERATE)])
     async def delete_all(stream: str) -> None:
         """Take all recordings of a stream away. 423 while a drone sends it, or a mission reads it."""
         with runs.unused_stream(stream):
@@ -44,7 +42,7 @@ def stream_routes(ingest: Ingest, runs: Runs) -> APIRouter:
     @router.delete(
         "/api/streams/{stream}/flights/{flight}",
         status_code=204,
-        dependencies=[Depends(needs(Role.OPERATE))],
+        dependencies=[needs(Role.OPERATE)],
     )
     async def delete_one(stream: str, flight: str) -> None:
         """Take one recording of a stream away. 423 while a drone sends it, or a mission reads the stream."""
@@ -53,7 +51,7 @@ def stream_routes(ingest: Ingest, runs: Runs) -> APIRouter:
 
     @router.websocket("/api/ingest/{stream}")
     async def take(
-        websocket: WebSocket, stream: str, _: Annotated[object, Depends(needs(Role.OPERATE))]
+        websocket: WebSocket, stream: str, _: Annotated[object, needs(Role.OPERATE)]
     ) -> None:
         """A drone's connection: binary messages as station/messages.py has them, acknowledged by number."""
         await websocket.accept()
@@ -63,7 +61,7 @@ def stream_routes(ingest: Ingest, runs: Runs) -> APIRouter:
     async def show(
         websocket: WebSocket,
         stream: str,
-        _: Annotated[object, Depends(needs(Role.VIEW))],
+        _: Annotated[object, needs(Role.VIEW)],
         mode: Annotated[Literal["annexb", "fmp4"], Query()] = "annexb",
     ) -> None:
         """The pictures as they came: JSON about the format first, then each picture, from the last key frame on."""

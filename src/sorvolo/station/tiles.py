@@ -4,19 +4,17 @@ import hashlib
 import os
 import re
 import threading
-from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from io import BytesIO
 from pathlib import Path
-from typing import Generic, TypeVar
 from urllib.parse import quote
 from xml.sax.saxutils import escape, quoteattr
 
 import cv2
 import numpy as np
-from fastapi import APIRouter, Depends, Request, Response
+from fastapi import APIRouter, Request, Response
 from PIL import Image
 from rasterio import DatasetReader
 from rasterio.enums import Resampling
@@ -30,50 +28,12 @@ from sorvolo.station.problems import Problem
 from sorvolo.station.security import needs
 from sorvolo.station.sites import SiteShelf, bounds_lonlat
 from sorvolo.station.tokens import Role
+from sorvolo.store.images import BytesCache
 from sorvolo.store.rasters.geotiff import crs_of_epsg, open_raster, quiet_gdal
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.tiles import TileView
 
 _MOST_LEVELS = 24  # halvings; a map of a million tiles a side needs 20
-
-
-Key = TypeVar("Key")
-Kept = TypeVar("Kept")
-
-
-class BytesCache(Generic[Key, Kept]):
-    """What was made last, up to a number of bytes; each thing is made once even if many ask at once."""
-
-    def __init__(self, most_bytes: int, size_of: Callable[[Kept], int]) -> None:
-        self._most_bytes, self._size_of = most_bytes, size_of
-        self._kept: OrderedDict[Key, Kept] = OrderedDict()
-        self._making: dict[Key, threading.Event] = {}
-        self._bytes = 0
-        self._lock = threading.Lock()
-
-    def get(self, key: Key, make: Callable[[], Kept]) -> Kept:
-        """What has this key, made now unless it is kept or being made; what `make` raises comes through."""
-        while True:
-            with self._lock:
-                if key in self._kept:
-                    self._kept.move_to_end(key)
-                    return self._kept[key]
-                made_elsewhere = self._making.get(key)
-                if made_elsewhere is None:
-                    self._making[key] = threading.Event()
-                    break
-            made_elsewhere.wait()
-        try:
-            made = make()
-            with self._lock:
-                self._kept[key] = made
-                self._bytes += self._size_of(made)
-                while self._bytes > self._most_bytes and len(self._kept) > 1:
-                    self._bytes -= self._size_of(self._kept.popitem(last=False)[1])
-        finally:
-            with self._lock:
-                self._making.pop(key).set()
-        return made
 
 
 class TilePyramid:
@@ -515,7 +475,7 @@ class XmlResponse(Response):
 def wmts_routes(shelf: SiteShelf) -> APIRouter:
     """The capabilities of each site's tiles."""
     router = APIRouter(
-        prefix="/api/sites/{site}", tags=["rasters"], dependencies=[Depends(needs(Role.VIEW))]
+        prefix="/api/sites/{site}", tags=["rasters"], dependencies=[needs(Role.VIEW)]
     )
 
     @router.get("/WMTSCapabilities.xml", response_class=XmlResponse)

@@ -16,7 +16,7 @@ from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import anyio
-from fastapi import APIRouter, Depends, Header, Request, Response
+from fastapi import APIRouter, Header, Request, Response
 from starlette.requests import ClientDisconnect
 
 from sorvolo.child_process import python_command
@@ -411,9 +411,7 @@ def upload_routes(
     uploads: Uploads, unused: Callable[[str], AbstractContextManager[None]]
 ) -> APIRouter:
     """Begin, continue, ask after, end an upload."""
-    router = APIRouter(
-        prefix="/api/uploads", tags=["uploads"], dependencies=[Depends(needs(Role.OPERATE))]
-    )
+    router = APIRouter(prefix="/api/uploads", tags=["uploads"], dependencies=[needs(Role.OPERATE)])
 
     @router.options("", status_code=204)
     def about() -> Response:
@@ -436,7 +434,7 @@ def upload_routes(
     def begin(
         upload_length: int = Header(ge=1, le=_MOST_LENGTH),
         upload_metadata: str = Header(max_length=4000),
-        holder: Holder = Depends(needs(Role.OPERATE)),
+        holder: Holder = needs(Role.OPERATE),
     ) -> Response:
         """Begin an upload of Upload-Length bytes; Upload-Metadata names its file (`filename BASE64`)."""
         made = uploads.create(upload_metadata, upload_length, holder.name)

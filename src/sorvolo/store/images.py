@@ -1,7 +1,9 @@
 """Pictures as bytes and back: JPEG for keyframes, PNG for tiles and previews, RGB(A) order on our side."""
 
+import threading
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
+from typing import Generic, TypeVar
 
 import cv2
 import numpy as np
@@ -9,6 +11,9 @@ from cv2.typing import MatLike
 
 from sorvolo.errors import StoreError
 from sorvolo.geometry.arrays import Floats32, ImageRGB, ImageRGBA, Mask, frozen
+
+Key = TypeVar("Key", bound=Hashable)
+Kept = TypeVar("Kept")
 
 MOST_KEYFRAME_PX = 160_000_000
 """Of a stored keyframe: the largest cameras that fly have 150 million pixels."""
@@ -200,33 +205,61 @@ def unweighted(image: MatLike) -> ImageRGBA:
     return np.clip(np.rint(np.dstack([colours, alpha])), 0, 255).astype(np.uint8)
 
 
+class BytesCache(Generic[Key, Kept]):
+    """What was made last, up to a number of bytes; each thing is made once even if many ask at once."""
+
+    def __init__(self, most_bytes: int, size_of: Callable[[Kept], int]) -> None:
+        self.most_bytes, self._size_of = most_bytes, size_of
+        self._kept: OrderedDict[Key, Kept] = OrderedDict()
+        self._making: dict[Key, threading.Event] = {}
+        self._bytes = 0
+        self._lock = threading.Lock()
+
+    def get(self, key: Key, make: Callable[[], Kept]) -> Kept:
+        """What has this key, made now unless it is kept or being made; what `make` raises comes through."""
+        while True:
+            with self._lock:
+                if key in self._kept:
+                    self._kept.move_to_end(key)
+                    return self._kept[key]
+                made_elsewhere = self._making.get(key)
+                if made_elsewhere is None:
+                    self._making[key] = threading.Event()
+                    break
+            made_elsewhere.wait()
+        try:
+            made = make()
+            with self._lock:
+                self._kept[key] = made
+                self._bytes += self._size_of(made)
+                while self._bytes > self.most_bytes and len(self._kept) > 1:
+                    self._bytes -= self._size_of(self._kept.popitem(last=False)[1])
+        finally:
+            with self._lock:
+                self._making.pop(key).set()
+        return made
+
+    def forget(self, key: Key) -> None:
+        """Drop what has this key, if it is kept."""
+        with self._lock:
+            if key in self._kept:
+                self._bytes -= self._size_of(self._kept.pop(key))
+
+    def clear(self) -> None:
+        """Drop everything."""
+        with self._lock:
+            self._kept.clear()
+            self._bytes = 0
+
+
 class ImageCache:
     """The images used last, bounded in bytes; `get` loads what is not there. Images come out read-only."""
 
     def __init__(self, load: Callable[[int], ImageRGB], limit_bytes: int) -> None:
-        self._load, self._limit_bytes = load, limit_bytes
-        self._images: OrderedDict[int, ImageRGB] = OrderedDict()
-        self._bytes = 0
+        self._load = load
+        self._kept = BytesCache[int, ImageRGB](limit_bytes, lambda image: image.nbytes)
+        self.forget, self.clear = self._kept.forget, self._kept.clear
 
     def get(self, index: int) -> ImageRGB:
         """The image at `index`, from memory if it was used lately."""
-        if index in self._images:
-            self._images.move_to_end(index)
-            return self._images[index]
-        image: ImageRGB = frozen(self._load(index), np.uint8)
-        self._images[index] = image
-        self._bytes += image.nbytes
-        while self._bytes > self._limit_bytes and len(self._images) > 1:
-            _, dropped = self._images.popitem(last=False)
-            self._bytes -= dropped.nbytes
-        return image
-
-    def forget(self, index: int) -> None:
-        """Drop the image at `index`: its file changes."""
-        dropped = self._images.pop(index, None)
-        self._bytes -= 0 if dropped is None else dropped.nbytes
-
-    def clear(self) -> None:
-        """Drop all images."""
-        self._images.clear()
-        self._bytes = 0
+        return self._kept.get(index, lambda: frozen(self._load(index), np.uint8))

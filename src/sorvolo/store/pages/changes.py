@@ -109,7 +109,14 @@ def changes_page(
         columns=_columns(listed, is_reviewed),
         files=_files(site),
         view_rows=_view_rows(report),
-        not_announced=_not_announced(report),
+        not_announced=[
+            (known(count), words, str(reason))
+            for name, words in (
+                ("withdrawn", "withdrawn after being announced"),
+                ("never_announced", "never announced"),
+            )
+            for reason, count in (at(report, "comparison", "candidates", name) or {}).items()
+        ],
         reasons=[
             (count, why) for why, count in (at(report, "comparison", "reasons") or {}).items()
         ],
@@ -383,18 +390,6 @@ def _view_rows(report: Mapping[str, Any]) -> list[tuple[str, int, str]]:
         (status.value, views[status.value], _VIEW_WORDS[status])
         for status in ViewStatus
         if views.get(status.value)
-    ]
-
-
-def _not_announced(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """Candidates for changes that the views did not confirm, by reason: number, what became of them, reason."""
-    return [
-        (known(count), words, str(reason))
-        for name, words in (
-            ("withdrawn", "withdrawn after being announced"),
-            ("never_announced", "never announced"),
-        )
-        for reason, count in (at(report, "comparison", "candidates", name) or {}).items()
     ]
 
 

@@ -20,19 +20,43 @@ from sorvolo.store.pages.words import (
 def search_page(report: Mapping[str, Any], pictures: Mapping[str, ImageRGBA]) -> str:
     """search.html of search.json's content; `pictures` are the maps of the classes' probabilities. Text is escaped."""
     first = next(iter(report["classes"]))
+    headline = known(at(report, "headline", "text"))
     page = render(
         "search.html",
         title=f"{known(report['site'])} - what the search would have found",
         site=known(report["site"]),
-        headline=_sentence(known(at(report, "headline", "text"))),
+        headline=headline[:1].upper() + headline[1:],
         model=known(report["model"]),
         notices=[*report["warnings"], *(known(at(each, "text")) for each in report["notices"])],
         maps=[(label, picture_uri(picture)) for label, picture in pictures.items()],
         figures=_figures(report["classes"][first]),
-        holes=_holes(report["classes"]),
-        segments=_segments(report),
+        holes=[
+            [label, reason, area_words(area_m2), f"{area_m2 / row['area_m2']:.0%}"]
+            for label, row in report["classes"].items()
+            for reason, area_m2 in row["holes_m2"].items()
+        ],
+        segments=[
+            [
+                known(each["name"]),
+                *(f"{each[key]:.2f}" for key in ("poa", "pod", "pos", "left")),
+                area_words(each["area_m2"]),
+            ]
+            for each in report["segments"]
+        ],
         refly=_refly(report.get("refly")),
-        plants=_plants(report),
+        plants=[
+            [
+                known(flight["name"]),
+                label,
+                str(row["planted"]),
+                str(row["found"]),
+                "{:.2f} to {:.2f}".format(*row["interval"]),
+                str(flight["frames"]),
+                seconds_words(flight["seconds"]),
+            ]
+            for flight in report["flights"]
+            for label, row in flight["classes"].items()
+        ],
         calibration=_calibration(report),
         calibration_plot=_calibration_plot(report),
         cell=with_unit("{:g} m", report["cell_m"]),
@@ -46,10 +70,6 @@ def waiting_page(*, is_over: bool) -> str:
     return str(
         render("search_waiting.html", title="What a search would have found", is_over=is_over)
     )
-
-
-def _sentence(text: str) -> str:
-    return text[:1].upper() + text[1:]
 
 
 def _figures(row: Mapping[str, Any]) -> list[tuple[str, str, str]]:
@@ -72,25 +92,6 @@ def _figures(row: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     ]
 
 
-def _holes(classes: Mapping[str, Any]) -> list[list[str]]:
-    return [
-        [label, reason, area_words(area_m2), f"{area_m2 / row['area_m2']:.0%}"]
-        for label, row in classes.items()
-        for reason, area_m2 in row["holes_m2"].items()
-    ]
-
-
-def _segments(report: Mapping[str, Any]) -> list[list[str]]:
-    return [
-        [
-            known(each["name"]),
-            *(f"{each[key]:.2f}" for key in ("poa", "pod", "pos", "left")),
-            area_words(each["area_m2"]),
-        ]
-        for each in report["segments"]
-    ]
-
-
 def _refly(refly: Mapping[str, Any] | None) -> str:
     if refly is None:
         return ""
@@ -100,22 +101,6 @@ def _refly(refly: Mapping[str, Any] | None) -> str:
         f"Another flight over {refly['holes']} of the holes ({area_words(number_at(refly, 'area_m2'))}), "
         f"{refly['height_m']:.0f} m high, takes {seconds_words(number_at(refly, 'duration_s'))}.{files}"
     )
-
-
-def _plants(report: Mapping[str, Any]) -> list[list[str]]:
-    return [
-        [
-            known(flight["name"]),
-            label,
-            str(row["planted"]),
-            str(row["found"]),
-            "{:.2f} to {:.2f}".format(*row["interval"]),
-            str(flight["frames"]),
-            seconds_words(flight["seconds"]),
-        ]
-        for flight in report["flights"]
-        for label, row in flight["classes"].items()
-    ]
 
 
 def _calibration_plot(report: Mapping[str, Any]) -> dict[str, Any]:

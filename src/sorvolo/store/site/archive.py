@@ -394,7 +394,7 @@ class Archive:
                 connection, flight_id, fingerprint, str(settings.get("method", "")), plain
             )
             base = records.tile_hashes(connection, version_id)
-        self.blobs.cache_bytes = min(self.blobs.cache_bytes, tiles_mb * _MEGABYTE)
+        self.blobs.cache.most_bytes = min(self.blobs.cache.most_bytes, tiles_mb * _MEGABYTE)
         tiles = GrowingTiles(self.blobs, base, grid.tile_px, tiles_mb * _MEGABYTE)
         self._writer = FlightWriter(
             self, flight_id, run_id, version_id, tiles, images_mb * _MEGABYTE

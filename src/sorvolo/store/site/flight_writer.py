@@ -218,7 +218,7 @@ class FlightWriter:
     def release_memory(self) -> None:
         """Drop tiles and pictures that can be read again: before a stage that needs others."""
         self._growing.release()
-        self._files.blobs.release()
+        self._files.blobs.cache.clear()
         self._cache.clear()
         give_back()
 

@@ -1,7 +1,6 @@
 """The map's tiles on disk: blobs named by their content, and mappings over them to read and to write."""
 
 import hashlib
-import threading
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, MutableMapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -13,7 +12,7 @@ from sorvolo.errors import GeometryError, StoreError
 from sorvolo.geometry.arrays import ImageRGBA, frozen
 from sorvolo.geometry.grid import TileIndex
 from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, sync_file, writing
-from sorvolo.store.images import png_from_rgba, rgba_from_png
+from sorvolo.store.images import BytesCache, png_from_rgba, rgba_from_png
 from sorvolo.store.nofollow import read_below
 from sorvolo.store.site.files import Origin, checked_sha256, is_sha256
 
@@ -33,11 +32,8 @@ class TileBlobs:
 
     def __init__(self, folder: Path, origin: Origin | None = None) -> None:
         self._folder, self._origin = folder, origin
-        self.cache_bytes = _CACHE_BYTES
         self._unsynced: set[str] = set()
-        self._read: OrderedDict[str, ImageRGBA] = OrderedDict()
-        self._read_bytes = 0
-        self._reading = threading.Lock()
+        self.cache = BytesCache[str, ImageRGBA](_CACHE_BYTES, lambda tile: tile.nbytes)
 
     def save(self, rgba: ImageRGBA) -> str:
         """Write a tile unless its very bytes are there already, and return the SHA-256 of its PNG."""
@@ -60,19 +56,13 @@ class TileBlobs:
         Raises FileNotFoundError when the blob is gone (a writer dropped its version) and StoreError when its
         bytes are not the ones that were written.
         """
-        with self._reading:
-            if sha256 in self._read:
-                self._read.move_to_end(sha256)
-                return self._read[sha256]
-        tile = rgba_from_png(self.encoded(sha256), str(self._path(sha256)))
-        tile.setflags(write=False)
-        with self._reading:
-            self._forget(sha256)
-            self._read[sha256] = tile
-            self._read_bytes += tile.nbytes
-            while self._read_bytes > self.cache_bytes:
-                self._forget(next(iter(self._read)))
-        return tile
+
+        def read() -> ImageRGBA:
+            tile = rgba_from_png(self.encoded(sha256), str(self._path(sha256)))
+            tile.setflags(write=False)
+            return tile
+
+        return self.cache.get(sha256, read)
 
     def encoded(self, sha256: str) -> bytes:
         """A tile's PNG; raises as `load` does."""
@@ -108,15 +98,8 @@ class TileBlobs:
         """Delete blobs that no version refers to."""
         for sha256 in hashes:
             self._path(sha256).unlink(missing_ok=True)
-            with self._reading:
-                self._forget(sha256)
+            self.cache.forget(sha256)
         self._unsynced.difference_update(hashes)
-
-    def release(self) -> None:
-        """Drop the tiles read last from memory."""
-        with self._reading:
-            self._read.clear()
-            self._read_bytes = 0
 
     def stored(self) -> set[str]:
         """The SHA-256 of every blob in the folder."""
@@ -132,10 +115,6 @@ class TileBlobs:
     def remove_leftovers(self) -> int:
         """Delete the half-written blobs of killed writers and count them."""
         return remove_leftovers(self._folder.glob("??"))
-
-    def _forget(self, sha256: str) -> None:
-        tile = self._read.pop(sha256, None)
-        self._read_bytes -= 0 if tile is None else tile.nbytes
 
     def _path(self, sha256: str) -> Path:
         return self._folder / checked_sha256(sha256)[:2] / f"{sha256}.png"
