@@ -11,10 +11,13 @@ from sorvolo.build import VERSION
 
 if TYPE_CHECKING:
     from sorvolo.capture.areas import read_area
+    from sorvolo.capture.live.reconnect import LiveSettings
     from sorvolo.change.compare import Comparison, compare_images
     from sorvolo.change.robust import RobustSettings
+    from sorvolo.detection.contract import ModelInfo
     from sorvolo.detection.detector import Detector
     from sorvolo.errors import GeometryError, InputError, SettingsError, SorvoloError, StoreError
+    from sorvolo.geometry.geodesy import LocalFrame
     from sorvolo.lab.datasets import read_dataset
     from sorvolo.lab.evaluation.changes import evaluate_changes
     from sorvolo.lab.evaluation.detector import (
@@ -46,8 +49,11 @@ if TYPE_CHECKING:
         write_calibration,
     )
     from sorvolo.missions.compare.flights import compare_flights
+    from sorvolo.missions.flight.detector_protocol import FindsObjects
+    from sorvolo.missions.flight.request import AlreadyDone
     from sorvolo.missions.flight.settings import CompareSettings, MapSettings
-    from sorvolo.missions.heights.run import HeightSettings, make_heights
+    from sorvolo.missions.heights.measure import measure_profile, measure_volume, write_contours
+    from sorvolo.missions.heights.run import HeightSettings, HeightsUpdate, make_heights
     from sorvolo.missions.inspect import inspect_input
     from sorvolo.missions.map.flights import map_flights
     from sorvolo.missions.plan_flight import (
@@ -60,28 +66,51 @@ if TYPE_CHECKING:
     from sorvolo.missions.search.flights import search_site
     from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
     from sorvolo.missions.telemetry.doctor import CotReceiver, correct_telemetry
+    from sorvolo.missions.watch.cot_sender import CotPlace, CotTls
     from sorvolo.missions.watch.flights import watch
     from sorvolo.missions.watch.run import WatchUpdate
     from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
     from sorvolo.store.site.archive import Archive
-    from sorvolo.survey.findings import Verdict
-    from sorvolo.survey.objects import Detections
+    from sorvolo.store.site.change_records import StoredChange
+    from sorvolo.survey.area import Area
+    from sorvolo.survey.findings import Change, ChangeKind, CompareUpdate, Verdict
+    from sorvolo.survey.flight import CameraModel, Frame, Notice, Site, Telemetry
+    from sorvolo.survey.map_objects import MapObject
+    from sorvolo.survey.mosaic import MosaicUpdate, Status
+    from sorvolo.survey.objects import Detections, Track
 
 __version__ = VERSION
 
 __all__ = [
+    "AlreadyDone",
     "Archive",
+    "Area",
+    "CameraModel",
+    "Change",
+    "ChangeKind",
     "CompareSettings",
+    "CompareUpdate",
     "Comparison",
+    "CotPlace",
     "CotReceiver",
+    "CotTls",
     "DataOptions",
     "Detections",
     "Detector",
     "EvaluationSettings",
+    "FindsObjects",
+    "Frame",
     "GeometryError",
     "HeightSettings",
+    "HeightsUpdate",
     "InputError",
+    "LiveSettings",
+    "LocalFrame",
+    "MapObject",
     "MapSettings",
+    "ModelInfo",
+    "MosaicUpdate",
+    "Notice",
     "PictureSettings",
     "PlanSettings",
     "RobustSettings",
@@ -89,9 +118,14 @@ __all__ = [
     "SearchSettings",
     "SettingsError",
     "SimulationSettings",
+    "Site",
     "SorvoloError",
+    "Status",
     "StoreError",
+    "StoredChange",
+    "Telemetry",
     "ThesisSettings",
+    "Track",
     "TrainSettings",
     "Verdict",
     "WatchOutputs",
@@ -113,6 +147,8 @@ __all__ = [
     "inspect_input",
     "make_heights",
     "map_flights",
+    "measure_profile",
+    "measure_volume",
     "parse_board",
     "plan_over",
     "prepare_reference",
@@ -128,11 +164,36 @@ __all__ = [
     "train_detector",
     "watch",
     "write_calibration",
+    "write_contours",
     "write_evaluation",
     "write_plan",
 ]
 
 _HOMES = {
+    "survey.mosaic": (
+        "MosaicUpdate",
+        "Status",
+    ),
+    "survey.map_objects": ("MapObject",),
+    "survey.flight": (
+        "CameraModel",
+        "Frame",
+        "Notice",
+        "Site",
+        "Telemetry",
+    ),
+    "survey.area": ("Area",),
+    "store.site.change_records": ("StoredChange",),
+    "missions.watch.cot_sender": (
+        "CotPlace",
+        "CotTls",
+    ),
+    "missions.heights.measure": ("measure_profile", "measure_volume", "write_contours"),
+    "missions.flight.request": ("AlreadyDone",),
+    "missions.flight.detector_protocol": ("FindsObjects",),
+    "geometry.geodesy": ("LocalFrame",),
+    "detection.contract": ("ModelInfo",),
+    "capture.live.reconnect": ("LiveSettings",),
     "capture.areas": ("read_area",),
     "change.compare": ("Comparison", "compare_images"),
     "change.robust": ("RobustSettings",),
@@ -170,7 +231,7 @@ _HOMES = {
     ),
     "missions.compare.flights": ("compare_flights",),
     "missions.flight.settings": ("CompareSettings", "MapSettings"),
-    "missions.heights.run": ("HeightSettings", "make_heights"),
+    "missions.heights.run": ("HeightsUpdate", "HeightSettings", "make_heights"),
     "missions.inspect": ("inspect_input",),
     "missions.map.flights": ("map_flights",),
     "missions.plan_flight": (
@@ -187,8 +248,16 @@ _HOMES = {
     "missions.watch.run": ("WatchUpdate",),
     "missions.watch.settings": ("WatchOutputs", "WatchSettings"),
     "store.site.archive": ("Archive",),
-    "survey.findings": ("Verdict",),
-    "survey.objects": ("Detections",),
+    "survey.findings": (
+        "Change",
+        "ChangeKind",
+        "CompareUpdate",
+        "Verdict",
+    ),
+    "survey.objects": (
+        "Track",
+        "Detections",
+    ),
 }
 
 

@@ -26,6 +26,7 @@ from sorvolo.errors import GeometryError, InputError
 from sorvolo.geometry.arrays import Floats
 from sorvolo.geometry.crs import crs_from_words, transformer
 from sorvolo.geometry.polygons import widened_line
+from sorvolo.paths import AnyPath
 from sorvolo.survey.area import Area
 
 CORRIDOR_M = 30.0
@@ -54,13 +55,14 @@ _LONGITUDE_NAMES = ("longitude", "lon", "lng", "long", "longitude_deg")
 Rings: TypeAlias = tuple[Floats, ...]
 
 
-def read_area(path: Path) -> Area:
+def read_area(path: AnyPath) -> Area:
     """The area of interest in a file, recognised by its content.
 
     Raises InputError for a file that is missing, empty, of another kind, without polygon or path, or whose
     coordinates are off the Earth, cross themselves or are not WGS84 longitude and latitude (GeoJSON may name another
     CRS, in its member `crs`).
     """
+    path = Path(path)
     raw = read_small_file(path, "area file", _MOST_BYTES)
     if raw[:2] == b"PK":
         raw = _kml_in_kmz(path, raw)

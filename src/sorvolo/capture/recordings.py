@@ -37,7 +37,7 @@ _LENS = re.compile(r"_([01])\d_(\d{3})$")
 
 
 @dataclass(frozen=True)
-class Recording:
+class RecordedVideo:
     """One recording: its video, or the chapters of it in order, and the copies beside it that are no flights."""
 
     chapters: tuple[Path, ...]
@@ -75,7 +75,7 @@ class Recording:
         )
 
 
-def recordings(films: Sequence[Path], *, with_siblings: bool = False) -> list[Recording]:
+def recordings(films: Sequence[Path], *, with_siblings: bool = False) -> list[RecordedVideo]:
     """The recordings among videos, in their order. A copy whose original is not among them is a recording itself.
 
     `with_siblings`: chapters that follow the last one given are taken from its folder.
@@ -104,7 +104,7 @@ def recordings(films: Sequence[Path], *, with_siblings: bool = False) -> list[Re
             chain.append(later)
     chains.sort(key=lambda each: films.index(each[0]))
     return [
-        Recording(tuple(each), tuple(film for film in original if original[film] in each))
+        RecordedVideo(tuple(each), tuple(film for film in original if original[film] in each))
         for each in chains
     ]
 

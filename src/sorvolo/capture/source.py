@@ -30,7 +30,7 @@ from sorvolo.capture.live.stream import LiveStream, open_stream
 from sorvolo.capture.photo_metadata import PhotoMetadata
 from sorvolo.capture.photo_positions import is_position_file
 from sorvolo.capture.photos import Album, PhotoSource, read_album
-from sorvolo.capture.recordings import ChapteredVideo, Recording, recordings
+from sorvolo.capture.recordings import ChapteredVideo, RecordedVideo, recordings
 from sorvolo.capture.telemetry import (
     find_telemetry_beside,
     is_telemetry,
@@ -210,9 +210,9 @@ class _AlbumInput:
     others: Sequence[Path] = ()
 
 
-def _sort_inputs(inputs: Sequence[Path]) -> tuple[list[Recording], list[_AlbumInput]]:
+def _sort_inputs(inputs: Sequence[Path]) -> tuple[list[RecordedVideo], list[_AlbumInput]]:
     """The recordings and the albums among the inputs."""
-    found: list[Recording] = []
+    found: list[RecordedVideo] = []
     videos: list[Path] = []
     albums: list[_AlbumInput] = []
     single: list[Path] = []
@@ -308,7 +308,7 @@ def _free_name(name: str, fingerprint: str, taken: Mapping[str, str]) -> str:
 
 
 def _open_recording(
-    recording: Recording, name: str, telemetry: Path | None, camera: Path | str | None
+    recording: RecordedVideo, name: str, telemetry: Path | None, camera: Path | str | None
 ) -> VideoSource:
     same = [*recording.chapters, *recording.copies]
     opened = [_open_video(path, name, telemetry, camera, same) for path in recording.chapters]

@@ -38,6 +38,7 @@ from sorvolo.detection.tiling import (
 )
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import ImageRGB, Labels
+from sorvolo.paths import AnyPath
 from sorvolo.survey.flight import Notice
 from sorvolo.survey.objects import Detections, Early, no_detections
 
@@ -156,7 +157,7 @@ class Detector:
     @classmethod
     def load(
         cls,
-        name_or_path: str | Path = "default",
+        name_or_path: AnyPath = "default",
         *,
         provider: Provider = "auto",
         threads: int | None = None,
@@ -177,7 +178,7 @@ class Detector:
     @classmethod
     def from_onnx(
         cls,
-        path: str | Path,
+        path: AnyPath,
         layout: str = AUTO,
         classes: Sequence[str] | None = None,
         *,

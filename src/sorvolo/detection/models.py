@@ -15,6 +15,7 @@ from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.layouts import AUTO
 from sorvolo.detection.session import adopted, read_info, read_model
 from sorvolo.errors import InputError
+from sorvolo.paths import AnyPath
 
 FOLDER_VARIABLE = "SORVOLO_MODELS"
 """Names the folder of the user's models in place of the usual one."""
@@ -66,14 +67,14 @@ def hidden_models() -> list[InstalledModel]:
     ]
 
 
-def find_model(name_or_path: str | Path) -> Path:
+def find_model(name_or_path: AnyPath) -> Path:
     """The file of an installed model, or the path that was given.
 
     Raises InputError for a name that is not installed, with those that are.
     """
     path = Path(name_or_path).expanduser()
     if (
-        isinstance(name_or_path, Path)
+        not isinstance(name_or_path, str)
         or path.suffix.lower() == ".onnx"
         or os.sep in name_or_path
         or path.is_file()

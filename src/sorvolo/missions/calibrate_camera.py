@@ -15,6 +15,7 @@ from sorvolo.capture.checkerboard import (
 )
 from sorvolo.capture.source import Source, open_sources
 from sorvolo.errors import InputError, SettingsError
+from sorvolo.paths import AnyPath, Inputs, listed
 from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.survey.flight import LostFrame
 
@@ -41,13 +42,14 @@ def parse_board(text: str) -> Board:
     return Board(int(columns), int(rows))
 
 
-def find_views(inputs: Sequence[Path], board: Board) -> Iterator[Looked]:
+def find_views(inputs: Inputs, board: Board) -> Iterator[Looked]:
     """Search photos, or some three frames a second of videos, for the board; one record a picture.
 
     Raises InputError for inputs that cannot be read or whose pictures differ in size.
     """
+    files = [Path(each) for each in listed(inputs)]
     size_px = (0, 0)
-    for source in open_sources(inputs):
+    for source in open_sources(files):
         step = _step(source)
         for frame in source.frames(lambda index, _, step=step: index % step == 0):  # type: ignore[misc]
             if isinstance(frame, LostFrame):
@@ -75,8 +77,9 @@ def calibrate_camera(looked: Sequence[Looked], board: Board) -> Calibration:
     return calibrate(views, board, looked[0].width_px, looked[0].height_px)
 
 
-def write_calibration(path: Path, calibration: Calibration) -> None:
+def write_calibration(path: AnyPath, calibration: Calibration) -> None:
     """Write the camera file, whole or not at all. Raises StoreError when it cannot be written."""
+    path = Path(path)
     text = camera_xml(
         calibration.camera,
         reprojection_error_px=calibration.reprojection_error_px,

@@ -1,10 +1,8 @@
 """A preflight of the input: what is in it, what is missing or suspicious, and what to do, within seconds."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from pathlib import Path
 from typing import Any
 
 from sorvolo.capture.preflight import (
@@ -19,6 +17,7 @@ from sorvolo.capture.preflight import (
 from sorvolo.capture.source import Source, opened_sources
 from sorvolo.geometry.units import SECOND_NS
 from sorvolo.missions.flight.sample_frames import sample_frames
+from sorvolo.paths import AnyPath, Inputs, as_text, listed
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.survey.flight import CameraModel, Notice
 
@@ -111,14 +110,17 @@ class Inspection:
 
 
 def inspect_input(
-    inputs: Sequence[Path | str],
-    telemetry: Path | str | None = None,
-    camera: Path | str | None = None,
+    inputs: Inputs,
+    telemetry: AnyPath | None = None,
+    camera: AnyPath | None = None,
 ) -> list[Inspection]:
     """Look at each flight among the inputs: all metadata, and a handful of frames; of a live one the next seconds.
 
     Raises InputError where `open_sources` does.
     """
+    inputs = listed(inputs)
+    telemetry = as_text(telemetry)
+    camera = as_text(camera)
     with opened_sources(inputs, telemetry, camera) as sources:
         return [_inspect(source) for source in sources]
 

@@ -27,6 +27,7 @@ from sorvolo.geometry.planning import (
     required_px_per_m,
     scene_length_m,
 )
+from sorvolo.paths import AnyPath
 from sorvolo.store.exports.waypoints import write_waypoints
 from sorvolo.survey.area import Area
 from sorvolo.survey.flight import CameraModel
@@ -165,8 +166,9 @@ def plan_over(area: Area, answers: FlightAnswers, settings: PlanSettings) -> Fli
     return plan_strips(area.polygons_m(area.frame), answers.camera.camera, strips)
 
 
-def write_plan(path: Path, plan: FlightPlan, area: Area, *, dji_drone: str = "fly") -> None:
+def write_plan(path: AnyPath, plan: FlightPlan, area: Area, *, dji_drone: str = "fly") -> None:
     """Write a plan made by `plan_over` as .plan, .kmz (for a DJI drone), .geojson or .kml."""
+    path = Path(path)
     write_waypoints(path, plan, area.frame, area.name, dji_drone=dji_drone)
 
 

@@ -13,6 +13,7 @@ from sorvolo.lab.datasets.recognising import form_of
 from sorvolo.lab.datasets.visdrone import read_visdrone
 from sorvolo.lab.datasets.voc import read_voc
 from sorvolo.lab.datasets.yolo import read_yolo
+from sorvolo.paths import AnyPath
 from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import CLASSES
 
@@ -41,7 +42,7 @@ READERS: Mapping[str, Reader] = {
 
 
 def read_dataset(
-    place: Path | str,
+    place: AnyPath,
     *,
     form: str | None = None,
     classes: Mapping[str, str] | None = None,
@@ -60,6 +61,7 @@ def read_dataset(
     Raises InputError when there is nothing to read, none of the names stands for a class, or labels and pictures do not
     belong together; SettingsError for an unknown form or a broken pattern.
     """
+    place = Path(place)
     return _read(Path(place), form, classes, ignore, unlabelled, group_pattern)[0]
 
 

@@ -32,6 +32,7 @@ from sorvolo.lab.evaluation.frame_rows import (
 )
 from sorvolo.lab.evaluation.mask_folders import MaskScores, compare_mask_folders, has_masks
 from sorvolo.mosaic.paired_flights import PairedFlights
+from sorvolo.paths import AnyPath
 from sorvolo.store.exports.plain import features_path, plain_json
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.findings import ChangeKind
@@ -68,7 +69,7 @@ class FlightChanges:
 
 
 def evaluate_changes(
-    found: Path, truth: Path, *, flight: str | None = None, least_px: int = 1
+    found: AnyPath, truth: AnyPath, *, flight: str | None = None, least_px: int = 1
 ) -> tuple[FlightChanges, ...]:
     """Measure the compared flights of a site folder, or a folder of masks, against the truth.
 
@@ -76,6 +77,8 @@ def evaluate_changes(
     `least_px` how many changed pixels make a frame positive. Raises InputError for folders that hold neither, or not
     the same frames.
     """
+    found = Path(found)
+    truth = Path(truth)
     refuse_simulation(found)
     true_flights = _true_flights(truth)
     if not (found / "flights").is_dir():

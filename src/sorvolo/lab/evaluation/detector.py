@@ -31,6 +31,7 @@ from sorvolo.lab.evaluation.detector_files import (
 )
 from sorvolo.lab.evaluation.detector_page import detector_page
 from sorvolo.lab.training.holding_out import hold_out
+from sorvolo.paths import AnyPath, Inputs, listed
 from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.exports.plain import json_bytes
 from sorvolo.survey.flight import Notice
@@ -86,7 +87,7 @@ class DetectorEvaluation:
 
 
 def read_sets(
-    places: Sequence[Path],
+    places: Inputs,
     *,
     form: str | None = None,
     classes: Mapping[str, str] | None = None,
@@ -102,8 +103,9 @@ def read_sets(
     With `held_out` only the share that a training with this share and seed holds out. Raises InputError and
     SettingsError as `read_datasets`, SettingsError for a share that cannot be.
     """
+    folders = [Path(each) for each in listed(places)]
     read = read_datasets(
-        places,
+        folders,
         form=form,
         classes=classes,
         ignore=ignore,
@@ -192,12 +194,13 @@ def _model_notices(seen: Sequence[Sequence[FoundSets]]) -> tuple[str, ...]:
 
 
 def write_evaluation(
-    evaluation: DetectorEvaluation, folder: Path, description: Mapping[str, Any]
+    evaluation: DetectorEvaluation, folder: AnyPath, description: Mapping[str, Any]
 ) -> None:
     """Write detector.html, detector.json and detections.json; `description` is what was measured on what.
 
     Raises StoreError on a full disk.
     """
+    folder = Path(folder)
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
     write_found(folder / FOUND, evaluation.found)

@@ -34,6 +34,7 @@ from sorvolo.lab.evaluation.map_quality import (
     residual_shift,
     spread_of,
 )
+from sorvolo.paths import AnyPath, as_path
 from sorvolo.registration.features import gray_from_rgb
 from sorvolo.store.rasters.geotiff import Raster, read_raster
 from sorvolo.store.site.archive import Archive
@@ -242,11 +243,11 @@ class _TablePlace:
 
 
 def evaluate_mosaic(
-    site: Path,
+    site: AnyPath,
     *,
-    truth: Path | None = None,
-    reference: Path | None = None,
-    positions: Path | None = None,
+    truth: AnyPath | None = None,
+    reference: AnyPath | None = None,
+    positions: AnyPath | None = None,
 ) -> MosaicEvaluation:
     """Measure the map in a site folder; the deviation from its own frames always, the rest where given.
 
@@ -255,6 +256,10 @@ def evaluate_mosaic(
     InputError for files that cannot be read or belong to another place, StoreError for a folder that is no
     site.
     """
+    site = Path(site)
+    truth = as_path(truth)
+    reference = as_path(reference)
+    positions = as_path(positions)
     refuse_simulation(site)
     with Archive.open(site, write=False) as archive:
         described = archive.site()

@@ -24,6 +24,7 @@ from sorvolo.lab.evaluation.track_metrics import (
     score_objects,
 )
 from sorvolo.mosaic.paired_flights import PairedFlights
+from sorvolo.paths import AnyPath
 from sorvolo.store.exports.plain import features_path
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.flight import Site
@@ -34,13 +35,15 @@ _VISIBLE = 0.5  # share of an object that nothing hides
 
 
 def evaluate_objects(
-    site: Path, truth: Path, *, flight: str | None = None
+    site: AnyPath, truth: AnyPath, *, flight: str | None = None
 ) -> tuple[FlightObjects, ...]:
     """Measure the objects of the site's flights against the folder that `sorvolo simulate` made.
 
     `flight` is one of the site's flights; None: all that were searched and that the truth knows. Raises InputError for
     folders that do not hold what is needed, SettingsError for a flight that was not searched.
     """
+    site = Path(site)
+    truth = Path(truth)
     refuse_simulation(site)
     frames_file = truth_file(truth)
     folder = frames_file.parent

@@ -15,6 +15,7 @@ from sorvolo.lab.simulation.folder import (
 from sorvolo.lab.simulation.ground import orthophoto_ground
 from sorvolo.lab.simulation.pictures import PictureSettings, SimulatedPicture, simulate_picture
 from sorvolo.lab.simulation.truth import coco_categories
+from sorvolo.paths import AnyPath, as_path
 from sorvolo.store.ahead import in_order
 from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.images import jpeg_from_image
@@ -33,9 +34,9 @@ class PicturesProgress:
 
 
 def simulate_pictures(
-    folder: Path,
+    folder: AnyPath,
     settings: PictureSettings,
-    ground_file: Path | None = None,
+    ground_file: AnyPath | None = None,
     ground_m_per_px: float | None = None,
 ) -> Iterator[PicturesProgress]:
     """Write `images/*.jpg` and `boxes.json` (COCO) to `folder`, which appears whole or not at all.
@@ -44,6 +45,8 @@ def simulate_pictures(
     settings whose ground is "orthophoto". Raises SettingsError for a folder that holds anything but an earlier
     simulation, InputError for an unreadable orthophoto and StoreError for a full disk.
     """
+    folder = Path(folder)
+    ground_file = as_path(ground_file)
     started = time.monotonic()
     ground = (
         None

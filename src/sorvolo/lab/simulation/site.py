@@ -35,6 +35,7 @@ from sorvolo.lab.simulation.truth import (
     object_features,
 )
 from sorvolo.lab.simulation.world import orthophoto
+from sorvolo.paths import AnyPath, as_path
 from sorvolo.store.ahead import in_order
 from sorvolo.store.atomic import writing
 from sorvolo.store.rasters.geotiff import write_cog
@@ -55,9 +56,9 @@ class SimulationProgress:
 
 
 def simulate_site(
-    folder: Path,
+    folder: AnyPath,
     settings: SimulationSettings,
-    ground_file: Path | None = None,
+    ground_file: AnyPath | None = None,
     ground_m_per_px: float | None = None,
 ) -> Iterator[SimulationProgress]:
     """Write the flights and their truth to `folder`, which appears whole or not at all.
@@ -66,6 +67,8 @@ def simulate_site(
     folder that holds anything but an earlier simulation, InputError for an unreadable orthophoto and
     StoreError for a full disk.
     """
+    folder = Path(folder)
+    ground_file = as_path(ground_file)
     started = time.monotonic()
     ground = (
         None

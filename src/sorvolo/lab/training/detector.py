@@ -55,6 +55,7 @@ from sorvolo.lab.training.start import (
 )
 from sorvolo.lab.training.starting import device_of, start_learner, without_denormals
 from sorvolo.lab.training.weights import ImageNetWeights
+from sorvolo.paths import AnyPath, Inputs, listed
 from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, writing
 from sorvolo.store.exports.plain import json_bytes, plain_json
 from sorvolo.survey.wording import counted
@@ -126,8 +127,8 @@ class _Run:
 
 
 def train_detector(
-    places: Sequence[Path],
-    out: Path,
+    places: Inputs,
+    out: AnyPath,
     settings: TrainSettings,
     options: DataOptions,
     *,
@@ -140,9 +141,11 @@ def train_detector(
     that cannot be used, SettingsError for a device that is not there, for an `out` that holds another run, and for
     resuming with other settings or data; StoreError on a full disk.
     """
+    folders = [Path(each) for each in listed(places)]
+    out = Path(out)
     device = device_of(device)
     with _claimed(out, resume):
-        yield from _train(places, out, settings, options, device, resume)
+        yield from _train(folders, out, settings, options, device, resume)
 
 
 def _train(

@@ -3,7 +3,7 @@
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -37,6 +37,7 @@ from sorvolo.missions.flight.setup import (
 from sorvolo.missions.flight.threads import read_ahead
 from sorvolo.missions.heights.measure import damaged_heights, heights_stamp, own_heights_stamp
 from sorvolo.mosaic.selection import StretchSelection, every
+from sorvolo.paths import AnyPath, Inputs, as_path, as_text, listed
 from sorvolo.registration.lens import single_threaded_opencv
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.area import Area
@@ -49,14 +50,14 @@ _DECODED = 1  # frames of a video that wait to be compared
 
 
 def compare_flights(
-    inputs: Sequence[Path | str],
-    site: Path,
+    inputs: Inputs,
+    site: AnyPath,
     settings: CompareSettings = CompareSettings(),
     *,
-    telemetry: Path | str | None = None,
-    camera: Path | str | None = None,
-    area: Path | None = None,
-    steps: Path | None = None,
+    telemetry: AnyPath | None = None,
+    camera: AnyPath | None = None,
+    area: AnyPath | None = None,
+    steps: AnyPath | None = None,
     detector: FindsObjects | None = None,
     live: LiveSettings = LiveSettings(keeps_all=True),
     until: threading.Event | None = None,
@@ -73,6 +74,12 @@ def compare_flights(
     Raises InputError, SettingsError or StoreError with what to do; the site then stays as it was. Close the generator
     to stop early: the flight that is being compared is left out, those before it are in.
     """
+    inputs = listed(inputs)
+    site = Path(site)
+    telemetry = as_text(telemetry)
+    camera = as_text(camera)
+    area = as_path(area)
+    steps = as_path(steps)
     if steps is not None:
         _check_steps(steps, site, settings)
     wanted = None if area is None else read_area(area)

@@ -14,6 +14,7 @@ from sorvolo.heights.field import HeightField, along
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.volumes import Tie, Volume, VolumeSettings, above_rim, between, contours, tie
 from sorvolo.missions.heights.run import height_grid, newest_flight, run_of
+from sorvolo.paths import AnyPath
 from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.store.exports.places import longitude_latitude
 from sorvolo.store.exports.plain import feature_collection, geojson_bytes
@@ -48,8 +49,8 @@ class ProfilePoint:
 
 
 def measure_volume(
-    site: Path,
-    area: Path,
+    site: AnyPath,
+    area: AnyPath,
     *,
     flight: str = "",
     since: str = "",
@@ -78,7 +79,7 @@ def measure_volume(
 
 
 def measure_profile(
-    site: Path, places: Sequence[str], *, flight: str = "", step_m: float = 0.0
+    site: AnyPath, places: Sequence[str], *, flight: str = "", step_m: float = 0.0
 ) -> list[ProfilePoint]:
     """Heights along a line through places ("latitude,longitude"), every `step_m` (0: every cell)."""
     if len(places) < 2:
@@ -100,7 +101,7 @@ def measure_profile(
         return [ProfilePoint(*(float(each) for each in row)) for row in rows]
 
 
-def write_contours(site: Path, path: Path, interval_m: float, *, flight: str = "") -> int:
+def write_contours(site: AnyPath, path: AnyPath, interval_m: float, *, flight: str = "") -> int:
     """Write contour lines of the bare ground as GeoJSON; return how many lines there are."""
     if not 0.01 <= interval_m <= 1000:
         raise SettingsError(f"--interval {interval_m}: give metres, 0.01 to 1000")
@@ -110,7 +111,7 @@ def write_contours(site: Path, path: Path, interval_m: float, *, flight: str = "
         described = archive.site()
         features = [_line(line, level, described) for level, line in contours(field, interval_m)]
         atomic_write_bytes(
-            path, geojson_bytes(feature_collection("contours", features, is_local=False))
+            Path(path), geojson_bytes(feature_collection("contours", features, is_local=False))
         )
         return len(features)
 

@@ -31,6 +31,7 @@ from sorvolo.heights.views import View, fix_from_residual, ground_outlines_m, pi
 from sorvolo.missions.flight.headline import contradicts_itself
 from sorvolo.missions.flight.report import peak_memory_mb
 from sorvolo.mosaic.exposure import corrected
+from sorvolo.paths import AnyPath
 from sorvolo.registration.features import gray_from_rgb
 from sorvolo.registration.lens import Undistorter, at_size, refined_camera
 from sorvolo.store.atomic import atomic_write_bytes, scratch_folder
@@ -214,7 +215,7 @@ class GroundModel:
 
 
 def make_heights(
-    site: Path,
+    site: AnyPath,
     settings: HeightSettings = HeightSettings(),
     *,
     flight: str | None = None,
@@ -225,6 +226,7 @@ def make_heights(
     `catalogues` has the site's; None: that of the environment. Raises InputError for a flight that has no heights to
     give (no GPS, too few photos that overlap), StoreError for a folder that is no site.
     """
+    site = Path(site)
     Archive.open(
         site, write=False, catalogues=catalogues
     ).close()  # to write would make a folder that is not there

@@ -48,6 +48,7 @@ from sorvolo.mosaic.selection import (
     select_keyframes,
     shows_all_between,
 )
+from sorvolo.paths import AnyPath, Inputs, as_path, as_text, listed
 from sorvolo.store.exports.waypoints import check_waypoint_files
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue_place import Catalogues
@@ -63,20 +64,20 @@ _FEW = 8  # selected frames after which a recorded flight is given up that canno
 
 
 def map_flights(
-    inputs: Sequence[Path | str],
-    site: Path,
+    inputs: Inputs,
+    site: AnyPath,
     settings: MapSettings = MapSettings(),
     *,
-    telemetry: Path | str | None = None,
-    camera: Path | str | None = None,
-    area: Path | None = None,
+    telemetry: AnyPath | None = None,
+    camera: AnyPath | None = None,
+    area: AnyPath | None = None,
     detector: FindsObjects | None = None,
     live: LiveSettings = LiveSettings(keeps_all=True),
     until: threading.Event | None = None,
-    control: Path | None = None,
-    base: Path | None = None,
+    control: AnyPath | None = None,
+    base: AnyPath | None = None,
     again: bool = False,
-    refly: Sequence[Path] = (),
+    refly: Inputs = (),
     catalogues: Catalogues | None = None,
     search: "SearchWhileFlying | None" = None,
 ) -> Generator[MosaicUpdate, None, tuple[AlreadyDone, ...]]:
@@ -97,7 +98,15 @@ def map_flights(
     Raises InputError, SettingsError or StoreError with what to do; the site then stays as it was. Close the generator
     to stop early: the flight that is being mapped is left out, those before it are in.
     """
-    check_waypoint_files(refly, site)
+    inputs = listed(inputs)
+    site = Path(site)
+    telemetry = as_text(telemetry)
+    camera = as_text(camera)
+    area = as_path(area)
+    control = as_path(control)
+    base = as_path(base)
+    waypoint_files = [Path(each) for each in listed(refly)]
+    check_waypoint_files(waypoint_files, site)
     wanted = None if area is None else read_area(area)
     is_live = any(is_live_address(str(each)) for each in inputs)
     looks = (
@@ -135,7 +144,9 @@ def map_flights(
             if isinstance(flight, AlreadyDone):
                 known.append(flight)
                 continue
-            coverage = FlightCoverage(flight.setup, archive, wanted, refly, settings.live_s)
+            coverage = FlightCoverage(
+                flight.setup, archive, wanted, waypoint_files, settings.live_s
+            )
             measuring = search if isinstance(flight.setup.source, LiveSource) else None
             yield from _map_one(flight, archive, settings, wanted, looks, coverage, measuring)
     return tuple(known)

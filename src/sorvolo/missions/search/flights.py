@@ -25,13 +25,14 @@ from sorvolo.missions.search.prepare import (
 )
 from sorvolo.missions.search.report import Searched, write_search
 from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
+from sorvolo.paths import AnyPath
 from sorvolo.search.cells import Cells, cells_of
 from sorvolo.store.atomic import writing
 from sorvolo.store.site.archive import Archive
 
 
 def search_site(
-    site_folder: Path,
+    site_folder: AnyPath,
     settings: SearchSettings,
     outputs: SearchOutputs,
     detector: FindsObjects | None = None,
@@ -42,6 +43,7 @@ def search_site(
     drawn into the flights' own frames. Raises InputError for a site without metres or flights, and for a model that is
     not installed; what `prepare_search` refuses is refused before any work.
     """
+    site_folder = Path(site_folder)
     prepared = prepare_search(settings, outputs, detector)
     area = prepared.area
     with Archive.open(site_folder, write=False) as archive:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sorvolo.errors import SettingsError
+from sorvolo.paths import as_path, listed
 
 FIGURES = ("search.html", "search.json", "pod.tif", "pod.geojson")
 """The files of a search's folder that hold its figures."""
@@ -65,3 +66,8 @@ class SearchOutputs:
     flights: tuple[str, ...] = ()
     refly: tuple[Path, ...] = ()
     dji_drone: str = "fly"
+
+    def __post_init__(self) -> None:
+        for name in ("folder", "area", "poa"):
+            object.__setattr__(self, name, as_path(getattr(self, name)))
+        object.__setattr__(self, "refly", tuple(Path(each) for each in listed(self.refly)))

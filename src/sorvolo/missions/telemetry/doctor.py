@@ -27,6 +27,7 @@ from sorvolo.missions.flight.headline import doubt_about
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup, prepare
 from sorvolo.missions.watch.cot_sender import CotPlace, CotTls, send_all
+from sorvolo.paths import AnyPath, as_path
 from sorvolo.store.atomic import atomic_path, atomic_write_bytes, writing
 from sorvolo.store.exports.places import longitude_latitude
 from sorvolo.store.exports.plain import json_bytes, plain_json
@@ -89,11 +90,11 @@ class _Compared:
 
 
 def correct_telemetry(
-    site_folder: Path,
-    folder: Path,
+    site_folder: AnyPath,
+    folder: AnyPath,
     *,
     flight: str = "",
-    source: Path | None = None,
+    source: AnyPath | None = None,
     telemetry: str | None = None,
     camera: str | None = None,
     cot: CotReceiver | None = None,
@@ -109,6 +110,9 @@ def correct_telemetry(
     another flight's files, a receiver that takes nothing or would get events without a date, and without `source` for a
     folder with a diagnosis, which would be lost, if there is nothing to send.
     """
+    site_folder = Path(site_folder)
+    folder = Path(folder)
+    source = as_path(source)
     with Archive.open(site_folder, write=False) as archive:
         site = archive.site()
         if site.is_local:

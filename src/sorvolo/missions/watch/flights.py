@@ -34,6 +34,7 @@ from sorvolo.missions.watch.run import EarlyFound, WatchRun, WatchUpdate, utc_ns
 from sorvolo.missions.watch.settings import DEFAULT_FRAMES_PER_SECOND, WatchOutputs, WatchSettings
 from sorvolo.missions.watch.waiting import WaitingFrames
 from sorvolo.mosaic.selection import every
+from sorvolo.paths import AnyPath, Inputs, as_text, listed
 from sorvolo.store.exports.detection_files import JOURNAL, claimed_folder
 from sorvolo.store.site.journal import RunJournal, content_sha256
 from sorvolo.survey.flight import Frame
@@ -45,12 +46,12 @@ _STOPPED = "stopped on demand"
 
 
 def watch(
-    source: Path | str,
+    source: Inputs,
     settings: WatchSettings = WatchSettings(),
     outputs: WatchOutputs = WatchOutputs(),
     *,
-    telemetry: Path | str | None = None,
-    camera: Path | str | None = None,
+    telemetry: AnyPath | None = None,
+    camera: AnyPath | None = None,
     detector: FindsObjects | None = None,
     live: LiveSettings = LiveSettings(),
     until: threading.Event | None = None,
@@ -77,9 +78,11 @@ def watch(
     press Ctrl-C, to end at once: all that was found until then is written. Raises
     InputError, SettingsError or StoreError with what to do.
     """
+    telemetry = as_text(telemetry)
+    camera = as_text(camera)
     until = until or threading.Event()
     finder = _checked_detector(detector, settings, outputs)
-    sources = open_sources([source], telemetry, camera, live=live, until=until)
+    sources = open_sources(listed(source), telemetry, camera, live=live, until=until)
     with ExitStack() as stack:
         for each in sources:
             if isinstance(each, LiveSource):

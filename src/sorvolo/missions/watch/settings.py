@@ -9,6 +9,7 @@ from sorvolo.missions.flight.looked_at import ENOUGH_LOOKED_AT, check_enough
 from sorvolo.missions.flight.settings import check_offset
 from sorvolo.missions.watch import alerts
 from sorvolo.missions.watch.cot_sender import CotTls, cot_place
+from sorvolo.paths import as_path
 
 DEFAULT_FRAMES_PER_SECOND = 10.0
 """Frames searched a second of a recorded flight: what a camera sees for half a second only is seen five times."""
@@ -83,6 +84,8 @@ class WatchOutputs:
     )
 
     def __post_init__(self) -> None:
+        for name in ("folder", "below"):
+            object.__setattr__(self, name, as_path(getattr(self, name)))
         self._check_files()
         self._check_receivers()
 

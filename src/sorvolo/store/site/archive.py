@@ -17,6 +17,7 @@ from sqlalchemy import Connection
 from sorvolo.errors import InputError, NotFoundError, SettingsError, SorvoloWarning, StoreError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.grid import SiteGrid
+from sorvolo.paths import AnyPath
 from sorvolo.store.exports.plain import features_name, plain_json
 from sorvolo.store.images import image_from_jpeg
 from sorvolo.store.nofollow import MOST_BYTES, open_below, read_below, sha256_of
@@ -88,7 +89,7 @@ class Archive:
         )  # files, by size and time, whose bytes were looked at
 
     @classmethod
-    def open(cls, folder: Path, *, write: bool, catalogues: Catalogues | None = None) -> Self:
+    def open(cls, folder: AnyPath, *, write: bool, catalogues: Catalogues | None = None) -> Self:
         """Open a site folder, to read it (while another process writes it, too) or as its only writer.
 
         Writing creates the folder, removes what a killed run left and repairs derived files. A new catalogue goes, and
@@ -96,6 +97,7 @@ class Archive:
         StoreError when the folder is no site, is being written by another process, cannot be written, is
         damaged, holds a link, or has another format version; then nothing in it was changed.
         """
+        folder = Path(folder)
         folder = Path(folder)
         if not write:
             if not is_site(folder):

@@ -1,0 +1,67 @@
+"""What strangers import: every function takes files as text or as any path, one input or several."""
+
+import dataclasses
+import inspect
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import sorvolo
+from sorvolo.paths import listed
+
+
+def public_functions() -> Iterator[tuple[str, Callable[..., Any]]]:
+    for name in sorvolo.__all__:
+        given = getattr(sorvolo, name)
+        if inspect.isfunction(given):
+            yield name, given
+        elif inspect.isclass(given):
+            for own, value in vars(given).items():
+                if isinstance(value, classmethod) and not own.startswith("_"):
+                    yield f"{name}.{own}", value.__func__
+
+
+def test_no_public_function_insists_on_a_path() -> None:
+    insisting = [
+        f"{name}({parameter})"
+        for name, function in public_functions()
+        for parameter in inspect.signature(function).parameters.values()
+        if "pathlib" in str(parameter.annotation)
+    ]
+    assert insisting == []
+
+
+def test_one_input_is_no_row_of_letters(tmp_path: Path) -> None:
+    class Odd:
+        def __fspath__(self) -> str:
+            return "a/b"
+
+    assert listed("flight.mp4") == ["flight.mp4"] and listed(Odd()) == ["a/b"]
+    assert listed([Path("a"), "rtsp://b/c"]) == ["a", "rtsp://b/c"]
+    with pytest.raises(sorvolo.InputError, match=r"no such file or folder: flight\.mp4"):
+        next(sorvolo.map_flights("flight.mp4", "site"))
+
+
+def test_a_folder_as_text_is_inspected(tmp_path: Path) -> None:
+    for index in range(2):
+        pixels = np.random.default_rng(index).integers(0, 255, (48, 64, 3), np.uint8)
+        Image.fromarray(pixels).save(tmp_path / f"IMG_{index}.jpg")
+    (one,) = sorvolo.inspect_input(str(tmp_path))
+    (other,) = sorvolo.inspect_input([os.fspath(tmp_path)])
+    assert one.inputs == other.inputs == ("IMG_0.jpg", "IMG_1.jpg")
+
+
+def test_records_of_outputs_take_text() -> None:
+    assert sorvolo.WatchOutputs(folder="found").folder == Path("found")  # type: ignore[arg-type]
+    outputs = sorvolo.SearchOutputs("results", refly=("holes.kmz",))  # type: ignore[arg-type]
+    assert (outputs.folder, outputs.refly) == (Path("results"), (Path("holes.kmz"),))
+
+
+def test_types_that_functions_give_are_public() -> None:
+    for name in ("MosaicUpdate", "CompareUpdate", "Track", "Telemetry", "ModelInfo", "CotPlace"):
+        assert dataclasses.is_dataclass(getattr(sorvolo, name)) and name in sorvolo.__all__
