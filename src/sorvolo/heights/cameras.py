@@ -153,13 +153,13 @@ def _matched(
         return np.zeros((0, 2), np.int64)
     likeness = left.descriptors[rows[0]] @ right.descriptors[rows[1]].T
     best = likeness.argmax(axis=1)
-    back = likeness.argmax(axis=0)
     every = np.arange(len(best))
     top = likeness[every, best]
+    is_mutual = top >= likeness.max(axis=0)[best]  # the row of a column's maximum costs far more
     likeness[every, best] = -1.0
     second = likeness.max(axis=1)
     # unit vectors: distance^2 = 2 - 2 likeness
-    good = (back[best] == every) & (1 - top < ratio**2 * (1 - second))
+    good = is_mutual & (1 - top < ratio**2 * (1 - second))
     return np.column_stack([rows[0][good], rows[1][best[good]]])
 
 
