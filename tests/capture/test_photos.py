@@ -702,6 +702,67 @@ def test_a_photo_that_lies_across_is_turned_to_fit(tmp_path: Path) -> None:
         assert np.abs(frame.image.astype(int) - np.asarray(picture(seed=seed))).mean() < 6
 
 
+WIDE, ZOOM, HEAT = (4.4, 24), (30.0, 162), (9.1, 40)
+
+
+def write_lens(path: Path, lens: tuple[float, int | None], source: str = "", seed: int = 0) -> Path:
+    focal_mm, film_mm = lens
+    film = {} if film_mm is None else {Base.FocalLengthIn35mmFilm: film_mm}
+    xmp = DJI.format(attributes=f'drone-dji:ImageSource="{source}"', elements="") if source else ""
+    extra = {Base.FocalLength: IFDRational(round(100 * focal_mm), 100), **film}
+    return write_photo(path, utc=f"2021:06:01 10:00:{seed:02d}", xmp=xmp, extra=extra, seed=seed)
+
+
+@pytest.mark.parametrize(
+    ("most", "others", "names", "way"),
+    [
+        ((WIDE, "WideCamera"), (ZOOM, "ZoomCamera"), ("DJI_{}_W", "DJI_{}_Z"), "*_Z.jpg"),
+        ((WIDE, ""), (HEAT, "InfraredCamera"), ("DJI_{}_W", "DJI_{}_T"), "*_T.jpg"),
+        (((4.4, None), ""), ((4.4, None), ""), ("DJI_{}_W", "DJI_{}_T"), "*_T.jpg"),
+        ((WIDE, ""), (WIDE, "InfraredCamera"), ("IMG_{}", "IRX_{}"), "IRX_*"),
+        (((4.4, None), ""), ((9.1, None), ""), ("DJI_1{}", "DJI_2{}"), "a folder of their own"),
+        ((HEAT, "InfraredCamera"), (WIDE, ""), ("DJI_2{}", "DJI_1{}"), "a folder of their own"),
+    ],
+)
+def test_each_lens_and_light_is_a_flight_of_its_own(
+    tmp_path: Path,
+    most: tuple[tuple[float, int | None], str],
+    others: tuple[tuple[float, int | None], str],
+    names: tuple[str, str],
+    way: str,
+) -> None:
+    for seed in range(4):
+        write_lens(tmp_path / f"{names[0].format(seed)}.jpg", *most, seed=seed)
+    second = [
+        write_lens(tmp_path / f"{names[1].format(seed)}.jpg", *others, seed=seed + 10)
+        for seed in range(3)
+    ]
+    source = open_photos(tmp_path)
+    assert source.inputs == tuple(f"{names[0].format(seed)}.jpg" for seed in range(4))
+    (found,) = [each for each in source.notices() if each.code == "other_camera"]
+    assert found.count == 3 and second[0].name in found.text and way in found.text
+    assert "zoom" not in codes(source) and len(source.telemetry) == 4
+    alone = open_photos(*second)
+    assert alone.frame_count == 3 and "other_camera" not in codes(alone)
+    assert alone.fingerprint != source.fingerprint
+
+
+def test_the_wide_ones_are_mapped_where_wide_and_thermal_are_as_many(tmp_path: Path) -> None:
+    for seed in range(3):
+        write_lens(tmp_path / f"DJI_{seed}_T.JPG", HEAT, "InfraredCamera", seed)
+        write_lens(tmp_path / f"DJI_{seed}_V.JPG", WIDE, "WideCamera", seed)
+        write_lens(tmp_path / f"DJI_{seed}_Z.JPG", ZOOM, "ZoomCamera", seed)
+    assert open_photos(tmp_path).inputs == tuple(f"DJI_{seed}_V.JPG" for seed in range(3))
+
+
+def test_photos_without_a_focal_length_stay_with_the_most(tmp_path: Path) -> None:
+    for seed in range(3):
+        write_lens(tmp_path / f"DJI_{seed}.JPG", WIDE, seed=seed)
+    write_lens(tmp_path / "DJI_3.JPG", (4.5, 24), seed=3)  # rounded another way
+    picture(seed=4).save(tmp_path / "DJI_4.JPG")
+    assert open_photos(tmp_path).frame_count == 5
+
+
 def test_other_sizes_are_resampled_or_lost(tmp_path: Path) -> None:
     flight(tmp_path)
     write_photo(tmp_path / "IMG_90.jpg", utc="2021:06:01 10:00:08", image=picture(160, 120))

@@ -101,6 +101,7 @@ class PhotoMetadata:
     unreadable: tuple[str, ...] = ()
     lens: photo_xmp.StatedLens = field(default_factory=photo_xmp.StatedLens)
     place_doubt: PlaceDoubt | None = None
+    is_thermal: bool = False  # as its XMP or its maker's name states
 
     @property
     def shown_size_px(self) -> tuple[int, int]:
@@ -156,6 +157,7 @@ def read_photo_metadata(path: Path) -> PhotoMetadata:
         unreadable,
         photo_xmp.stated_lens(properties, full_width_px, full_height_px),
         place_doubt,
+        photo_xmp.is_thermal(properties) or "flir" in _text(main.get(ExifTags.Base.Make)).lower(),
     )
 
 

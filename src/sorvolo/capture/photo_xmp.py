@@ -81,6 +81,12 @@ class StatedLens:
     is_calibrated: bool = False
 
 
+def is_thermal(properties: Mapping[str, str]) -> bool:
+    """Whether DJI's ImageSource names the thermal camera of several."""
+    source = properties.get("dji:ImageSource", "").lower()
+    return "infrared" in source or "thermal" in source
+
+
 def stated_lens(properties: Mapping[str, str], width_px: int, height_px: int) -> StatedLens:
     """DJI's DewarpData ("date;fx,fy,cx,cy,k1,k2,p1,p2,k3"), else a calibrated focal length, DJI's or Skydio's.
 

@@ -51,6 +51,9 @@ _QUARTER_TURN = 6  # EXIF's number for clockwise
 _EDGE_BYTES = (
     65_536  # of a photo's beginning and end, by which a copy of it is recognised; by choice
 )
+_ONE_LENS = 1.05  # ratio of focal lengths up to which photos are of one lens; by choice
+_NAMED = 5  # photos of another camera, of those that have no common name
+_THERMAL_NAME = re.compile(r"(?:_t|^irx?_.*)$", re.IGNORECASE)  # DJI's and Autel's
 _EXIF_UTC = "UTC in the photos' EXIF"
 _OF_A_PLACE = {
     "latitude_deg",
@@ -180,6 +183,7 @@ def read_album(
 ) -> Album:
     """Read every photo's metadata and put the photos in order of time; takes milliseconds a photo.
 
+    Where several lenses, or a thermal and a daylight camera, took them, the photos of the one with the most are the album.
     `positions` are files that place photos by name or number (`read_positions`), which goes before the photos' own; of
     a photo in several the first counts. `strict`: one that cannot be used is an error, no notice. Raises InputError
     when none of the files is a readable picture.
@@ -191,6 +195,7 @@ def read_album(
         raise InputError(
             f"none of the {len(found)} pictures can be read; the first: {found[0].problem.removeprefix('corrupt: ')}"
         )
+    found, camera_notices = _of_one_camera(found)
     found, place_notices = _placed(found, positions, strict=strict)
     timed, start_origin, time_notices = _put_in_time(found)
     distinct = _mark_duplicates(timed)
@@ -211,6 +216,7 @@ def read_album(
         0 if start_origin.startswith("unknown") else photos[0].time_ns,
         start_origin,
         (
+            *camera_notices,
             *place_notices,
             *time_notices,
             *gps_notices,
@@ -224,6 +230,83 @@ def _read(path: Path) -> Photo:
         return Photo(path, 0, read_photo_metadata(path))
     except InputError as error:
         return Photo(path, 0, PhotoMetadata(0, 0), f"corrupt: {error}", PhotoFault.UNREADABLE)
+
+
+def _of_one_camera(photos: Sequence[Photo]) -> tuple[list[Photo], list[Notice]]:
+    """The photos of the lens and light that took most of them, and notices of each other group with what maps it."""
+    groups = _by_light_and_lens(photos)
+    if len(groups) < 2:
+        return list(photos), []
+    most = max(groups, key=len)  # the first of equals
+    notices = []
+    for group in groups:
+        if group is most:
+            continue
+        names = [photo.path.name for photo in group]
+        metadata = group[0].metadata
+        light = "thermal" if _is_thermal(group[0]) else "daylight"
+        focal_mm = metadata.focal_length_mm
+        lens = f", focal length {focal_mm:g} mm" if focal_mm > 0 else ""
+        shown = ", ".join(names[:_NAMED]) + (" ..." if names[_NAMED:] else "")
+        words = f"photos of another camera than most, left out ({light}{lens}): {{}} ({shown}); "
+        notices += notice("other_camera", len(group), words + _way_to_map(group, photos))
+    left_out = {photo.path for group in groups if group is not most for photo in group}
+    return [photo for photo in photos if photo.path not in left_out], notices
+
+
+def _by_light_and_lens(photos: Sequence[Photo]) -> list[list[Photo]]:
+    """The readable photos of each light and focal length, daylight and wide ones first.
+
+    Lengths are compared as for 35 mm film where all photos of a light state these, else within a camera's model. Those
+    that state none are with the first group of their light.
+    """
+    groups: list[list[Photo]] = []
+    for is_thermal in (False, True):
+        lit = [each for each in photos if not each.problem and _is_thermal(each) is is_thermal]
+        stated = [each for each in lit if each.metadata.focal_length_mm > 0]
+        of_film = [each for each in lit if each.metadata.focal_length_35mm > 0]
+        is_by_film = len(of_film) == len({each.path for each in (*stated, *of_film)})
+
+        def lens(photo: Photo, by_film: bool = is_by_film) -> tuple[str, float]:
+            metadata = photo.metadata
+            if by_film:
+                return "", metadata.focal_length_35mm
+            return metadata.model, metadata.focal_length_mm
+
+        of_light: list[list[Photo]] = []
+        for photo in sorted(of_film if is_by_film else stated, key=lens):
+            last = lens(of_light[-1][-1]) if of_light else ("", 0.0)
+            is_same = last[0] == lens(photo)[0] and lens(photo)[1] <= _ONE_LENS * last[1]
+            if is_same:
+                of_light[-1].append(photo)
+            else:
+                of_light.append([photo])
+        grouped = {photo.path for group in of_light for photo in group}
+        unstated = [photo for photo in lit if photo.path not in grouped]
+        if unstated and of_light:
+            max(of_light, key=len).extend(unstated)
+        elif unstated:
+            of_light.append(unstated)
+        groups += of_light
+    return groups
+
+
+def _is_thermal(photo: Photo) -> bool:
+    return photo.metadata.is_thermal or _THERMAL_NAME.search(photo.path.stem) is not None
+
+
+def _way_to_map(group: Sequence[Photo], photos: Sequence[Photo]) -> str:
+    """What maps a group of photos alone: a pattern of names where one takes these and no other photo."""
+    first = group[0].path
+    before, _, after = first.name.rpartition("_")
+    patterns = [f"*_{after}", f"{first.name.partition('_')[0]}_*"] if before else []
+    wanted = {photo.path.name for photo in group}
+    for pattern in patterns:
+        if {each.path.name for each in photos if each.path.match(pattern)} == wanted:
+            return f"`sorvolo map {first.parent / pattern}` maps them, in a site of their own"
+    return (
+        "move them to a folder of their own, and give that to `sorvolo map` with a site of its own"
+    )
 
 
 def _placed(

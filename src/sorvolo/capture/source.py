@@ -436,7 +436,7 @@ def _open_photos(
         len(ignored),
         f"files in the folder that are no photos, ignored: {{}} ({', '.join(ignored[:5])})",
     )
-    fingerprint = _fingerprint(sorted(source.photos)[0])
+    fingerprint = _fingerprint(min(photo.path for photo in album.photos))
     return PhotoSource(name, fingerprint, album, model, found, notices)
 
 

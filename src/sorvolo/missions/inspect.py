@@ -55,6 +55,7 @@ _ADVICE = {
     "unknown_column": "rename one to height_above_takeoff(m), altitude_msl(m) or gimbal_pitch(deg) if it is that",
     "unknown_telemetry": "see docs/formats-in.md for what is read, or give other telemetry with --telemetry",
     "unusable_telemetry": "give a readable file with --telemetry",
+    "other_camera": "map them alone, in a site of their own",
     "mixed_cameras": "map each camera's pictures as its own flight",
     "zoom": "map each focal length as its own flight",
     "no_date": "nothing if video and telemetry begin together, else give --offset",
