@@ -219,6 +219,28 @@ def _textured(index: int) -> Any:
     return np.dstack([np.roll(cv2.resize(noise, (160, 400)), 2 * index, axis=0)[:96]] * 3)
 
 
+def _car_on_texture(index: int) -> Any:
+    image = _textured(index)
+    image[8 + 2 * index : 16 + 2 * index, 110:116] = 230
+    return image
+
+
+def test_without_places_pictures_count_and_objects_keep_their_ids(tmp_path: Path) -> None:
+    port, folder = free_port(), tmp_path / "watch"
+    detector, address = _VerySlowDetector(), f"udp://127.0.0.1:{port}"
+    with sending(udp_url(port), image=_car_on_texture, count=2 * RATE):
+        updates = list(
+            watch(address, outputs=WatchOutputs(folder=folder), detector=detector, live=_LIVE)
+        )
+    report = json.loads((folder / "report.json").read_text())
+    assert any(each.has_landed for each in updates) and report["frames"]["skipped"] == 0
+    searched = report["frames"]["detected"]
+    assert report["headline"]["text"] == f"1 car; {searched} of {searched} pictures looked at"
+    assert report["headline"]["complete"] and not (folder / "searched.geojson").exists()
+    (track,) = json.loads((folder / "tracks.json").read_text())["features"]
+    assert [new.id for each in updates for new in each.new] == [track["id"]]
+
+
 def test_how_the_picture_moves_is_known_between_the_frames_that_are_searched(
     tmp_path: Path,
 ) -> None:

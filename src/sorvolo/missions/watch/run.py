@@ -354,12 +354,16 @@ class WatchRun:
 
     def show(self, frame: Frame) -> PointsM | None:
         """A frame shows ground, whether or not it is searched: (4, 2) site metres; None where that is not known."""
-        view = None if self._ground is None else self._places.view(frame)
-        if view is None or self._ground is None:
-            return None
-        outline_m = near_ground(view.outline_m, view.site_from_camera.translation_m)
-        self._ground.show(outline_m)
+        outline_m = self._outline_m(frame)
+        if outline_m is not None and self._ground is not None:
+            self._ground.show(outline_m)
         return outline_m
+
+    def _outline_m(self, frame: Frame) -> PointsM | None:
+        view = None if self._ground is None else self._places.view(frame)
+        if view is None:
+            return None
+        return near_ground(view.outline_m, view.site_from_camera.translation_m)
 
     def new_share(self, outline_m: PointsM) -> float:
         """The share, 0 to 1, of this ground that no frame was searched for."""
@@ -377,7 +381,7 @@ class WatchRun:
 
     def _look(self, frame: Frame) -> None:
         """Note the ground of a frame that was searched."""
-        outline_m = self.show(frame)
+        outline_m = self._outline_m(frame)
         if outline_m is not None and self._ground is not None:
             m_per_px = self._places.m_per_px(frame)
             self._ground.look(outline_m, math.inf if m_per_px is None else m_per_px, self._classes)
@@ -391,6 +395,8 @@ class WatchRun:
         """A frame that cannot be used."""
         self.log.read = max(self.log.read, lost.index + 1)
         self.log.lost[lost.reason] += 1
+        if self._setup.source.kind == "video":  # a photo's place is lost with it
+            self.show(Frame.unseen(lost.index, lost.name, lost.time_ns, (0, 0)))
 
     def add(self, frame: Frame, arrived_s: float) -> WatchUpdate:
         """Search one frame, whose turn came at `arrived_s` of the monotonic clock, and take in what it shows."""
