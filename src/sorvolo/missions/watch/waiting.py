@@ -82,8 +82,7 @@ class WaitingFrames:
         frame as it comes; the newest where none shows any. Every second one shows what was seen but not often enough to
         be announced: the places (2,), by id, of `doubtful`. Raises what went wrong with the source.
         """
-        is_over = False
-        while not is_over:
+        while True:
             with self._changed:
                 came, self._came = self._came, []
                 newest, is_over = self._newest, self._is_over
