@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from sorvolo.capture.calibration import camera_from_option
-from sorvolo.capture.photo_metadata import read_photo_metadata
+from sorvolo.capture.source import open_sources
 from sorvolo.cli.main import main
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.lab.evaluation.change_metrics import Counts
@@ -237,7 +237,6 @@ def test_the_benchmark_mosaic_of_a_video_is_found_and_correlated(
 
 def test_npus_sequences_are_read_as_published(tmp_path: Path) -> None:
     """Key frames by place and calibration, and all frames with a log of fixes: one a second of them."""
-    jpeg = cv2.imencode(".jpg", np.full((60, 80, 3), 90, np.uint8))[1].tobytes()
     folder = tmp_path / "phantom3-npu-kfs"
     (folder / "rgb").mkdir(parents=True)
     (folder / "config.cfg").write_text(
@@ -249,10 +248,11 @@ def test_npus_sequences_are_read_as_published(tmp_path: Path) -> None:
     (unified / "rgb").mkdir(parents=True)
     (unified / "frames.txt").write_text("".join(f"{n / 10} rgb/{n}.jpg\n" for n in range(25)))
     (unified / "gps.txt").write_text("0 108.9 34.2 400 1\n2 108.9002 34.2 402 1\n")
-    for name in ("10.5", "12.75"):
-        (folder / "rgb" / f"{name}.jpg").write_bytes(jpeg)
-    for n in range(25):
-        (unified / "rgb" / f"{n}.jpg").write_bytes(jpeg)
+    for shade, file in enumerate(
+        [folder / "rgb" / f"{name}.jpg" for name in ("10.5", "12.75")]
+        + [unified / "rgb" / f"{n}.jpg" for n in range(25)]
+    ):
+        cv2.imwrite(str(file), np.full((60, 80, 3), 9 * shade, np.uint8))
     sequences = read_npu_folder(tmp_path)
     assert [each.video.key for each in sequences] == [
         "npu/phantom3-npu-kfs",
@@ -262,12 +262,11 @@ def test_npus_sequences_are_read_as_published(tmp_path: Path) -> None:
         video_input(each.video, None, tmp_path / each.video.name / "made") for each in sequences
     )
     assert kfs.camera is not None and camera_from_option(str(kfs.camera), 80, 60).camera.fx_px == 70
-    first, second = (read_photo_metadata(each) for each in sorted(kfs.video.iterdir()))
-    assert second.utc_ns - first.utc_ns == 2_250_000_000
-    assert second.columns["longitude_deg"] - 108.9 == pytest.approx(30 / 92_150, rel=0.01)
-    assert second.columns["height_above_takeoff_m"] == pytest.approx(120)
-    fixes = [read_photo_metadata(each).columns for each in sorted(all_frames.video.iterdir())]
-    assert [each["longitude_deg"] for each in fixes] == pytest.approx([108.9, 108.9001, 108.9002])
+    (flight,) = open_sources([kfs.video])
+    longitudes = flight.telemetry["longitude_deg"]
+    assert longitudes[1] - longitudes[0] == pytest.approx(30 / 92_150, rel=0.01)
+    (flight,) = open_sources([all_frames.video])
+    assert flight.telemetry["longitude_deg"] == pytest.approx([108.9, 108.9001, 108.9002])
     (folder / "config.cfg").write_text("")
     with pytest.raises(InputError, match=r"no GPS\.Origin"):
         photos_of_sequence(folder, tmp_path / "again")

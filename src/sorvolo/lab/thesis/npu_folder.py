@@ -10,15 +10,12 @@ import shutil
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
-from PIL import Image
-from PIL.ExifTags import GPS, IFD, Base
 
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Floats
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.lab.datasets.text_files import read_text
@@ -30,7 +27,6 @@ ENVIRONMENT = "NPU"
 """Of its videos, beside UMCD's environments."""
 
 _KEYFRAMES, _FRAMES = "trajectory.txt", "frames.txt"
-_EPOCH_S = 1_420_070_400.0  # 2015: its times count from anywhere
 
 
 @dataclass(frozen=True)
@@ -71,90 +67,65 @@ def read_npu_folder(place: Path) -> tuple[NpuSequence, ...]:
 
 
 def photos_of_sequence(folder: Path, to: Path) -> tuple[Path, Path | None]:
-    """A published sequence as photos with their places, one a second (the thesis's 4.1.2), and its calibration.
+    """A published sequence as photos with their places (geo.txt), one a second (the thesis's 4.1.2), and its
+    calibration.
 
     Raises InputError for files that are not of the published form.
     """
+    photos = to / "photos"
     with writing(to):
         shutil.rmtree(to, ignore_errors=True)
-        (to / "photos").mkdir(parents=True)
+        photos.mkdir(parents=True)
     config = read_text(folder / "config.cfg") if (folder / "config.cfg").is_file() else ""
     rows = _keyframes(folder, config) if (folder / _KEYFRAMES).is_file() else _seconds(folder)
-    last_s, count = -np.inf, 0
-    for time_s, picture, lonlat_height, above_ground_m in rows:
-        if time_s - last_s < 1.0 or not picture.is_file():
-            continue
-        last_s, count = time_s, count + 1
-        tagged = _tagged(picture.read_bytes(), time_s, lonlat_height, above_ground_m)
-        atomic_write_bytes(to / "photos" / f"{count:06d}.jpg", tagged, durable=False)
-    if not count:
+    geo, last_s = ["EPSG:4326"], -np.inf
+    for time_s, picture, (longitude_deg, latitude_deg, height_m) in rows:
+        if time_s - last_s >= 1.0 and picture.is_file():
+            last_s, name = time_s, f"{len(geo):06d}{picture.suffix}"
+            with writing(to):
+                shutil.copyfile(picture, photos / name)
+            geo.append(f"{name} {longitude_deg:.9f} {latitude_deg:.9f} {height_m:.3f}")
+    if len(geo) == 1:
         raise InputError(f"{folder}: none of the pictures that its list names is there")
-    return to / "photos", _camera(config, to / "camera.xml")
+    atomic_write_bytes(photos / "geo.txt", "\n".join(geo).encode())
+    return photos, _camera(config, to / "camera.xml")
 
 
-def _keyframes(folder: Path, config: str) -> Iterator[tuple[float, Path, Floats, float]]:
-    origin, plane = _numbers(config, r"GPS\.Origin"), _numbers(config, "Plane")
+_Row: TypeAlias = tuple[float, Path, tuple[float, float, float]]
+"""A picture's time, s, its file, and its longitude, latitude and height."""
+
+
+def _keyframes(folder: Path, config: str) -> Iterator[_Row]:
+    origin = _numbers(config, r"GPS\.Origin")
     if len(origin) < 3:
         raise InputError(f"{folder}: config.cfg states no GPS.Origin (longitude latitude altitude)")
     frame = LocalFrame(Geodetic(origin[1], origin[0], origin[2]))
-    ground_m = plane[2] if len(plane) >= 3 else 0.0
-    for line in read_text(folder / _KEYFRAMES).splitlines():
-        name, *rest = line.split() or [""]
-        pose = [float(each) for each in rest if _is_number(each)]
-        if not _is_number(name) or len(pose) < 3:
-            continue
-        latitude, longitude, height = frame.wgs84_from_site(np.array([pose[:3]]))
-        place = np.array([longitude[0], latitude[0], height[0]])
-        yield float(name), folder / "rgb" / f"{name}.jpg", place, pose[2] - ground_m
+    for name, place_m in _table(folder / _KEYFRAMES, numbers=3):
+        latitude, longitude, height = (
+            float(e[0]) for e in frame.wgs84_from_site(np.array([place_m]))
+        )
+        yield float(name), folder / "rgb" / f"{name}.jpg", (longitude, latitude, height)
 
 
-def _seconds(folder: Path) -> Iterator[tuple[float, Path, Floats, float]]:
+def _seconds(folder: Path) -> Iterator[_Row]:
     fixes = np.array(
-        [
-            [float(each) for each in line.split()[:4]]
-            for line in read_text(folder / "gps.txt").splitlines()
-            if len(line.split()) >= 4 and all(map(_is_number, line.split()[:4]))
-        ]
-    ).reshape(-1, 4)
+        [[float(time), *place] for time, place in _table(folder / "gps.txt", numbers=3)]
+    )
     if len(fixes) < 2:
         raise InputError(f"{folder}: gps.txt has no fixes (time longitude latitude altitude)")
     for line in read_text(folder / _FRAMES).splitlines():
-        words = line.split(maxsplit=1)
-        if len(words) == 2 and _is_number(words[0]):
-            time_s = float(words[0])
-            place = np.array([np.interp(time_s, fixes[:, 0], fixes[:, each]) for each in (1, 2, 3)])
-            yield time_s, folder / words[1].strip(), place, float("nan")
+        time, _, picture = line.strip().partition(" ")
+        if _is_number(time):
+            x, y, z = (float(np.interp(float(time), fixes[:, 0], each)) for each in fixes[:, 1:].T)
+            yield float(time), folder / picture.strip(), (x, y, z)
 
 
-def _tagged(jpeg: bytes, time_s: float, lonlat_height: Floats, above_ground_m: float) -> bytes:
-    """The very JPEG with its time and place in EXIF, and its height above ground, where known, in DJI's XMP."""
-    moment = datetime.fromtimestamp(_EPOCH_S + time_s % 1e8, UTC)
-    exif = Image.Exif()
-    detail = exif.get_ifd(IFD.Exif)
-    detail[Base.DateTimeOriginal] = moment.strftime("%Y:%m:%d %H:%M:%S")
-    detail[Base.SubsecTimeOriginal] = f"{moment.microsecond // 1000:03d}"
-    detail[Base.OffsetTimeOriginal] = "+00:00"
-    longitude, latitude, height_m = lonlat_height.tolist()
-    exif.get_ifd(IFD.GPSInfo).update(
-        {
-            GPS.GPSLatitudeRef: "N" if latitude >= 0 else "S",
-            GPS.GPSLatitude: (abs(latitude) // 1, abs(latitude) % 1 * 60, 0.0),
-            GPS.GPSLongitudeRef: "E" if longitude >= 0 else "W",
-            GPS.GPSLongitude: (abs(longitude) // 1, abs(longitude) % 1 * 60, 0.0),
-            GPS.GPSAltitudeRef: b"\x00" if height_m >= 0 else b"\x01",
-            GPS.GPSAltitude: abs(height_m),
-        }
-    )
-    segments = [exif.tobytes()]
-    if np.isfinite(above_ground_m):
-        segments.append(
-            b"http://ns.adobe.com/xap/1.0/\0"
-            b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
-            b'<rdf:Description rdf:about="" xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" '
-            b'drone-dji:RelativeAltitude="%+.3f"/></rdf:RDF></x:xmpmeta>' % above_ground_m
-        )
-    head = b"".join(b"\xff\xe1" + (len(each) + 2).to_bytes(2, "big") + each for each in segments)
-    return jpeg[:2] + head + jpeg[2:]
+def _table(path: Path, numbers: int) -> Iterator[tuple[str, list[float]]]:
+    """The rows of a text file that begin with a time, as written, and so many numbers."""
+    for line in read_text(path).splitlines():
+        words = line.split()[: numbers + 1]
+        if len(words) > numbers and all(map(_is_number, words)):
+            yield words[0], [float(each) for each in words[1:]]
 
 
 def _camera(config: str, path: Path) -> Path | None:

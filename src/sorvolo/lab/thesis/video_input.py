@@ -39,7 +39,7 @@ def video_input(each: UmcdVideo, camera: Path | None, scratch: Path) -> VideoInp
     """
     if each.video.is_dir():
         photos, own_camera = photos_of_sequence(each.video, scratch)
-        first = read_photo_metadata(min(photos.iterdir()))
+        first = read_photo_metadata(min(photos.glob("0*")))
         return VideoInput(photos, None, own_camera, 1.0, 0.0, (first.width_px, first.height_px))
     info = read_video_info(each.video)
     telemetry = next((path for path in each.texts if is_telemetry(path)), None)
