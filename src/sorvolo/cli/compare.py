@@ -256,7 +256,7 @@ def _show_progress(
             for change in () if update.is_resumed else update.announced:
                 site = site or site_of(folder)
                 unit, colour = "units" if site.is_local else "m", _COLOURS[change.kind]
-                what = _class_words(change.class_before, change.class_after)
+                what = _class_words(change.kind, change.class_before, change.class_after)
                 middle_m = (change.outline_m.min(axis=0) + change.outline_m.max(axis=0)) / 2
                 console.print(
                     f"[{colour}]{change.kind.value:>11}[/{colour}]  {escape(change.id)}: "
@@ -276,9 +276,10 @@ def _show_progress(
     return announced
 
 
-def _class_words(before: str | None, after: str | None) -> str:
-    """What stood there and stands there: "car", "car to person"."""
-    return " to ".join(escape(name) for name in (before, after) if name)
+def _class_words(kind: str, before: str | None, after: str | None) -> str:
+    """What stood there and stands there: "car", "car to person"; "" for changed ground."""
+    words = " to ".join(escape(name) for name in (before, after) if name)
+    return words or ("" if kind == "area" else "unknown object")
 
 
 def _show_result(result: Mapping[str, Any], console: Console, form: PlaceFormat) -> None:
@@ -364,7 +365,7 @@ def _show_changes(
         # the middle of the outline's box: the place that pages, exports and `review` print
         xs, ys = zip(*(point[:2] for point in feature["geometry"]["coordinates"][0]))
         x, y = (min(xs) + max(xs)) / 2, (min(ys) + max(ys)) / 2
-        what = _class_words(change["class_before"], change["class_after"])
+        what = _class_words(change["kind"], change["class_before"], change["class_after"])
         table.add_row(
             escape(change["id"]),
             f"{change['kind']}\n{what}" if what else str(change["kind"]),

@@ -56,7 +56,8 @@ Model = Annotated[
 Classes = Annotated[
     str | None,
     typer.Option(
-        help="What to look for, such as person,car.", show_default="what the model usually reports"
+        help="What to look for: person,car,small object.",
+        show_default="what the model usually reports",
     ),
 ]
 EnoughLookedAt = Annotated[

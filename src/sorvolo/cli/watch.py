@@ -91,7 +91,7 @@ def watch_command(
     coordinates: PlaceFormatOption = PlaceFormat.LATLON,
     as_json: AsJson = False,
 ) -> None:
-    """Find people, cars and small objects in a flight, live or recorded, and where on the ground they are.
+    """Find people and cars in a flight, live or recorded, and where on the ground they are; small objects by --classes.
 
     Ends with the source or with Ctrl-C, and writes all results either way. While a drone flies, frames of new ground are
     searched first; the others are kept and searched once it has landed, or after Ctrl-C (again: stop at once).

@@ -8,7 +8,7 @@ import { zipOfFiles } from "./zip.js";
 
 const KINDS = {
   map: ["Map", "A first map, or more of it, from a flight."], compare: ["Compare", "A later flight over the same ground: what changed."],
-  watch: ["Watch", "People, cars and small objects in a video, counted and placed."], search: ["Search", "How probable it is that somebody would have been found: on this site's flights, or on one that is mapped now, measured while it flies."],
+  watch: ["Watch", "People and cars in a video, counted and placed."], search: ["Search", "How probable it is that somebody would have been found: on this site's flights, or on one that is mapped now, measured while it flies."],
 };
 const MOST_ZIP_BYTES = 4e9;
 
