@@ -93,6 +93,9 @@ def test_heights_of_a_mapped_flight_are_files_that_fit_each_other(
     mapped: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     map_before = (mapped / "mosaic.tif").read_bytes()
+    of_map = json.loads(next(mapped.glob("flights/*/report.json")).read_text())
+    assert not of_map["shape"]["is_flat"] and of_map["residual_px"]["median"] < 1
+    assert [each["frames"] for each in of_map["pieces"]] == [of_map["frames"]["vision"]]
     assert main(["heights", str(mapped), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)["heights"]
     folder = mapped / "flights" / report["flight"]

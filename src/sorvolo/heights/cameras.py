@@ -225,7 +225,7 @@ class Cameras3D:
     `lost` are the names of views that no track holds. `points_m` (P, 3), `residual_px` the rms of all observations at
     the views' size, `fix_rms_m` (3,) cameras minus fixes, NaN without; `height_sigma` what heights err by the cameras.
     `point_sigma_m` (P,) is what the points' heights err by their features alone, `point_views` (P,) how many see each;
-    `view_residuals_px` (V,) is the median of each view's residuals.
+    `view_residuals_px` (V,) is the median of each view's residuals, `view_pieces` (V,) which views points tie together.
     """
 
     views: tuple[View, ...]
@@ -240,6 +240,7 @@ class Cameras3D:
     point_sigma_m: Floats = field(default_factory=lambda: np.zeros(0))
     point_views: Rows = field(default_factory=lambda: np.zeros(0, int))
     view_residuals_px: Floats = field(default_factory=lambda: np.zeros(0))
+    view_pieces: Rows = field(default_factory=lambda: np.zeros(0, int))
 
 
 def solve_cameras(
@@ -346,6 +347,11 @@ def _solved(
     )
     residual = scene.residuals_px()
     miss_px = np.linalg.norm(residual, axis=1)
+    size = len(views) + len(scene.points_m)
+    ties = coo_matrix(
+        (np.ones(len(residual), np.int8), (scene.view, len(views) + scene.point)), (size, size)
+    )
+    pieces = np.asarray(connected_components(ties, directed=False)[1], int)
     with np.errstate(invalid="ignore"):
         off = (scene.centres_m - priors.fixes_m)[held]
     # The pictures weighed as they fit (their residuals' median), which is better than the
@@ -366,6 +372,7 @@ def _solved(
         matched_deviations(scene, priors, weighed),
         np.bincount(scene.point, minlength=len(scene.points_m)),
         np.array([np.nanmedian(miss_px[scene.view == k]) for k in np.flatnonzero(held)]),
+        pieces[: len(views)][held],
     )
 
 

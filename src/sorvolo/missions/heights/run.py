@@ -98,7 +98,7 @@ def _residuals_m(archive: Archive, flight_id: str) -> dict[str, tuple[float | No
         raise InputError(f"{path} is gone or damaged ({error!r}); map the flight again") from error
 
 
-_LARGE_BYTES = 288 << 20  # of pictures as stored, for the orthophoto: ten of 9 megapixels
+_LARGE_BYTES = 192 << 20  # of pictures as stored, for the orthophoto: five of 12 megapixels
 _SMALL_BYTES = (
     128 << 20
 )  # of gray ones, for the sweep: about a hundred of 4000 px at the usual cells
@@ -122,6 +122,11 @@ class FlightPictures:
     def colour(self, number: int) -> ImageRGB:
         """A picture as it is stored, corrected."""
         return self._large.get(number)
+
+    def release(self) -> None:
+        """Drop the pictures that are kept."""
+        self._large.clear()
+        give_back()
 
     def gray(self, number: int) -> ImageGray:
         """A picture in gray, as it is stored; it is not kept."""

@@ -123,6 +123,15 @@ def standing_frames(
     return result
 
 
+def pieces_of(frames: Sequence[PlacedFrame], model: GroundModel) -> list[list[int]]:
+    """The frames, by index, that points in space tie to each other."""
+    index_of = {frame.name: frame.index for frame in frames}
+    pieces: dict[int, list[int]] = {}
+    for view, piece in zip(model.solved.views, model.solved.view_pieces.tolist(), strict=True):
+        pieces.setdefault(piece, []).append(index_of[view.name])
+    return list(pieces.values())
+
+
 def _on_plane(view: View, matrix: Matrix3, model: GroundModel) -> Matrix3:
     """(3, 3) from pixels of a view's picture, whose camera has this matrix, to site metres on the bare ground's plane."""
     lattice = model.surface.lattice

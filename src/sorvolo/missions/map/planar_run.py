@@ -32,7 +32,7 @@ from sorvolo.missions.flight.settings import TILES_MB, MapSettings, memory_budge
 from sorvolo.missions.flight.setup import FlightSetup, new_site
 from sorvolo.missions.heights.run import GroundModel, ground_tiles, write_heights
 from sorvolo.missions.map.coverage import FlightCoverage
-from sorvolo.missions.map.ground import ground_of, shape_of, standing_frames
+from sorvolo.missions.map.ground import ground_of, pieces_of, shape_of, standing_frames
 from sorvolo.missions.map.painting import FlightPainter, KnownKeyframes
 from sorvolo.mosaic.base_ties import BaseReport, FoundFrame, tie_to_base
 from sorvolo.mosaic.exposure import Exposure
@@ -420,6 +420,7 @@ class PlanarRun(FlightRun):
         shown = {len(self._known) + index_of[view.name] for view in model.solved.views}
         tiles = ground_tiles(model, self._archive.site_grid())
         painter.finish(((index, rgba) for index, rgba, _ in tiles), shown)
+        model.pictures.release()
         sigmas_m = {
             each - len(self._known): sigma_m
             for each, sigma_m in self._mapper.sigmas_m(leans=False).items()
@@ -445,7 +446,9 @@ class PlanarRun(FlightRun):
             self._exposure.spread,
             control=self._control,
             base=self._base,
-            pieces=[[each - len(self._known) for each in ids] for ids in self._mapper.pieces()],
+            pieces=[[each - len(self._known) for each in ids] for ids in self._mapper.pieces()]
+            if model is None
+            else pieces_of(placed, model),
             shape=shape,
         )
         report = build_report(
