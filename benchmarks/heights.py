@@ -101,12 +101,9 @@ def simulated(seed: int, relief_m: float = 0.0) -> dict[str, Any]:
         folder = Path(scratch)
         for _ in simulate_site(folder / "made", settings):
             pass
-        list(
-            map_flights(
-                [folder / "made" / "flight1" / "photos"], folder / "site", MapSettings(model="none")
-            )
-        )
-        list(make_heights(folder / "site", HeightSettings()))
+        photos, site = folder / "made" / "flight1" / "photos", folder / "site"
+        list(map_flights([photos], site, MapSettings(model="none", heights=False)))
+        list(make_heights(site, HeightSettings()))
         flown = next(iter(simulate_flights(settings)))
         day = flown.day
         with Archive.open(folder / "site", write=False) as archive:
@@ -348,14 +345,15 @@ def real(folder: Path, colmap: Path | None) -> dict[str, Any]:
     """What mapping a flight and its heights cost, and how far its cameras are from COLMAP's."""
     with tempfile.TemporaryDirectory() as scratch:
         site = Path(scratch) / "site"
-        flat = _measured(["map", str(folder), "--site", str(site), "--model", "none"])
+        mapping = ["map", str(folder), "--model", "none", "--site"]
+        flat = _measured([*mapping, str(site), "--flat"])
         heights = _measured(["heights", str(site)])
+        whole = _measured([*mapping, str(site.with_name("whole"))])
         report = json.loads(next(site.glob("flights/*/heights.json")).read_text())
         frames = json.loads(next(site.glob("flights/*/frames.geojson")).read_text())["features"]
         result = {
             "photos": len(frames),
-            "flat": flat,
-            "heights": heights,
+            **{"flat": flat, "heights": heights, "whole": whole},
             "residual_rms_px": report["cameras"]["residual_rms_px"],
             "surface": report["surface"],
         }
