@@ -4,6 +4,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -403,11 +404,13 @@ def test_a_changed_area_has_its_height_change_where_both_flights_have_heights(
         (False, True, {}, False, "asked for"),
         (True, None, {"is_tied": True}, True, "tied to known ground"),
         (True, True, {"is_local": True}, True, "GPS"),
+        (True, None, {"is_live": True}, True, "101 pictures take long"),
     ],
 )
 def test_a_map_stands_on_heights_where_its_ground_is_not_level_or_one_asks_for_it(
     is_uneven: bool, asked: bool | None, where: dict[str, bool], is_flat: bool, why: str
 ) -> None:
     graph = GraphReport(1.0, 0.1, 0.0, 0.0, 3, 0, 0.0, 0.3, is_uneven=is_uneven)
-    shape = shape_of(graph, [], asked, **{"is_local": False, "is_tied": False} | where)
+    frames = [SimpleNamespace(site_from_camera=object())] * 101
+    shape = shape_of(graph, frames, asked, **{"is_local": False, "is_tied": False} | where)
     assert shape.is_flat is is_flat and why in shape.why

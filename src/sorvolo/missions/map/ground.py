@@ -17,7 +17,9 @@ from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import StoredKeyframe
 from sorvolo.survey.mosaic import PlacedFrame, Status
 
-_MOST_PHOTOS = 600  # unless heights are asked for: features of so many take a gigabyte; by choice
+# Pictures of a flight whose heights are made unasked: features of 600 take a gigabyte, and after landing
+# somebody waits for the map. By choice.
+_MOST, _MOST_LIVE = 600, 100
 _SIDE = 12  # rays a side through a picture, to the ground below it
 
 
@@ -28,6 +30,7 @@ def shape_of(
     *,
     is_local: bool,
     is_tied: bool,
+    is_live: bool = False,
 ) -> MapShape:
     """Whether a map is to stand on heights: as `asked`, or (None) where its pictures fit as over uneven ground.
 
@@ -46,7 +49,7 @@ def shape_of(
             True,
             f"the map is flat though {uneven}: it is tied to known ground; `sorvolo heights` adds a true orthophoto",
         )
-    if asked is None and placed > _MOST_PHOTOS:
+    if asked is None and placed > (_MOST_LIVE if is_live else _MOST):
         return MapShape(
             True,
             f"the map is flat though {uneven}: heights of {placed:,} pictures take long; --heights makes them",

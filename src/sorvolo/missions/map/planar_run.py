@@ -401,6 +401,7 @@ class PlanarRun(FlightRun):
             self._settings.heights,
             is_local=self._archive.site().is_local,
             is_tied=self._setup.known_ground is not None,
+            is_live=isinstance(self._setup.source, LiveSource),
         )
         model = None
         if not shape.is_flat:
