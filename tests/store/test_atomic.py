@@ -136,4 +136,4 @@ def test_a_disk_that_fills_while_the_map_is_exported_is_made_good_later(small_di
     subprocess.run(["mount", "-o", "remount,size=40m", str(small_disk)], check=True)
     with Archive.open(folder, write=True) as archive:
         assert archive.mosaic_path.exists()
-        assert archive.kmz_path.exists()
+        assert (archive.folder / "mosaic.kmz").exists()

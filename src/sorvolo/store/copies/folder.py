@@ -25,6 +25,7 @@ from sorvolo.store.atomic import (
     sync_file,
     writing,
 )
+from sorvolo.store.exports.change_files import OBJECTS
 from sorvolo.store.nofollow import chunks_of, open_below, refuse_links, sha256_of
 from sorvolo.store.site import catalogue as records
 from sorvolo.store.site import schema
@@ -56,18 +57,8 @@ from sorvolo.store.site.files import (
     lock_folder,
     refuse_unfinished,
 )
+from sorvolo.store.site.upkeep import LIST_ENDINGS, MAP_FILES
 
-_MAP_FILES = frozenset(
-    {
-        "mosaic.tif",
-        "preview.png",
-        "mosaic.kmz",
-        "objects.geojson",
-        "objects.json",
-        "objects.kml",
-        "objects.gpx",
-    }
-)
 _MOST_PARTS = 6  # of a file's path: flights/<flight>/staged/<run>/changes/<file>
 _HOW_FAR_WRITTEN = {
     "site": {"derived_version"},
@@ -187,7 +178,7 @@ def is_site_path(path: str) -> bool:
     """Whether a site has a file of this path: one of the map's, or one below `flights/<flight>/`; tiles apart."""
     parts = path.split("/")
     if len(parts) == 1:
-        return path in _MAP_FILES
+        return path in (*MAP_FILES, *(f"{OBJECTS}{ending}" for ending in LIST_ENDINGS))
     if not 3 <= len(parts) <= _MOST_PARTS or parts[0] != "flights" or parts[2] == JOURNAL:
         return False
     return all(is_plain_name(part) for part in parts[1:]) and not parts[-1].startswith(

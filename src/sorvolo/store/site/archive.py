@@ -409,16 +409,6 @@ class Archive:
         return self.folder / "mosaic.tif"
 
     @property
-    def preview_path(self) -> Path:
-        """The map as a small PNG."""
-        return self.folder / "preview.png"
-
-    @property
-    def kmz_path(self) -> Path:
-        """The map for Google Earth."""
-        return self.folder / "mosaic.kmz"
-
-    @property
     def live_preview_path(self) -> Path:
         """A small PNG of the growing map."""
         return self.folder / LIVE_PREVIEW

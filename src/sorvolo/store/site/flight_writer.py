@@ -133,11 +133,7 @@ class FlightWriter:
         return self._sizes[self._image_path(index)], self._sha256[index]
 
     def keyframe(self, frame: PlacedFrame, image_path: str) -> StoredKeyframe:
-        """The record of a frame whose picture was saved at this path; raises StoreError where none was."""
-        if image_path not in self._sizes:
-            raise StoreError(
-                f"the image {image_path} of frame {frame.name} was never saved; save it first"
-            )
+        """The record of a frame whose picture was saved at this path."""
         width_px, height_px = self._sizes[image_path]
         camera = frame.camera.undistorted()
         sx, sy = camera.width_px / width_px, camera.height_px / height_px
@@ -254,8 +250,8 @@ class FlightWriter:
         none, changes.geojson, changes.html and the crops are written, too, changes.html from `report`
         (docs/formats.md). `search` is what the frames were searched for and what was found, None when they were not:
         with it objects.geojson and the crops are written, too. `documents` are further files of the flight's folder by
-        name, not empty. Raises SettingsError for a bad `crs`, StoreError on a full disk, an unknown image path, or an
-        id that two changes have.
+        name, not empty. Raises SettingsError for a bad `crs`, StoreError on a full disk or an id that two
+        changes have.
         """
         if crs is not None:
             parse_crs(crs, self._files.site_grid().grid)

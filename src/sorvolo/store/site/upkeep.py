@@ -44,12 +44,13 @@ from sorvolo.store.site.journal import is_journal_after
 if TYPE_CHECKING:
     from sorvolo.store.site.archive import Archive
 
+MAP_FILES = ("mosaic.tif", "preview.png", "mosaic.kmz")
 STAGED_FOLDERS = ("changes", "masks", CROPS)
 HEIGHTS = "heights"
 """The staged folder whose files go to the flight's own folder."""
 # of the map in changes.html; daily flights without change should cost little
 _PICTURE_PX, _UNCHANGED_PX = 1600, 800
-_ENDINGS = (".geojson", ".json", ".kml", ".gpx")  # of lists of places
+LIST_ENDINGS = (".geojson", ".json", ".kml", ".gpx")  # of lists of places
 
 
 def repair(files: "Archive") -> None:
@@ -71,7 +72,7 @@ def repair(files: "Archive") -> None:
         if owed or bool(searches) != features_path(files.folder, OBJECTS).is_file():
             # the newest of each place; none where no flight was ever searched
             newest_of_each = change_records.newest_objects(files.objects(), searches)
-            with files.replacing(*(f"{OBJECTS}{ending}" for ending in _ENDINGS)):
+            with files.replacing(*(f"{OBJECTS}{ending}" for ending in LIST_ENDINGS)):
                 _write_objects(files, files.folder, newest_of_each if searches else None)
         for written in waiting:
             written.result()
@@ -89,9 +90,10 @@ def _is_shown(files: "Archive", newest: VersionEntry, shown: int) -> bool:
             now, then = (records.tile_hashes(connection, each) for each in (newest.id, shown))
         if now != then or written_as.get(shown) != (newest.export_crs, newest.compress):
             return False
-    paths = [files.preview_path, files.mosaic_path]
-    paths += [] if files.site().is_local else [files.kmz_path]
-    return not newest.tiles or all(path.is_file() and files.is_sound(path.name) for path in paths)
+    names = MAP_FILES[: 2 if files.site().is_local else None]
+    return not newest.tiles or all(
+        (files.folder / name).is_file() and files.is_sound(name) for name in names
+    )
 
 
 def forget_unfinished(files: "Archive") -> None:
@@ -161,7 +163,7 @@ def _write_flight_files(files: "Archive", owed: OwedFiles) -> None:
         is_compared = change_records.is_compared(connection, owed.run_id)
         is_searched = change_records.is_searched(connection, owed.run_id)
     staged = folder / STAGED / str(owed.run_id)
-    lists = (f"{name}{ending}" for name in ("changes", OBJECTS) for ending in _ENDINGS)
+    lists = (f"{name}{ending}" for name in ("changes", OBJECTS) for ending in LIST_ENDINGS)
     pictures = (name for name in STAGED_FOLDERS if (staged / name).is_dir())
     heights = HeightFile if (staged / HEIGHTS).is_dir() else ()
     names = (*contents, *owed.leftovers, *lists, "changes.html", *pictures, *heights)
@@ -179,48 +181,34 @@ def _write_flight_files(files: "Archive", owed: OwedFiles) -> None:
 
 
 def _write_map_files(files: "Archive", version: VersionEntry) -> None:
-    paths = (files.preview_path, files.mosaic_path, files.kmz_path)
-    with files.replacing(*(path.name for path in paths)):
-        write_map_files(files, version)
+    """Write the map's files of a version; remove them when it has no tiles."""
+    mosaic, preview, kmz = (files.folder / name for name in MAP_FILES)
+    tiles, site = files.version_tiles(version.id), files.site()
+    with files.replacing(*MAP_FILES):
+        if not tiles:
+            for path in (mosaic, preview, kmz):
+                path.unlink(missing_ok=True)
+            return
+        small = small_map_of(tiles, files.site_grid().grid.tile_px)
+        waiting: list[Future[None]] = []
+        with ThreadPoolExecutor(1, thread_name_prefix="previews") as other:
 
+            def pass_by(index: TileIndex, tile: ImageRGBA) -> None:
+                small.take(index, tile)
+                if small.taken == len(tiles):  # while GDAL makes its file
+                    shown = (site.name, preview, None if site.is_local else kmz)
+                    waiting.append(other.submit(write_small_maps, small, files.site_grid(), *shown))
 
-def write_map_files(files: "Archive", version: VersionEntry) -> None:
-    """Write mosaic.tif, preview.png and mosaic.kmz of a version; remove them when it has no tiles."""
-    tiles = files.version_tiles(version.id)
-    if not tiles:
-        for path in (files.preview_path, files.mosaic_path, files.kmz_path):
-            path.unlink(missing_ok=True)
-        return
-    site = files.site()
-    small = small_map_of(tiles, files.site_grid().grid.tile_px)
-    waiting: list[Future[None]] = []
-    with ThreadPoolExecutor(1, thread_name_prefix="previews") as other:
-
-        def pass_by(index: TileIndex, tile: ImageRGBA) -> None:
-            small.take(index, tile)
-            if small.taken == len(tiles):  # while GDAL makes its file
-                kmz = None if site.is_local else files.kmz_path
-                waiting.append(
-                    other.submit(
-                        write_small_maps,
-                        small,
-                        files.site_grid(),
-                        site.name,
-                        files.preview_path,
-                        kmz,
-                    )
-                )
-
-        write_cog(
-            tiles,
-            files.site_grid(),
-            files.mosaic_path,
-            crs=version.export_crs or None,
-            compress=version.compress,
-            pass_by=pass_by,
-        )
-    for each in waiting:
-        each.result()
+            write_cog(
+                tiles,
+                files.site_grid(),
+                mosaic,
+                crs=version.export_crs or None,
+                compress=version.compress,
+                pass_by=pass_by,
+            )
+        for each in waiting:
+            each.result()
 
 
 def take_staged(flight_folder: Path, run_id: int) -> None:
@@ -314,7 +302,7 @@ def _write_list(
 
 
 def _remove_list(folder: Path, name: str, but: str = "") -> None:
-    for ending in _ENDINGS[: 2 if but else None]:
+    for ending in LIST_ENDINGS[: 2 if but else None]:
         if (file := f"{name}{ending}") != but:
             (folder / file).unlink(missing_ok=True)
 
