@@ -126,8 +126,9 @@ def open_sources(
     `until` is set. `telemetry` belongs to the only flight. Without it, a video's is looked for inside and beside it;
     photos' is in them or beside them (positions by photo, the only log); beside a live source it is a link to a
     receiver (serial:, tcp://, udp://, follow:LOG). `camera` is a calibration file or what else `--camera` takes
-    (capture.calibration). `known` are the site's flights, name to fingerprint: another flight of the same name (cards are numbered anew) gets a name of its own. `better_camera`
-    gives the camera to use instead of the one of the input or of `camera`.
+    (capture.calibration). `known` are the site's flights, name to fingerprint: another flight of the same name (cards
+    are numbered anew) gets a name of its own. `better_camera` gives the camera to use instead of the one of the input
+    or of `camera`.
     Raises InputError for what cannot be read, naming the file and what to do.
     """
     if not inputs:
