@@ -1,6 +1,6 @@
 """Cameras by model name: sensor, focal length and image size of common drones.
 
-docs/formats-in.md ("Camera presets") states for each where its figures come from and how far they agree with another
+docs/calibrate.md ("Camera presets") states for each where its figures come from and how far they agree with another
 source; `focal_sigma` covers the difference.
 """
 
@@ -95,7 +95,7 @@ CAMERA_PRESETS = (
         9248,
         6944,
     ),
-    # unverified, from memory (docs/formats-in.md): focal lengths that an angle of view or a length at 35 mm gives
+    # unverified, from memory (docs/calibrate.md): focal lengths that an angle of view or a length at 35 mm gives
     CameraPreset("Autel EVO II", ("XT701",), 6.4, 4.8, 4.74, 8000, 6000, 0.06),
     CameraPreset("Autel EVO II Pro", ("XT705", "XL705"), 12.75, 8.5, 10.57, 5472, 3648, 0.05),
     CameraPreset("Autel EVO II Dual 640T", ("XT709",), 6.4, 4.8, 4.74, 8000, 6000, 0.06),
