@@ -45,10 +45,6 @@ class RoiStitchingSettings:
     max_features: int = (
         6000  # the strongest, in frame and region each: matching costs their product
     )
-    matching: Literal["cross-check", "ratio"] = (
-        "cross-check"  # both read "only identical patterns match"
-    )
-    ratio: float = 0.8  # Lowe's (2004)
     transform: Literal["similarity", "homography"] = (
         "similarity"  # homography: the thesis's Figure 3.12a
     )
@@ -61,8 +57,6 @@ class RoiStitchingSettings:
             ("side_px", 256 <= self.side_px <= 8192, "256 to 8192"),
             ("akaze_threshold", self.akaze_threshold > 0, "a positive number"),
             ("max_features", self.max_features >= 1, "at least 1"),
-            ("matching", self.matching in ("cross-check", "ratio"), "cross-check or ratio"),
-            ("ratio", 0 < self.ratio <= 1, "more than 0, at most 1"),
             (
                 "transform",
                 self.transform in ("similarity", "homography"),
@@ -200,20 +194,8 @@ class RoiStitcher:
                 frame_id,
                 f"too few features: {len(in_frame[0])} in the frame, {len(in_mosaic[0])} in the mosaic",
             )
-        # (N, 2) indices of mosaic and frame features that match, each at most once.
-        mosaic = in_mosaic[1]
-        frame = in_frame[1]
-        if self._settings.matching == "cross-check":
-            found = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(frame, mosaic)
-        else:
-            nearest = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(frame, mosaic, k=2)
-            best: dict[int, cv2.DMatch] = {}
-            for pair in nearest:
-                if len(pair) == 2 and pair[0].distance < self._settings.ratio * pair[1].distance:
-                    rival = best.get(pair[0].trainIdx)
-                    if rival is None or pair[0].distance < rival.distance:
-                        best[pair[0].trainIdx] = pair[0]
-            found = list(best.values())
+        # "identical patterns", each with one partner: two pictures have none, but mutually nearest ones
+        found = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(in_frame[1], in_mosaic[1])
         pairs = np.array([(m.trainIdx, m.queryIdx) for m in found], dtype=np.int64).reshape(-1, 2)
         if len(pairs) < self._settings.min_inliers:
             return NotStitched(
@@ -268,25 +250,15 @@ class RoiStitcher:
         self, mosaic_px: PointsPx, frame_px: PointsPx
     ) -> tuple[Matrix3 | None, NDArray[np.bool_]]:
         # both estimators seed their own generator, so the same points give the same answer
+        limits: dict[str, Any] = {"maxIters": 5000, "confidence": 0.999}
+        reach = self._settings.ransac_px
         if self._settings.transform == "similarity":
-            affine, inliers = cv2.estimateAffinePartial2D(
-                frame_px,
-                mosaic_px,
-                method=cv2.RANSAC,
-                ransacReprojThreshold=self._settings.ransac_px,
-                maxIters=5000,
-                confidence=0.999,
+            matrix, inliers = cv2.estimateAffinePartial2D(
+                frame_px, mosaic_px, method=cv2.RANSAC, ransacReprojThreshold=reach, **limits
             )
-            matrix = None if affine is None else np.vstack([affine, [0.0, 0.0, 1.0]])
+            matrix = None if matrix is None else np.vstack([matrix, [0.0, 0.0, 1.0]])
         else:
-            matrix, inliers = cv2.findHomography(
-                frame_px,
-                mosaic_px,
-                cv2.RANSAC,
-                self._settings.ransac_px,
-                maxIters=5000,
-                confidence=0.999,
-            )
+            matrix, inliers = cv2.findHomography(frame_px, mosaic_px, cv2.RANSAC, reach, **limits)
         if matrix is None or inliers is None:
             return None, np.zeros(len(frame_px), dtype=bool)
         return matrix, inliers.ravel().astype(bool)
@@ -337,15 +309,10 @@ def solve_gains(
     return dict(zip(frames, np.atleast_1d(spsolve(normal, right)).tolist(), strict=True))
 
 
-def georeference(
-    barycentres_mosaic_px: PointsPx, fixes_site_m: PointsM, *, robust: bool = False
-) -> Matrix3:
-    """site_from_mosaic (3, 3): the least-squares similarity of anchored barycentres, (N, 2) px, onto fixes,
-    (N, 2) m.
+def georeference(barycentres_mosaic_px: PointsPx, fixes_site_m: PointsM) -> Matrix3:
+    """site_from_mosaic (3, 3): the least-squares similarity of anchored barycentres, (N, 2) px, onto fixes, (N, 2) m.
 
-    The mosaic's y points down, so it is reflected first. `robust` drops, twice, pairs off by more than three
-    times the median; the thesis takes every fix as it is. Raises GeometryError for fewer than two different
-    points.
+    The mosaic's y points down, so it is reflected first. Raises GeometryError for fewer than two different points.
     """
     barycentres = np.asarray(barycentres_mosaic_px, dtype=np.float64)
     fixes_m = np.asarray(fixes_site_m, dtype=np.float64)
@@ -353,14 +320,8 @@ def georeference(
         raise GeometryError(
             f"barycentres {barycentres.shape} and fixes {fixes_m.shape} must both be (N, 2)"
         )
-    upright = barycentres * [1.0, -1.0]
-    keep = np.ones(len(upright), dtype=bool)
-    site_from_upright = fit_similarity(fixes_m, upright)
-    for _ in range(2 if robust else 0):
-        miss_m = np.linalg.norm(apply_homography(site_from_upright, upright) - fixes_m, axis=1)
-        keep = miss_m <= 3 * np.median(miss_m[keep]) + 1e-9
-        site_from_upright = fit_similarity(fixes_m[keep], upright[keep])
-    return site_from_upright @ np.diag([1.0, -1.0, 1.0])
+    upright = np.diag([1.0, -1.0, 1.0])
+    return fit_similarity(fixes_m, apply_homography(upright, barycentres)) @ upright
 
 
 def _corners(width: int, height: int) -> PointsPx:
