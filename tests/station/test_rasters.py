@@ -10,6 +10,8 @@ import pytest
 from shapely.geometry import shape
 from starlette.testclient import TestClient
 
+from sorvolo.store.site.archive import Archive
+
 COG = "/api/sites/field/cogs/mosaic"
 
 
@@ -73,10 +75,12 @@ def test_files_come_by_id_and_are_geotiffs(client: TestClient, root: Path, tmp_p
     assert client.get(f"{COG}/info?url=http://evil.example/x.tif").json()["driver"] == "GTiff"
     mosaic = root / "field/mosaic.tif"
     kept = mosaic.read_bytes()
-    mosaic.write_text(
-        '<VRTDataset rasterXSize="9" rasterYSize="9"><VRTRasterBand dataType="Byte" band="1"><SimpleSource>'
-        f"<SourceFilename>{tmp_path / 'secret.tif'}</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>"
-    )
+    # by a stranger, who makes the catalogue, too
+    with Archive.open(root / "field", write=True) as site, site.replacing("mosaic.tif"):
+        mosaic.write_text(
+            '<VRTDataset rasterXSize="9" rasterYSize="9"><VRTRasterBand dataType="Byte" band="1"><SimpleSource>'
+            f"<SourceFilename>{tmp_path / 'secret.tif'}</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>"
+        )
     (tmp_path / "secret.tif").write_bytes(kept)
     assert client.get(f"{COG}/info").status_code == 400
     mosaic.unlink()
