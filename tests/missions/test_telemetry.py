@@ -16,6 +16,7 @@ import av
 import numpy as np
 import pytest
 
+from sealing import seal_again
 from small_flights import simulate_into, small_flight
 from sorvolo.capture.correction import corrected_poses, fitted, path_fit, telemetry_faults
 from sorvolo.capture.live.klv_telemetry import read_klv_file
@@ -185,6 +186,7 @@ def test_a_misplaced_frame_is_laid_by_the_log(
                 json.dumps((aside @ np.array(json.loads(turned)).reshape(3, 3)).tolist()),
             ),
         )
+    seal_again(site / "site.db")
     report = correct_telemetry(
         site, out, source=faulty / "flight1" / "flight1.mp4", camera=str(faulty / "camera.xml")
     )
@@ -703,6 +705,7 @@ def test_what_other_programs_cannot_take_is_warned_of(
         database.execute(
             "update keyframes set name = 'IMG ' || name, time_ns = time_ns % 60000000000"
         )
+    seal_again(site / "site.db")
     with pytest.raises(InputError, match="the date of flight1 is not known"):
         correct_telemetry(site, out, cot=CotReceiver(CotPlace("udp", "127.0.0.1", 9)))
     assert not out.exists()
