@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Protocol
 
 from sorvolo.capture.telemetry import dji_srt, flight_table, gpx, nmea
+from sorvolo.capture.telemetry.autopilot_logs import AUTOPILOT_READERS
 from sorvolo.errors import InputError
 from sorvolo.survey.flight import Telemetry
 
@@ -14,8 +15,22 @@ LARGEST_FILE_BYTES = 500_000_000
 _HEAD_BYTES = (
     65_536  # of a file, by which its format is recognised; a flight table's header has thousands
 )
-_SUFFIXES = (".srt", ".ass", ".csv", ".nmea", ".gpx", ".log", ".txt", ".tsv", ".gps", ".dat")
-_UNREAD_SUFFIXES = (".ulg", ".tlog", ".bin", ".kml", ".fit", ".tcx", ".mcap", ".bag")  # of logs
+_SUFFIXES = (
+    ".srt",
+    ".ass",
+    ".csv",
+    ".nmea",
+    ".gpx",
+    ".log",
+    ".txt",
+    ".tsv",
+    ".gps",
+    ".dat",
+    ".ulg",
+    ".bin",
+    ".tlog",
+)
+_UNREAD_SUFFIXES = (".kml", ".fit", ".tcx", ".mcap", ".bag")  # of logs
 _VIDEO_SUFFIXES = frozenset(
     (".mp4", ".mov", ".mkv", ".avi", ".ts", ".m2ts", ".mts", ".m4v", ".webm", ".mpg", ".mpeg")
 )
@@ -42,6 +57,7 @@ class Reader(Protocol):
 
 # Order matters where a file fits two: a table may hold NMEA sentences in one of its columns.
 TELEMETRY_READERS: dict[str, Reader] = {
+    **AUTOPILOT_READERS,
     "dji_srt": dji_srt,
     "gpx": gpx,
     "table": flight_table,
@@ -61,7 +77,8 @@ def read_telemetry(path: Path) -> Telemetry:
     if reader is None:
         raise InputError(
             f"{path}: {_unknown(data)}; read are DJI's and Autel's subtitles (.SRT, .ass), GPX tracks with times, tables with Latitude and "
-            "Longitude columns (DatCon, Airdata, DJI logs as .csv), and NMEA 0183 with GGA or RMC sentences"
+            "Longitude columns (DatCon, Airdata, DJI logs as .csv), NMEA 0183 with GGA or RMC sentences, and logs of PX4 "
+            "(.ulg) and ArduPilot (.bin, .tlog)"
         )
     return TELEMETRY_READERS[reader].read(data, str(path))
 
