@@ -261,7 +261,7 @@ def test_logs_beside_the_video_that_are_not_used_are_named(tmp_path: Path) -> No
     rows = "".join(f"41.89000{row},12.6,2026-04-02 12:44:0{row}\n" for row in range(5))
     for name in ("a.csv", "b.csv"):
         (tmp_path / name).write_text(f"latitude,longitude,datetime(utc)\n{rows}")
-    (tmp_path / "DJI_0001.ulg").write_bytes(b"ULog\x01\x12\x35")
+    (tmp_path / "DJI_0001.fit").write_bytes(b"\x0e\x10\xd9\x07")
 
     def named() -> dict[str, str]:
         (source,) = open_sources([tmp_path / "DJI_0001.mp4"])
@@ -269,6 +269,6 @@ def test_logs_beside_the_video_that_are_not_used_are_named(tmp_path: Path) -> No
 
     first = named()
     assert "a.csv, b.csv; give one as --telemetry" in first["unused_telemetry"]
-    assert "DJI_0001.ulg" in first["unknown_telemetry"]
+    assert "DJI_0001.fit" in first["unknown_telemetry"]
     (tmp_path / "a.csv").rename(tmp_path / "DJI_0001.csv")
     assert "(DJI_0001.csv is): b.csv" in named()["unused_telemetry"]

@@ -19,6 +19,11 @@ GPX = (
 )
 UMCD = b"offsetTime,Longitude,Latitude\n0.0,11.5,48.1\n0.1,11.5,48.1\n"
 SAMPLES = {"nmea": NMEA, "dji_srt": SRT, "gpx": GPX, "table": UMCD}
+BEGINNINGS = {
+    "ulog": b"ULog\x01\x12\x35\x01" + bytes(8),
+    "dataflash": b"\xa3\x95\x80\x80\x59FMT\0",
+    "tlog": 3 * (b"\0\6\0" + bytes(5) + b"\xfe\1\0\1\1\0" + bytes(3)),
+}
 
 
 def write(path: Path, data: bytes) -> Path:
@@ -35,8 +40,8 @@ def test_the_content_decides_not_the_suffix(tmp_path, name, suffix):
 
 
 def test_every_reader_is_listed_by_its_own_name():
-    assert set(TELEMETRY_READERS) == set(SAMPLES)
-    for name, data in SAMPLES.items():
+    assert set(TELEMETRY_READERS) == {*SAMPLES, *BEGINNINGS}
+    for name, data in (SAMPLES | BEGINNINGS).items():
         assert [
             other for other, reader in TELEMETRY_READERS.items() if reader.recognises(data)
         ] == [name]

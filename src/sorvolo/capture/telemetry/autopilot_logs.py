@@ -127,7 +127,7 @@ class UlogReader:
             known = utc_us > _DATED_US[0]
             zero_us = float(np.median((utc_us - boot_us)[known]))
         fixes, attitude, height = _Rows(), _Rows(), _Rows()
-        for row in np.flatnonzero(np.asarray(gps.get("fix_type", ())) >= _FIX_3D):
+        for row in np.flatnonzero(np.asarray(gps.get("fix_type", ())) >= _FIX_3D).tolist():
             fixes.add((boot_us[row] + zero_us) / 1e6, **_ulog_fix(gps, row))
         turned = found.get("vehicle_attitude", {})
         for row, time_us in enumerate(turned.get("timestamp", ())):
