@@ -15,6 +15,7 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, ImageRGB, Matrix3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.level_ground import footprint, is_on_ground
+from sorvolo.heights.figures import camera_warnings
 from sorvolo.missions.flight.control import FlightControl
 from sorvolo.missions.flight.log import Ending, FlightLog, Stage, nothing_placed
 from sorvolo.missions.flight.looked_at import searched_document
@@ -462,6 +463,8 @@ class PlanarRun(FlightRun):
             [*notices, *self._archive.notices, *self._detector_notices],
             time.monotonic() - started_s,
         )
+        if model is not None:
+            report["warnings"] += camera_warnings(model.solved)
         documents = self._add_search(report, search, placed)
         page = report_page(report, shown.rgba, crops_of(search), self._archive.site())
         documents |= {} if self._control is None else control_documents(self._control)
