@@ -21,6 +21,7 @@ UMCD = b"offsetTime,Longitude,Latitude\n0.0,11.5,48.1\n0.1,11.5,48.1\n"
 SAMPLES = {"nmea": NMEA, "dji_srt": SRT, "gpx": GPX, "table": UMCD}
 BEGINNINGS = {
     "ulog": b"ULog\x01\x12\x35\x01" + bytes(8),
+    "mcap": b"\x89MCAP0\r\n\1",
     "dataflash": b"\xa3\x95\x80\x80\x59FMT\0",
     "tlog": 3 * (b"\0\6\0" + bytes(5) + b"\xfe\1\0\1\1\0" + bytes(3)),
 }

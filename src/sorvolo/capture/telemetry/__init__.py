@@ -6,6 +6,7 @@ from typing import Protocol
 
 from sorvolo.capture.telemetry import dji_srt, flight_table, gpx, nmea
 from sorvolo.capture.telemetry.autopilot_logs import AUTOPILOT_READERS
+from sorvolo.capture.telemetry.mcap_log import McapReader
 from sorvolo.errors import InputError
 from sorvolo.survey.flight import Telemetry
 
@@ -29,8 +30,9 @@ _SUFFIXES = (
     ".ulg",
     ".bin",
     ".tlog",
+    ".mcap",
 )
-_UNREAD_SUFFIXES = (".kml", ".fit", ".tcx", ".mcap", ".bag")  # of logs
+_UNREAD_SUFFIXES = (".kml", ".fit", ".tcx", ".bag")  # of logs
 _VIDEO_SUFFIXES = frozenset(
     (".mp4", ".mov", ".mkv", ".avi", ".ts", ".m2ts", ".mts", ".m4v", ".webm", ".mpg", ".mpeg")
 )
@@ -58,6 +60,7 @@ class Reader(Protocol):
 # Order matters where a file fits two: a table may hold NMEA sentences in one of its columns.
 TELEMETRY_READERS: dict[str, Reader] = {
     **AUTOPILOT_READERS,
+    "mcap": McapReader(),
     "dji_srt": dji_srt,
     "gpx": gpx,
     "table": flight_table,
@@ -77,8 +80,8 @@ def read_telemetry(path: Path) -> Telemetry:
     if reader is None:
         raise InputError(
             f"{path}: {_unknown(data)}; read are DJI's and Autel's subtitles (.SRT, .ass), GPX tracks with times, tables with Latitude and "
-            "Longitude columns (DatCon, Airdata, DJI logs as .csv), NMEA 0183 with GGA or RMC sentences, and logs of PX4 "
-            "(.ulg) and ArduPilot (.bin, .tlog)"
+            "Longitude columns (DatCon, Airdata, DJI logs as .csv), NMEA 0183 with GGA or RMC sentences, logs of PX4 "
+            "(.ulg) and ArduPilot (.bin, .tlog), and fixes in MCAP recordings"
         )
     return TELEMETRY_READERS[reader].read(data, str(path))
 
