@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sorvolo.capture.clock_offset import OffsetEstimate
 from sorvolo.cli.main import main
 from sorvolo.errors import InputError
 from sorvolo.geometry.camera import Camera
@@ -19,7 +20,13 @@ from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
 from sorvolo.lab.simulation.flight_files import video_writer
 from sorvolo.missions.compare.report import views_notices
-from sorvolo.missions.flight.headline import MapQuality, _angle_warnings, map_headline, unlevelled
+from sorvolo.missions.flight.headline import (
+    MapQuality,
+    _angle_warnings,
+    clock_doubts,
+    map_headline,
+    unlevelled,
+)
 from sorvolo.missions.map.flights import _refuse_view_aside
 from sorvolo.mosaic.consistency import Consistency
 from sorvolo.mosaic.flight_figures import flight_figures
@@ -55,6 +62,26 @@ def placed(
 
 def quality_of(frames: list[PlacedFrame], *, is_video: bool = True) -> MapQuality:
     return map_headline(frames, flight_figures(frames, _CAMERA.fx_px), is_video=is_video).quality
+
+
+def test_a_clock_that_the_pictures_contradict_is_never_silent() -> None:
+    setup = SimpleNamespace(clock=SimpleNamespace(tie="both carry UTC", sigma_s=2.0))
+    alike = OffsetEstimate(0.1, 0.05, 0.5, 0.5, rivals_s=(26.0, -26.0))
+    (text,) = clock_doubts(setup, alike, None)
+    assert (
+        "alike as with its clock (both carry UTC) with other clock offsets (+26.0, -26.0 s)" in text
+    )
+    assert clock_doubts(setup, alike, 0.0) == []  # the user has chosen
+    (kept,) = clock_doubts(setup, OffsetEstimate(14.0, 0.1, 40.0, 0.5), 7.0)
+    assert "+14.0 s from --offset 7" in kept and "try --offset 21.00" in kept
+    (far,) = clock_doubts(setup, OffsetEstimate(0.0, np.inf, 10.0, 0.5), None)
+    assert "far from where its clock puts them" in far
+    assert clock_doubts(setup, OffsetEstimate(0.3, 0.1, 1.0, 0.9), None) == []
+    frames = [placed(10.0 * k) for k in range(8)]
+    doubted = map_headline(
+        frames, flight_figures(frames, _CAMERA.fx_px), is_video=True, others=[text]
+    )
+    assert doubted.quality is MapQuality.DOUBTFUL
 
 
 def test_frames_that_fit_each_other_are_a_map() -> None:

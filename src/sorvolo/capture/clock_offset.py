@@ -1,8 +1,10 @@
 """The clock offset that motion shows: telemetry's path against the one seen in the pictures."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sorvolo.capture.sync import Track
 from sorvolo.geometry.arrays import Floats, PointsM
@@ -26,6 +28,10 @@ class OffsetSettings:
     steps: int = 4  # places of the smooth path in each interval
     reach: int = 6  # four sigmas
     around: int = 5
+    least_share: float = 0.6  # of the way seen in the pictures that the log must cover at an offset
+    alike: float = 2.0  # times the best misfit, or half a fix's sigma: an offset that fits as well
+    free_step_s: float = 0.5  # between offsets all over the log
+    near_s: float = 2.0  # from the best of these: searched more closely
     most_frames: int = 400  # that a noise is learnt from
     shares: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 0.9, 0.97)
     memories: int = 6  # times in which it is forgotten that are tried, from one frame's step to the whole flight
@@ -33,12 +39,24 @@ class OffsetSettings:
 
 @dataclass(frozen=True)
 class OffsetEstimate:
-    """A clock offset seen in motion, with its one-sigma uncertainty, and what a fit at 0 and at it leaves over."""
+    """A clock offset seen in motion, with its one-sigma uncertainty, and what a fit at 0 and at it leaves over.
+
+    `rivals_s` are other offsets, far from it, at which the log fits as many pictures as well. Where the clocks' own tie
+    is none of those that fit, the offset is not known and the rivals are all of them.
+    """
 
     offset_s: float
     sigma_s: float
     rms_at_zero_m: float
     rms_m: float
+    rivals_s: tuple[float, ...] = ()
+
+    def left_s(self, applied_s: float, tie_s: float) -> float:
+        """One sigma of what an offset of `applied_s` may still be off, where clocks tied so err by `tie_s`."""
+        if not self.is_known:
+            return tie_s
+        share = tie_s**2 / (tie_s**2 + self.sigma_s**2)  # of the motion's word, beside the clocks'
+        return float(np.hypot(np.sqrt(share) * self.sigma_s, share * (self.offset_s - applied_s)))
 
     @property
     def is_known(self) -> bool:
@@ -56,8 +74,8 @@ class OffsetEstimate:
 
     def refined(self, found: "OffsetEstimate", applied_s: float) -> "OffsetEstimate":
         """This estimate after another search, which began at `applied_s` and found so much more."""
-        return OffsetEstimate(
-            applied_s + found.offset_s, found.sigma_s, self.rms_at_zero_m, found.rms_m
+        return replace(
+            self, offset_s=applied_s + found.offset_s, sigma_s=found.sigma_s, rms_m=found.rms_m
         )
 
 
@@ -67,9 +85,13 @@ def estimate_offset(
     seen_m: PointsM,
     *,
     reach_s: float,
+    is_free: bool = False,
     settings: OffsetSettings = OffsetSettings(),
 ) -> OffsetEstimate:
     """The clock offset that makes telemetry's path fit the path seen in the pictures (N, 2), up to a similarity.
+
+    It is looked for within `reach_s`, and with `is_free` all over the log: a clock may be right in form and of another
+    moment. A similarity turns, so that a strip flown the other way fits as well where nothing else tells the two apart.
 
     Straight flight at constant speed fits at any offset: then the uncertainty comes out infinite or large. It comes
     from the motion that the pictures show, with the misfit as the noise: the fixes' own noise bends a path as well,
@@ -79,46 +101,128 @@ def estimate_offset(
     unknown = OffsetEstimate(0.0, float("inf"), float("nan"), float("nan"))
     if usable.sum() < settings.least_fixes or len(times_s) < settings.least_frames or reach_s <= 0:
         return unknown
-    within_s = float(times_s.min()) - reach_s, float(times_s.max()) + reach_s
+    within_s = (-np.inf, np.inf) if is_free else (times_s[0] - reach_s, times_s[-1] + reach_s)
     path_s, path_m = _smooth_path(
         track.sample_s[usable], track.east_north_m[usable], track.interval_s, within_s, settings
     )
-
-    def laid(offset_s: float) -> tuple[Floats, PointsM, PointsM]:
-        """The times within the path, the fixes then, and the seen path laid on these."""
-        at = times_s + offset_s
-        inside = (at >= path_s[0]) & (at <= path_s[-1])
-        fixes = np.column_stack([np.interp(at[inside], path_s, path_m[:, k]) for k in range(2)])
-        seen = seen_m[inside]
-        if (
-            inside.sum() < max(settings.least_frames, 0.6 * len(at))
-            or np.ptp(seen, axis=0).max() <= 0
-        ):
-            return times_s[:0], fixes[:0], seen[:0]
-        change = fit_similarity(fixes, seen)
-        return times_s[inside], fixes, seen @ change[:2, :2].T + change[:2, 2]
-
-    def misfit(offset_s: float) -> float:
-        _, fixes, places = laid(offset_s)
-        if not len(fixes):
-            return float("inf")
-        miss = np.linalg.norm(places - fixes, axis=1)
-        return float(np.mean(np.minimum(miss, _outlying_m(miss)) ** 2))
-
+    compared = _Compared(path_s, path_m, times_s, seen_m, settings)
+    begin_s = 0.0
+    rivals_s: tuple[float, ...] = ()
+    if is_free:
+        noise_m = float(np.median(track.horizontal_sigma_m[usable])) / 2
+        begin_s, rivals_s = _hypotheses(compared, reach_s, noise_m, settings)
+        if abs(begin_s) > reach_s and rivals_s:
+            return replace(unknown, rivals_s=(begin_s, *rivals_s))
+        reach_s = min(reach_s, settings.near_s)
     step = max(0.02, reach_s / 100)
-    offsets = np.arange(-reach_s, reach_s + step / 2, step)
-    costs = np.array([misfit(each) for each in offsets])
-    if not np.isfinite(costs).any():
+    offsets = begin_s + np.arange(-reach_s, reach_s + step / 2, step)
+    misfits = np.array([compared.misfit(each)[0] for each in offsets])
+    if not np.isfinite(misfits).any():
         return unknown
-    best = float(offsets[int(np.argmin(costs))])
+    best = float(offsets[int(np.argmin(misfits))])
     for _ in range(3):
         step /= 4
         nearby = best + step * np.arange(-4, 5)
-        best = float(nearby[int(np.argmin([misfit(each) for each in nearby]))])
-    rms_at_zero_m, rms_m = (float(np.sqrt(misfit(each))) for each in (0.0, best))
-    if abs(best) > 0.97 * reach_s:
-        return replace(unknown, rms_at_zero_m=rms_at_zero_m, rms_m=rms_m)
-    return OffsetEstimate(best, _offset_sigma_s(*laid(best), settings), rms_at_zero_m, rms_m)
+        best = float(nearby[int(np.argmin([compared.misfit(each)[0] for each in nearby]))])
+    least, scale, _ = compared.misfit(best)
+    found = replace(
+        unknown,
+        rms_at_zero_m=compared.misfit(0.0)[0] / scale,
+        rms_m=least / scale,
+        rivals_s=rivals_s,
+    )
+    if abs(best - begin_s) > 0.97 * reach_s or least > compared.most_misfit(best):
+        return found
+    at, fixes_m, places_m = compared.laid(best)
+    return replace(found, offset_s=best, sigma_s=_offset_sigma_s(at, fixes_m, places_m, settings))
+
+
+class _Compared:
+    """Telemetry's path, (M, 2) m at M times, and the one seen in the pictures, (N, 2) in units of its own at N times."""
+
+    def __init__(
+        self,
+        path_s: Floats,
+        path_m: PointsM,
+        times_s: Floats,
+        seen: PointsM,
+        settings: OffsetSettings,
+    ) -> None:
+        self.path_s, self._path_m, self.times_s, self._seen = path_s, path_m, times_s, seen
+        self._settings = settings
+        legs = np.linalg.norm(np.diff(seen, axis=0), axis=1)
+        self._way = np.append(legs, 0.0) + np.append(0.0, legs)  # twice that of each picture
+        self._plane = seen @ np.array([1, 1j]), path_m @ np.array([1, 1j])
+
+    def _inside(self, offset_s: float) -> NDArray[np.bool_]:
+        at = self.times_s + offset_s
+        return np.asarray((at >= self.path_s[0]) & (at <= self.path_s[-1]))
+
+    def misfit(self, offset_s: float) -> tuple[float, float, float]:
+        """How far the fixes, turned, shifted and scaled, miss the seen path, rms, units; infinite where they cover too
+        little of it. Its units a metre; and the share of its way that fixes cover.
+
+        It is measured in the pictures' own units: fixes that stand still would fit any path if that may shrink.
+        """
+        inside, way = self._inside(offset_s), float(self._way.sum())
+        share = float(self._way[inside].sum()) / way if way > 0 else 0.0
+        if inside.sum() < self._settings.least_frames or share < self._settings.least_share:
+            return float("inf"), 1.0, share
+        seen, path = self._plane
+        fixes = np.interp(self.times_s[inside] + offset_s, self.path_s, path)
+        fixes, places = fixes - fixes.mean(), seen[inside] - seen[inside].mean()
+        spread = np.vdot(fixes, fixes).real
+        if spread <= 0:
+            return float("inf"), 1.0, share
+        turn = np.vdot(fixes, places) / spread
+        miss = np.abs(fixes * turn - places)
+        most = 3 * float(np.sort(miss)[int(0.8 * len(miss))]) + 1e-9  # a few fixes may be wrong
+        rms = float(np.sqrt(np.mean(np.minimum(miss, most) ** 2)))
+        return rms, max(float(abs(turn)), 1e-9), share
+
+    def most_misfit(self, offset_s: float) -> float:
+        """Half of what the seen places spread, units: more, as while hovering, and the two paths have nothing alike."""
+        places = self._plane[0][self._inside(offset_s)]
+        return float(places.std()) / 2
+
+    def laid(self, offset_s: float) -> tuple[Floats, PointsM, PointsM]:
+        """The times within the path, the fixes then, and the seen path laid on these."""
+        inside = self._inside(offset_s)
+        at = self.times_s[inside] + offset_s
+        fixes_m = np.column_stack(
+            [np.interp(at, self.path_s, self._path_m[:, k]) for k in range(2)]
+        )
+        change = fit_similarity(fixes_m, self._seen[inside])
+        places_m = self._seen[inside] @ change[:2, :2].T + change[:2, 2]
+        return self.times_s[inside], fixes_m, places_m
+
+
+def _hypotheses(
+    compared: _Compared, reach_s: float, noise_m: float, settings: OffsetSettings
+) -> tuple[float, tuple[float, ...]]:
+    """The offset near which to look, within `reach_s` where one there fits; and its rivals, see `OffsetEstimate`."""
+    first_s = float(compared.path_s[0] - compared.times_s[-1])
+    last_s = float(compared.path_s[-1] - compared.times_s[0])
+    offsets = np.arange(first_s, last_s, settings.free_step_s)
+    misfits, scales, shares = np.array([compared.misfit(each) for each in offsets]).T
+    best = int(np.argmin(misfits))
+    if not np.isfinite(misfits[best]):
+        return 0.0, ()
+    is_alike = misfits <= settings.alike * max(misfits[best], noise_m * scales[best])
+    # of all that fit alike, those that explain the most of the way; of these, those near the clocks' own tie
+    is_near = np.abs(offsets) <= reach_s + settings.free_step_s
+    chosen = is_alike & (shares > shares[is_alike].max() - 0.02)
+    chosen = chosen & is_near if (chosen & is_near).any() else chosen
+    begin = np.flatnonzero(chosen)[int(np.argmin(misfits[chosen]))]
+    begin_s = float(offsets[begin])
+    rivals_s: list[float] = []
+    for k in np.argsort(misfits):
+        apart_s = np.abs(offsets[k] - np.array([begin_s, *rivals_s]))
+        # a log may end before the pictures do: the clocks' own tie is heard though it explains less
+        least_share = 0.8 * shares[begin] if is_near[k] else shares[begin] - 0.02
+        if is_alike[k] and shares[k] > least_share and apart_s.min() > reach_s:
+            rivals_s.append(float(offsets[k]))
+    return begin_s, tuple(rivals_s)
 
 
 def _outlying_m(miss_m: Floats) -> float:
@@ -178,18 +282,7 @@ def _offset_sigma_s(
     some = np.unique(np.linspace(0, len(rows) - 1, settings.most_frames).round().astype(int))
     rows, velocity_m_s = rows[some], velocity_m_s[some]
     at_s, places, misses = times_s[rows], places_m[rows], (fixes_m - places_m)[rows].T.ravel()
-    # (2N, 4) how N places, all their easts before their norths, move with a similarity of their
-    # plane.
-    east, north = (places - places.mean(axis=0)).T
-    one, zero = np.ones(len(places)), np.zeros(len(places))
-    similar = np.column_stack(
-        [
-            np.concatenate([one, zero]),
-            np.concatenate([zero, one]),
-            np.concatenate([east, north]),
-            np.concatenate([-north, east]),
-        ]
-    )
+    similar = _similar(places)
     taken_up, *_ = np.linalg.lstsq(similar, velocity_m_s.T.ravel(), rcond=None)
     motion = (
         velocity_m_s.T.ravel() - similar @ taken_up
@@ -212,6 +305,37 @@ def _offset_sigma_s(
             )
     weights = np.exp(np.array(likelihoods) - max(likelihoods))
     return float(np.sqrt(np.average(variances, weights=weights)))
+
+
+def _similar(places_m: PointsM) -> Floats:
+    """(2N, 4) how N places, all their easts before their norths, move with a similarity of their plane."""
+    east, north = (places_m - places_m.mean(axis=0)).T
+    one, zero = np.ones(len(places_m)), np.zeros(len(places_m))
+    return np.column_stack(
+        [
+            np.concatenate([one, zero]),
+            np.concatenate([zero, one]),
+            np.concatenate([east, north]),
+            np.concatenate([-north, east]),
+        ]
+    )
+
+
+def shared_motion_m_s(times_s: Sequence[float], places_m: PointsM) -> float:
+    """How far a second of clock error moves a map that is laid on fixes, rms per axis, m.
+
+    `places_m` (N, 2+) are those of the pictures, NaN where one has none.
+
+    On a straight line it is all of the speed. Strips flown to and fro move against each other, and the map less.
+    """
+    known = np.isfinite(places_m[:, 0])
+    if known.sum() < 2:
+        return 0.0
+    known_m = places_m[known, :2]
+    velocity_m_s = np.gradient(known_m, np.array(times_s)[known], axis=0).T.ravel()
+    similar = _similar(known_m)
+    taken_up, *_ = np.linalg.lstsq(similar, velocity_m_s, rcond=None)
+    return float(np.sqrt(np.mean((similar @ taken_up) ** 2)))
 
 
 def _restricted_likelihood(alike: Floats, model: Floats, misses: Floats) -> tuple[float, float]:

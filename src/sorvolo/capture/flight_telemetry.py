@@ -115,6 +115,7 @@ class FlightTelemetry:
             np.array(seconds)[tied],
             seen_m[tied, :2],
             reach_s=reach_s,
+            is_free=self.clock.is_of_a_log and not applied_s,
         )
 
     def prior(self, seconds: float, smooth_s: float) -> CameraPrior:

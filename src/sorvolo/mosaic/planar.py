@@ -282,6 +282,7 @@ class PlanarMapper:
         self._settings = settings
         self._graph = PoseGraph(graph, shelf)
         self._ground_miss_m = 0.0  # per axis: see `note_ground_miss`
+        self._clock_miss_m = 0.0  # per axis: see `note_clock_miss`
         self._cache = LinkCache(settings.links.features)
         self._keyframes = Keyframes(shelf, keyframe_bytes)
         self._own: list[int] = []
@@ -364,6 +365,10 @@ class PlanarMapper:
     def note_ground_miss(self, miss_m: float) -> None:
         """Known ground lies so far beside the tied map, rms per axis, beyond what is expected: a part of `sigmas_m`."""
         self._ground_miss_m = miss_m
+
+    def note_clock_miss(self, miss_m: float) -> None:
+        """What is not known of telemetry's clock moves all of a map that fixes place so far, 1 sigma per axis."""
+        self._clock_miss_m = miss_m
 
     def ground_places_m(self, ties: GroundTies) -> PointsM:
         """See `PoseGraph.ground_places_m`."""
@@ -455,7 +460,7 @@ class PlanarMapper:
         common_m = (
             float(np.nanmedian(tied_to))
             if np.isfinite(tied_to).any()
-            else self._graph.common_sigma_m()
+            else float(np.hypot(self._graph.common_sigma_m(), self._clock_miss_m))
         )
         leans_m = self._graph.leans_m() if leans else {}
         return {

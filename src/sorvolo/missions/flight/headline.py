@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
+from sorvolo.capture.clock_offset import OffsetEstimate
 from sorvolo.missions.flight.log import FlightLog
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.mosaic.consistency import NOTHING_KNOWN, Consistency
@@ -19,6 +20,8 @@ _MANY = 0.1  # share of the frames
 _MOST = 0.5  # share of the frames whose loss makes a map one to check; by choice
 _BAD_FIT_PX = 3.0  # median residual of a map's matches from which on it is warned of; by choice
 _TURNED_DEG = 6.0  # by which all stated angles may be off without a word
+_MOST_RIVALS = 4  # clock offsets in a sentence
+_FAR_BETTER = 0.7  # of the misfit at the clock's own tie
 _GUESSED = 0.1  # relative: a focal length that is hardly known
 
 
@@ -29,12 +32,13 @@ def flight_warnings(
     log: FlightLog,
     agreement: Consistency = NOTHING_KNOWN,
     graph: GraphReport | None = None,
+    others: Sequence[str] = (),
 ) -> list[str]:
-    """The warnings of a flight's report."""
+    """The warnings of a flight's report; `others` are what `map_headline` takes as such."""
     camera, clock, warnings = (
         setup.source.camera,
         setup.clock,
-        [*agreement.faults, *agreement.steps],
+        [*agreement.faults, *agreement.steps, *others],
     )
     lost = sum(each.status is Status.REJECTED for each in placed)
     if lost > _MANY * len(placed):
@@ -64,10 +68,40 @@ def flight_warnings(
     if clock is not None and abs(log.offset_applied_s) > 2 * clock.sigma_s:
         warnings.append(
             f"the pictures fit this telemetry best {log.offset_applied_s:+.1f} s from where its clock puts them, more "
-            f"than clocks tied like these differ ({clock.tie}): is it the telemetry of this flight? --offset 0 keeps to "
-            "its clock"
+            f"than clocks tied like these differ ({clock.tie}): is it the telemetry of this flight? --offset "
+            f"{log.offset_applied_s:.2f} maps it so from its first frame, --offset 0 keeps to its clock"
         )
     return warnings
+
+
+def clock_doubts(
+    setup: FlightSetup, found: OffsetEstimate | None, given_s: float | None
+) -> list[str]:
+    """Why telemetry may be of another moment than the pictures: several moments fit alike, or another one than was
+    given or searched."""
+    clock = setup.clock
+    if found is None or clock is None:
+        return []
+    if found.rivals_s and (given_s is None or not found.is_known):
+        offsets_s = [(given_s or 0.0) + each for each in found.rivals_s]
+        listed = ", ".join(f"{each:+.1f}" for each in offsets_s[:_MOST_RIVALS])
+        more = ", ..." if len(found.rivals_s) > _MOST_RIVALS else ""
+        tie = f" as with its clock ({clock.tie})" if found.is_known else ""
+        return [
+            f"the log fits the pictures alike{tie} with other clock offsets ({listed}{more} s): give --offset, or --offset "
+            "0 if both clocks were right"
+        ]
+    if found.is_significant and given_s is not None and abs(found.offset_s) > clock.sigma_s:
+        return [
+            f"the pictures fit the log best {found.offset_s:+.1f} s from --offset {given_s:g} (1 sigma {found.sigma_s:.2f} "
+            f"s), which was kept: try --offset {given_s + found.offset_s:.2f}"
+        ]
+    if not found.is_known and found.rms_m < _FAR_BETTER * found.rms_at_zero_m:
+        return [
+            f"the pictures fit the telemetry best far from where its clock puts them ({clock.tie}): is it the telemetry of "
+            "this flight?"
+        ]
+    return []
 
 
 def doubts(

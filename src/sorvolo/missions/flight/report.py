@@ -4,13 +4,19 @@ import resource
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from math import isfinite
 from typing import Any
 
 from sorvolo.build import build
 from sorvolo.capture.clock_offset import OffsetEstimate
 from sorvolo.capture.video import VideoSource
 from sorvolo.geometry.camera import Camera
-from sorvolo.missions.flight.headline import flight_warnings, map_headline, unlevelled
+from sorvolo.missions.flight.headline import (
+    clock_doubts,
+    flight_warnings,
+    map_headline,
+    unlevelled,
+)
 from sorvolo.missions.flight.log import FlightLog, Stage
 from sorvolo.missions.flight.request import software
 from sorvolo.missions.flight.settings import MapSettings
@@ -81,15 +87,15 @@ def build_report(
     plane = graph if result.shape.is_flat else None
     agreement = consistency(placed, result.pieces, figures, _stated(setup, result), plane)
     headline = {}
+    others = clock_doubts(setup, result.offset, settings.offset_s)
     if result.makes_map:
-        others = unlevelled(placed, plane, setup)
         headline["headline"] = asdict(
             map_headline(
                 placed,
                 figures,
                 is_video=source.kind == "video",
                 agreement=agreement,
-                others=others,
+                others=[*others, *unlevelled(placed, plane, setup)],
                 graph=plane,
             )
         )
@@ -138,7 +144,7 @@ def build_report(
         **_effort(log, seconds, max(1, len(placed))),
         "notices": [asdict(each) for each in (*source.telemetry.notices, *setup.notices, *notices)],
         "warnings": [
-            *flight_warnings(placed, figures, setup, log, agreement, plane),
+            *flight_warnings(placed, figures, setup, log, agreement, plane, others),
             *(result.control.remarks if result.control else ()),
         ],
         "settings": asdict(settings),
@@ -228,5 +234,9 @@ def _offset(settings: MapSettings, log: FlightLog, offset: OffsetEstimate | None
     }
     if offset is not None and offset.is_known:
         result |= {"estimate_s": offset.offset_s, "sigma_s": offset.sigma_s}
-        result |= {"rms_at_zero_m": offset.rms_at_zero_m, "rms_m": offset.rms_m}
+        at_zero_m = offset.rms_at_zero_m
+        result |= {"rms_at_zero_m": at_zero_m if isfinite(at_zero_m) else None}
+        result |= {"rms_m": offset.rms_m}
+    if offset is not None and offset.rivals_s:
+        result["rivals_s"] = list(offset.rivals_s)
     return result

@@ -8,7 +8,7 @@ from functools import cache, partial
 from types import TracebackType
 from typing import Any, Self
 
-from sorvolo.capture.clock_offset import OffsetEstimate
+from sorvolo.capture.clock_offset import OffsetEstimate, shared_motion_m_s
 from sorvolo.capture.live.stream import LiveStream
 from sorvolo.capture.source import LiveSource
 from sorvolo.errors import InputError
@@ -601,6 +601,10 @@ class PlanarRun(FlightRun):
             priors = telemetry.priors(seconds, applied_s, self._setup.plan.smooth_s)
             self._mapper.retime(dict(zip(ids, priors, strict=True)))
         self._log.offset_applied_s = applied_s
+        if estimate is not None:
+            left_s = estimate.left_s(applied_s, telemetry.clock.sigma_s)
+            moved_m = shared_motion_m_s(seconds, self._mapper.path_m())
+            self._mapper.note_clock_miss(left_s * moved_m)
         return estimate
 
     def _placed(self) -> list[PlacedFrame]:
