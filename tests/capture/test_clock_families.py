@@ -31,7 +31,9 @@ class Flight:
         for strip in range(rng.integers(1, 8)):
             ends_m = [0.0, length_m] if strip % 2 == 0 else [length_m, 0.0]
             uneven_m = rng.normal(0, 1.0, (2, 2))
-            corners += [[end, strip * spacing_m] + row for end, row in zip(ends_m, uneven_m)]
+            corners += [
+                np.array([end, strip * spacing_m]) + row for end, row in zip(ends_m, uneven_m)
+            ]
         home = np.array(corners[0]) + rng.normal(0, 40, 2)
         way_m = np.array([home, *corners, home])
         legs_s = np.linalg.norm(np.diff(way_m, axis=0), axis=1) / rng.uniform(3, 10)
