@@ -23,7 +23,7 @@ from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.journal import Entry, RecordPacker, RunJournal, content_sha256, unpacked
 from sorvolo.survey.flight import CameraModel, CameraPrior, Frame
 
-_BEGUN, _SAMPLES, _FRAME = "flight", "telemetry", "frame"
+_BEGUN, _SAMPLES, _FRAME, _CAME = "flight", "telemetry", "frame", "came"
 _DAMAGED = (KeyError, TypeError, ValueError, IndexError, SorvoloError)
 
 T = TypeVar("T")
@@ -158,6 +158,18 @@ class ResultCache:
             frame = self.known(index, _FRAME, KeptFrame) if stage == _FRAME else None
             if frame is not None:
                 yield frame
+
+    def note_came(self, frame: _OfFlight) -> None:
+        """Note a live frame that waits to be searched. Raises StoreError when the disk is full."""
+        self.keep(frame, _CAME, None)
+
+    def waited_frames(self) -> Iterator[Frame]:
+        """Yield the frames, without pictures, that still waited when a run was killed, in order."""
+        for (index, stage), at in sorted(self._known.items()) if self.is_of_stream else ():
+            entry = self.journal.entry(at) if stage == _CAME and self.journal is not None else None
+            if entry is not None and not self.has_ended(index):
+                name, time_ns = str(entry.values["name"]), int(entry.values["time_ns"])
+                yield Frame.unseen(index, name, time_ns, (0, 0))
 
     def end(self, error: BaseException | None) -> None:
         """The run ended, with this error or none: remove the journal, unless the same command can go on with it."""

@@ -28,7 +28,7 @@ class Announced:
     ) -> None:
         self._known = {each.id: each for each in tracks if each.confirmed}
         self._seen, self._by_place = seen, by_place
-        self._first_free = max((each.id for each in tracks), default=0)
+        self._first_free = max(self._known, default=0)
         self._names: dict[int, int] = {}  # ids of this time to announced ones
         self._told: set[int] = set(self._known)
 

@@ -228,6 +228,10 @@ class WatchFiles:
     def _write_labels(self) -> None:
         if not self._labelled:
             return
+        listed = {Path(picture.path).name for picture, _ in self._labelled}
+        for path in (self.folder / LABELS / "images").iterdir():
+            if path.name not in listed:  # of a live flight that was searched again
+                path.unlink()
         found = LabelledSet(
             self._site.name, self._classes, tuple(picture for picture, _ in self._labelled)
         )

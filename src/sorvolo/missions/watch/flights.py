@@ -16,7 +16,7 @@ from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.stream import LiveStream
 from sorvolo.capture.source import LiveSource, Source, open_sources
 from sorvolo.errors import InputError, SettingsError, SorvoloWarning
-from sorvolo.geometry.arrays import ImageGray
+from sorvolo.geometry.arrays import ImageGray, PointsM
 from sorvolo.missions.flight.detector_protocol import (
     FindsObjects,
     ObjectDetector,
@@ -244,7 +244,7 @@ class _Passed:
         self._showing: deque[tuple[int, int]] = deque()
         self.count = 0
         self.earlier = 0
-        """How many frames a killed watch had searched."""
+        """How many frames came while a killed watch ran."""
         self._asked = 0
 
     def is_wanted(self, index: int, time_ns: int) -> bool:
@@ -299,7 +299,15 @@ def _live(
     for each in memo.kept_frames():
         passed.earlier += 1
         yield run.add(each.frame, time.monotonic())
-    with closing(waiting.live(run.show, run.new_share, run.doubtful)) as arrivals:
+    for frame in memo.waited_frames():  # their pictures are lost
+        passed.earlier += 1
+        run.show(frame)
+
+    def came(frame: Frame) -> PointsM | None:
+        memo.note_came(frame)
+        return run.show(frame)
+
+    with closing(waiting.live(came, run.new_share, run.doubtful)) as arrivals:
         for arrived_s, arrived in arrivals:
             passed.note(run)
             if isinstance(arrived, Frame):

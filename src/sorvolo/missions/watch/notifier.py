@@ -34,7 +34,7 @@ class Notifier:
     ) -> None:
         self._memo = memo
         self._sent = {
-            (note.values.get("receiver"), note.values.get("track"))
+            (note.values.get("receiver"), str(note.values.get("sighting")))
             for note in memo.notes
             if note.kind == "sent"
         }
@@ -126,7 +126,7 @@ class Notifier:
         }
         alert["time"] = alert["last_seen"]
         for receiver, outbox in self._alerts.items():
-            if (receiver, track.id) not in self._sent:
+            if (receiver, _sighting(alert)) not in self._sent:
                 outbox.put(alert)
 
     def _add_receiver(
@@ -136,7 +136,7 @@ class Notifier:
 
         def noted(alert: Mapping[str, Any]) -> None:
             send(alert)
-            self._memo.note("sent", receiver=code, track=alert["id"])
+            self._memo.note("sent", receiver=code, sighting=_sighting(alert))
 
         self._alerts[code] = Outbox(noted, code=code, what=what)
 
@@ -148,3 +148,8 @@ class Notifier:
             now_ns=time.time_ns(),
             stale_s=self._outputs.cot_stale_s,
         )
+
+
+def _sighting(alert: Mapping[str, Any]) -> str:
+    """What an alert is known again by: ids differ where a live flight's frames came in another order."""
+    return f"{alert['best_frame']} {alert['best_box_px']}"
