@@ -30,15 +30,24 @@ SRT = """1
 """
 
 
-def write_video(path: Path, seed: int = 0, rotation: int | None = None) -> Path:
+def write_video(
+    path: Path, seed: int = 0, rotation: int | None = None, *, with_sound: bool = False
+) -> Path:
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=5)
         stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p"
         if rotation is not None:
             stream.set_display_rotation(rotation)
+        sound = container.add_stream("aac", rate=44100) if with_sound else None
         for index in range(10):
             image = np.full((64, 96, 3), (20 * index + seed) % 255, np.uint8)
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        if sound is not None:
+            silence = np.zeros((1, 44100), np.float32)
+            frame = av.AudioFrame.from_ndarray(silence, format="fltp", layout="mono")
+            frame.rate = 44100
+            container.mux(sound.encode(frame))
+            container.mux(sound.encode(None))
         container.mux(stream.encode(None))
     return path
 
@@ -253,6 +262,19 @@ def test_an_empty_telemetry_file_beside_the_video_is_named(tmp_path: Path) -> No
     found = {notice.code: notice.text for notice in source.notices()}
     assert "DJI_0001.SRT" in found["empty_telemetry"] and "0 bytes" in found["empty_telemetry"]
     assert not source.telemetry.has_fixes
+
+
+def test_djis_telemetry_track_is_named_where_nothing_else_has_positions(tmp_path: Path) -> None:
+    """A track of sound is renamed in the file to what DJI's metadata track is called."""
+    video = write_video(tmp_path / "DJI_0001.mp4", with_sound=True)
+    assert "unread_track" not in {each.code for each in open_sources([video])[0].notices()}
+    data = video.read_bytes().replace(b"mp4a", b"djmd").replace(b"soun", b"meta")
+    video.write_bytes(data.replace(b"SoundHandler\0", b"DJI meta\0\0\0\0\0"))
+    (source,) = open_sources([video])
+    (words,) = [each.text for each in source.notices() if each.code == "unread_track"]
+    assert "(djmd), which is not read" in words and "(.SRT)" in words
+    (tmp_path / "DJI_0001.SRT").write_text(SRT)
+    assert "unread_track" not in {each.code for each in open_sources([video])[0].notices()}
 
 
 def test_logs_beside_the_video_that_are_not_used_are_named(tmp_path: Path) -> None:

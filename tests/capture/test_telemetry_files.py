@@ -174,3 +174,9 @@ def test_random_bytes_raise_only_input_errors(data):
             reader.read(data, "noise")
         except InputError:
             pass
+
+
+def test_djis_own_flight_record_is_named(tmp_path):
+    path = write(tmp_path / "DJIFlightRecord_2026-05-01_[12-44-00].txt", bytes(range(256)))
+    with pytest.raises(InputError, match=r"DJI's own flight record, .* export it as CSV"):
+        read_telemetry(path)

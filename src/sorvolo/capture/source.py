@@ -342,6 +342,12 @@ def _open_video(
         model = stated or _video_camera(info)
     else:
         model = camera_from_option(str(camera), info.width_px, info.height_px)
+    if info.has_dji_track and not found.has_fixes:
+        words = (
+            f"{path.name} holds DJI's telemetry track (djmd), which is not read; switch on the drone's video subtitles "
+            "(.SRT), or give the flight's log as --telemetry"
+        )
+        notices = [*notices, Notice("unread_track", 1, words)]
     source = VideoSource(name, _fingerprint(path), info, model, found, notices)
     if inside is not None and found is inside.telemetry:
         source.ground_elevation_m = inside.ground_elevation_m

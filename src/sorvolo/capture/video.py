@@ -57,6 +57,7 @@ VIDEO_SUFFIXES = frozenset(
 )
 """How videos in a folder are recognised; a file given by name may have any name."""
 
+_DJI_TRACK = "DJI meta"  # the handler of the track djmd
 _FALLBACK_RATE_HZ = 25.0  # of a video that states none: PAL's
 
 
@@ -66,7 +67,8 @@ class VideoInfo:
 
     `turn` is (transpose, flip left-right, flip up-down), applied in that order to decoded frames;
     `pixel_aspect` the width of a pixel over its height, as delivered; `frame_count` and `duration_s` are
-    estimates, 0 where nothing is known; `is_cut`: the file ends before its header's own length.
+    estimates, 0 where nothing is known; `is_cut`: the file ends before its header's own length; `has_dji_track`: it has DJI's
+    telemetry track (djmd), which is not read.
     """
 
     path: Path
@@ -84,6 +86,7 @@ class VideoInfo:
     make: str
     model: str
     is_cut: bool
+    has_dji_track: bool = False
 
 
 @dataclass(frozen=True)
@@ -278,6 +281,7 @@ def read_video_info(path: Path) -> VideoInfo:
             duration_s = (container.duration or 0) / av.time_base
         codec, count, aspect = stream.codec_context.name, stream.frames, stream.sample_aspect_ratio
         container_name = container.format.name.split(",")[0]
+        handlers = {each.metadata.get("handler_name", "") for each in container.streams.data}
     first = next(decoded_frames(path, DecodingDamage()), None)
     if first is None:
         raise InputError(
@@ -304,6 +308,7 @@ def read_video_info(path: Path) -> VideoInfo:
         _first_of(metadata, "com.apple.quicktime.make", "make", "com.android.manufacturer"),
         _first_of(metadata, "com.apple.quicktime.model", "model", "com.android.model"),
         ends_early(path, container_name),
+        _DJI_TRACK in handlers,
     )
 
 

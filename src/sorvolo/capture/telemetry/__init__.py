@@ -77,6 +77,11 @@ def read_telemetry(path: Path) -> Telemetry:
     """
     data = _bytes_of(path)
     reader = _reader_for(data[:_HEAD_BYTES])
+    if reader is None and path.name.lower().startswith("djiflightrecord"):
+        raise InputError(
+            f"{path}: DJI's own flight record, which is encrypted and not read; export it as CSV (Airdata, DJI log viewers) "
+            "and give that"
+        )
     if reader is None:
         raise InputError(
             f"{path}: {_unknown(data)}; read are DJI's and Autel's subtitles (.SRT, .ass), GPX tracks with times, tables with Latitude and "
