@@ -191,14 +191,14 @@ def test_what_was_printed_is_not_printed_again(
 ) -> None:
     video, folder = flown / "flight1" / "flight1.mp4", tmp_path / "watch"
     command = ["watch", str(video), "--out", str(folder), "--camera", "aov=70"]
-    monkeypatch.setattr("sorvolo.missions.watch.flights.Detector.load", lambda _: detector)
+    monkeypatch.setattr("sorvolo.missions.watch.flights.load_detector", lambda _: detector)
     closing = watch(video, WatchSettings(), WatchOutputs(folder=folder), camera="aov=70")
     new = [track.id for _, each in zip(range(_KILLED_AT), closing) for track in each.new]
     copy_as_killed(folder, tmp_path / "amid")
     closing.close()
     shutil.rmtree(folder)
     shutil.move(tmp_path / "amid", folder)
-    assert main(command) == 0
+    assert main(command) == 3  # the pixels are too coarse for small objects
     printed = capsys.readouterr().err
     assert new and f"continuing after {_KILLED_AT} frames of a stopped run" in printed
     assert not any(f" {each}  at " in printed for each in new)
