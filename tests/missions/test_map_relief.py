@@ -1,4 +1,4 @@
-"""`sorvolo map` over hills: the flat map is reported as one to check, and its accuracy holds; level ground is a map."""
+"""`sorvolo map` over hills is a map over heights, and a flat one is reported as one to check; accuracy holds."""
 
 import json
 from dataclasses import replace
@@ -23,8 +23,10 @@ _LEVEL = small_flight(
 )
 
 
-@pytest.mark.parametrize("relief_m", [0.0, 12.0])
-def test_the_report_names_ground_that_is_not_level(relief_m: float, tmp_path: Path) -> None:
+@pytest.mark.parametrize("relief_m, asked", [(0.0, []), (12.0, ["--flat"]), (12.0, [])])
+def test_the_report_names_ground_that_is_not_level(
+    relief_m: float, asked: list[str], tmp_path: Path
+) -> None:
     simulate_into(
         tmp_path / "made", replace(_LEVEL, scene=replace(_LEVEL.scene, relief_m=relief_m))
     )
@@ -40,12 +42,17 @@ def test_the_report_names_ground_that_is_not_level(relief_m: float, tmp_path: Pa
             "none",
             "--camera",
             camera,
+            *asked,
         ]
     )
     report = json.loads(next((tmp_path / "site").glob("flights/*/report.json")).read_text())
-    assert any("the ground is not level" in each for each in report["warnings"]) == (relief_m > 0)
-    assert exit_code == (3 if relief_m else 0)
-    assert ("the ground is not level" in report["headline"]["text"]) == (relief_m > 0)
+    is_doubted = bool(asked)
+    assert any("the ground is not level" in each for each in report["warnings"]) == is_doubted
+    assert exit_code == (3 if is_doubted else 0)
+    assert ("the ground is not level" in report["headline"]["text"]) == is_doubted
+    stands = relief_m > 0 and not asked
+    assert report.get("shape", {}).get("is_flat", True) != stands
+    assert any((tmp_path / "site").glob("flights/*/heights.tif")) == stands
     off_m = _off_m(tmp_path)
     assert (off_m < 2 * report["sigma_m"] * np.sqrt(2)).mean() > 0.9, (off_m, report["sigma_m"])
 
