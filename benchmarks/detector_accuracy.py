@@ -23,13 +23,17 @@ from sorvolo.lab.datasets import read_dataset
 from sorvolo.lab.evaluation.detection_scores import score_set
 from sorvolo.lab.evaluation.detector import (
     EvaluationSettings,
+    FoundSet,
     evaluate_detector,
     write_evaluation,
 )
-from sorvolo.lab.evaluation.detector_files import FoundSet
 from sorvolo.lab.simulation.flight import simulate_flight
-from sorvolo.lab.simulation.picture_sets import simulate_pictures
-from sorvolo.lab.simulation.pictures import LEAST_VISIBLE, SMALLEST_PX, PictureSettings
+from sorvolo.lab.simulation.pictures import (
+    LEAST_VISIBLE,
+    SMALLEST_PX,
+    PictureSettings,
+    simulate_pictures,
+)
 from sorvolo.lab.simulation.presets import preset
 from sorvolo.lab.simulation.truth import coco_boxes
 from sorvolo.store.exports.plain import plain_json

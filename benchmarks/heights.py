@@ -31,7 +31,6 @@ import rasterio
 from provenance import commit, machine, note_scoring, seeds_or_drawn
 from sorvolo.heights.field import HeightField
 from sorvolo.lab.simulation.flight import SimulatedFlight, simulate_flights
-from sorvolo.lab.simulation.relief import Relief
 from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     OutputSettings,
@@ -42,12 +41,12 @@ from sorvolo.lab.simulation.settings import (
 )
 from sorvolo.lab.simulation.site import simulate_site
 from sorvolo.lab.simulation.truth import ground_heights, surface_heights
-from sorvolo.lab.simulation.world import orthophoto
+from sorvolo.lab.simulation.world import Relief, orthophoto
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.heights.measure import read_field
 from sorvolo.missions.heights.run import HeightSettings, make_heights
 from sorvolo.missions.map.flights import map_flights
-from sorvolo.search.drawing.objects import Label
+from sorvolo.search.drawing.objects import ThingLabel
 from sorvolo.search.drawing.view import map_view
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.files import HeightFile
@@ -117,7 +116,7 @@ def simulated(seed: int, relief_m: float = 0.0) -> dict[str, Any]:
         view = map_view(ground.area.west_m, ground.area.north_m, (_M_PER_PX, _M_PER_PX), size)
         top = surface_heights(day.things, day.bodies, view, day.relief)
         true = top - ground_heights(view, day.relief)
-        houses = [thing for thing in day.things if thing.label is Label.HOUSE]
+        houses = [thing for thing in day.things if thing.label is ThingLabel.HOUSE]
         paths = {
             "flat": folder / "site" / "mosaic.tif",
             "true": folder / "site" / "flights" / flight / "orthophoto.tif",

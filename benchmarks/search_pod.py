@@ -33,6 +33,7 @@ from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.summary import calibration_bins
 from sorvolo.geometry.sun import direction_from_angles
 from sorvolo.lab.simulation.flight import SimulatedFlight, simulate_flight
+from sorvolo.lab.simulation.pictures import heat_picture, warm_day
 from sorvolo.lab.simulation.rendering import render, render_labels
 from sorvolo.lab.simulation.settings import (
     ImagingSettings,
@@ -42,15 +43,13 @@ from sorvolo.lab.simulation.settings import (
     SceneSettings,
     SimulationSettings,
 )
-from sorvolo.lab.simulation.thermal import heat_picture, warm_day
 from sorvolo.lab.simulation.world import build_day, is_free
 from sorvolo.missions.search.measure import MeasuredFlight, SearchFrame, measure_flight, reach_m
 from sorvolo.missions.search.settings import SearchSettings
 from sorvolo.search.cells import cell_side_m, cells_over
 from sorvolo.search.conditions import gather, look_at
-from sorvolo.search.drawing.frame_light import frame_light
 from sorvolo.search.drawing.objects import Thing
-from sorvolo.search.drawing.planted import new_plant
+from sorvolo.search.drawing.planted import frame_light, new_plant
 from sorvolo.store.pages.plots import stated_and_found
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import PlacedFrame, Status

@@ -28,8 +28,7 @@ if TYPE_CHECKING:
     )
     from sorvolo.lab.evaluation.mosaic import evaluate_mosaic
     from sorvolo.lab.evaluation.objects import evaluate_objects
-    from sorvolo.lab.simulation.picture_sets import simulate_pictures
-    from sorvolo.lab.simulation.pictures import PictureSettings
+    from sorvolo.lab.simulation.pictures import PictureSettings, simulate_pictures
     from sorvolo.lab.simulation.presets import preset, preset_names
     from sorvolo.lab.simulation.settings import SimulationSettings
     from sorvolo.lab.simulation.site import simulate_site
@@ -209,9 +208,8 @@ _HOMES = {
     ),
     "lab.evaluation.mosaic": ("evaluate_mosaic",),
     "lab.evaluation.objects": ("evaluate_objects",),
-    "lab.simulation.picture_sets": ("simulate_pictures",),
     "lab.simulation.site": ("simulate_site",),
-    "lab.simulation.pictures": ("PictureSettings",),
+    "lab.simulation.pictures": ("PictureSettings", "simulate_pictures"),
     "lab.simulation.presets": ("preset", "preset_names"),
     "lab.simulation.settings": ("SimulationSettings",),
     "lab.thesis.changes": (

@@ -39,7 +39,7 @@ from sorvolo.capture.photos import read_album, read_picture
 from sorvolo.capture.source import open_sources
 from sorvolo.capture.telemetry import read_telemetry
 from sorvolo.errors import InputError
-from sorvolo.lab.datasets.picture_files import shown_size_px
+from sorvolo.lab.datasets.parsed import shown_size_px
 
 
 def png_of(width_px: int, height_px: int) -> bytes:

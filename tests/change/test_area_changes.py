@@ -19,7 +19,7 @@ from sorvolo.change.outlines import overlap
 from sorvolo.change.patches import PatchWindow, cut
 from sorvolo.change.reconcile import with_areas
 from sorvolo.lab.simulation.ground import GroundKind, paint_ground
-from sorvolo.lab.simulation.ground_painting import Area
+from sorvolo.lab.simulation.ground_painting import GroundArea
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Patch
 
 M_PER_PX = 0.05
@@ -32,7 +32,7 @@ Rgb = np.ndarray
 def painted(kind: GroundKind, seed: int) -> Rgb:
     """64 x 48 m of ground, north up, its north west corner at the site's origin."""
     return paint_ground(
-        kind, Area(0.0, -48.0, 64.0, 0.0), M_PER_PX, np.random.default_rng(seed)
+        kind, GroundArea(0.0, -48.0, 64.0, 0.0), M_PER_PX, np.random.default_rng(seed)
     ).raster.rgb.copy()
 
 

@@ -5,8 +5,8 @@ import importlib.util
 import numpy as np
 import pytest
 
-from sorvolo.detection.calibration import platt_scaled
-from sorvolo.detection.contract import Calibration
+from sorvolo.detection.contract import ScoreCalibration
+from sorvolo.detection.fusing import platt_scaled
 from sorvolo.errors import InputError
 from sorvolo.lab.evaluation.detection_metrics import (
     SIZES_PX,
@@ -441,7 +441,7 @@ def test_what_held_out_scores_mean() -> None:
     wrong = [(square(20 * index, 50), 0, 0.5 - 0.01 * index) for index in range(20)]
     matches, _, _ = match_pictures(truth, [seen(*right, *wrong)], CLASSES)
     checked = Checked({each.label: (each,) for each in matches if each.label == "person"}, {})
-    before = {"person": Calibration(0.5, 0.0), "car": Calibration(2.0, -1.0)}
+    before = {"person": ScoreCalibration(0.5, 0.0), "car": ScoreCalibration(2.0, -1.0)}
     found = checked.calibration(CLASSES, before)
     assert found["car"] == before["car"] and found["person"] != before["person"]
     sure, unsure = platt_scaled(np.array([0.85, 0.42]), found["person"])

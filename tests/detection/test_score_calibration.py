@@ -9,9 +9,9 @@ import onnx
 import pytest
 from toy_models import draw, rectangle_model
 
-from sorvolo.detection.calibration import in_own_scale, platt_fit, platt_scaled, scaled_thresholds
-from sorvolo.detection.contract import FORMAT, METADATA_KEY, Calibration
+from sorvolo.detection.contract import FORMAT, METADATA_KEY, ScoreCalibration
 from sorvolo.detection.detector import Detector
+from sorvolo.detection.fusing import in_own_scale, platt_fit, platt_scaled, scaled_thresholds
 from sorvolo.detection.models import installed_models
 from sorvolo.errors import InputError
 
@@ -53,7 +53,7 @@ def test_thresholds_are_of_what_comes_out(tmp_path: Path) -> None:
 def test_a_fit_finds_what_scores_mean() -> None:
     """Reports right as often as a known scale states: it is found again, and then 0.5 means half."""
     rng = np.random.default_rng(5)
-    own, truth = rng.uniform(0.02, 0.98, 200_000), Calibration(0.7, -1.4)
+    own, truth = rng.uniform(0.02, 0.98, 200_000), ScoreCalibration(0.7, -1.4)
     right = rng.random(len(own)) < platt_scaled(own, truth)
     fit = platt_fit(own, right)
     assert fit is not None
@@ -63,17 +63,6 @@ def test_a_fit_finds_what_scores_mean() -> None:
     scores = platt_scaled(own, fit)
     half = (scores > 0.4) & (scores < 0.6)
     assert right[half].mean() == pytest.approx(0.5, abs=0.03)
-
-
-def test_what_counts_twice_is_there_twice() -> None:
-    own, right = np.array([0.2, 0.3, 0.6, 0.9]), np.array([False, True, False, True])
-    twice = [0, 1, 1, 2, 3]
-    counted, doubled = (
-        platt_fit(own, right, np.array([1.0, 2.0, 1.0, 1.0])),
-        platt_fit(own[twice], right[twice]),
-    )
-    assert counted is not None and doubled is not None
-    assert counted.slope == pytest.approx(doubled.slope, abs=1e-3)
 
 
 def test_no_scale_where_scores_tell_nothing() -> None:
@@ -91,7 +80,7 @@ def test_thresholds_go_there_and_back(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("score", [0.0, 1.0])
 def test_scores_at_the_ends_stay_between(score: float) -> None:
-    assert 0 < platt_scaled(score, Calibration(1.2, -0.5)) < 1
+    assert 0 < platt_scaled(score, ScoreCalibration(1.2, -0.5)) < 1
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,7 @@ def test_notebook_runs(
     if (
         name == "tune_detector"
     ):  # the first twenty of the pictures settle the model's norms, not a hundred
-        monkeypatch.setattr("sorvolo.lab.training.starting._SETTLING_PX", 20 * 256 * 256)
+        monkeypatch.setattr("sorvolo.lab.training.start._SETTLING_PX", 20 * 256 * 256)
     notebook = json.loads((NOTEBOOKS / f"{name}.ipynb").read_text(encoding="utf-8"))
     variables: dict[str, object] = {"__name__": "__main__"}
     for number, cell in enumerate(notebook["cells"]):

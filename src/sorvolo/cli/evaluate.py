@@ -30,17 +30,17 @@ from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
     from sorvolo.lab.evaluation.change_metrics import EventScores
-    from sorvolo.lab.evaluation.changes import FlightChanges
+    from sorvolo.lab.evaluation.changes import MeasuredChanges
     from sorvolo.lab.evaluation.detection_scores import (
-        Difference,
         Interval,
+        ScoreDifference,
         SetComparison,
         SetScores,
     )
     from sorvolo.lab.evaluation.map_quality import Spread
     from sorvolo.lab.evaluation.mask_folders import MaskScores
     from sorvolo.lab.evaluation.mosaic import MosaicEvaluation
-    from sorvolo.lab.evaluation.track_metrics import FlightObjects
+    from sorvolo.lab.evaluation.objects import FlightObjects
 
 evaluate_app = typer.Typer(no_args_is_help=True)
 
@@ -252,7 +252,7 @@ def _show_objects(console: Console, measured: "FlightObjects") -> None:
         console.print(f"{measured.flight}: missed {each}", highlight=False)
 
 
-def show_changes(console: Console, measured: "FlightChanges") -> None:
+def show_changes(console: Console, measured: "MeasuredChanges") -> None:
     """The tables of one flight's changes."""
     if measured.masks is not None:
         _show_masks(console, measured.flight, measured.masks)
@@ -448,7 +448,7 @@ def _show_comparison(console: Console, comparison: "SetComparison") -> None:
     console.print(table)
 
 
-def _difference(found: "Difference") -> str:
+def _difference(found: "ScoreDifference") -> str:
     """In percentage points, with the bounds where there are any."""
     low, high = 100 * found.low, 100 * found.high
     bounds = f" ({low:+.1f} to {high:+.1f})" if math.isfinite(low) else ""

@@ -130,8 +130,7 @@ def simulate(
         raise SettingsError(
             f"--pictures makes single pictures, not flights: leave out {', '.join(given)}"
         )
-    from sorvolo.lab.simulation.picture_sets import simulate_pictures
-    from sorvolo.lab.simulation.pictures import PictureSettings
+    from sorvolo.lab.simulation.pictures import PictureSettings, simulate_pictures
 
     asked = PictureSettings(pictures, 1 if seed is None else seed, kind, thermal)
     if height is not None:
@@ -272,7 +271,7 @@ def _next_steps(folder: Path, site: Path) -> list[str]:
 
 def _is_simulated(folder: Path, settings: "SimulationSettings") -> bool:
     """Whether an earlier run of this version left the very flights that are wanted."""
-    from sorvolo.lab.simulation.folder import MARK
+    from sorvolo.lab.simulation.flight_files import MARK
     from sorvolo.store.exports.plain import plain_json
 
     try:

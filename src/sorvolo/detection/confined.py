@@ -6,10 +6,10 @@ import struct
 import subprocess
 import sys
 import weakref
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, Protocol
+from typing import IO, Any
 
 import numpy as np
 
@@ -17,13 +17,12 @@ from sorvolo.child_process import python_command
 from sorvolo.detection.contract import METADATA_KEY, info_from_metadata
 from sorvolo.detection.engine import (
     CUDA,
+    OUTPUTS,
     Engine,
     Planes,
     Provider,
-    Run,
     describe,
     open_engine,
-    output_names,
 )
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import Numbers
@@ -35,11 +34,11 @@ _PER_THREAD_BYTES = (
     160 << 20
 )  # that a thread maps and hardly uses: its stack and its share of the heap
 _MOST_TEXT_BYTES = 1 << 28  # settings and boxes as JSON, far more than any; by choice
-_MOST_DATA_BYTES = 3 << 29  # of pictures, 1.6 GB: a batch of the largest that a mission takes
-_MOST_ROWS = 100_000  # boxes of a batch; by choice
-_TYPES = {"boxes": np.float32, "scores": np.float32, "labels": np.int64, "pictures": np.int64}
-ERRORS = {"InputError": InputError, "SettingsError": SettingsError}
-"""Those that opening and running a model raise, as they are named between processes."""
+_MOST_DATA_BYTES = 3 << 29  # of a picture or a model, 1.6 GB; by choice
+_MOST_ROWS = 100_000  # boxes of a picture; by choice
+_TYPES = {"boxes": np.float32, "scores": np.float32, "labels": np.int64}
+# those that opening and running a model raise, as they are named between processes
+_ERRORS = {"InputError": InputError, "SettingsError": SettingsError}
 
 
 @dataclass(frozen=True)
@@ -50,22 +49,19 @@ class _Wish:
     provider: Provider
     threads: int
     describes: bool
-    most_bytes: int
 
 
-def confined_engine(
-    model: bytes, where: str, provider: Provider, threads: int, most_bytes: int = MOST_BYTES
-) -> Engine:
-    """As `engine.open_engine`, in another process of at most `most_bytes`.
+def confined_engine(model: bytes, where: str, provider: Provider, threads: int) -> Engine:
+    """As `engine.open_engine`, in another process of at most `MOST_BYTES`.
 
     Raises what that raises, and InputError where the model asks for more memory or its process ends.
     """
-    return _Process(model, _Wish(where, provider, threads, False, most_bytes)).engine()
+    return _Process(model, _Wish(where, provider, threads, False)).engine()
 
 
-def described_confined(model: bytes, where: str, most_bytes: int = MOST_BYTES) -> Engine:
+def described_confined(model: bytes, where: str) -> Engine:
     """As `engine.describe`, in another process, which has ended when this returns: the engine cannot run."""
-    process = _Process(model, _Wish(where, "cpu", 1, True, most_bytes))
+    process = _Process(model, _Wish(where, "cpu", 1, True))
     try:
         return process.engine()
     finally:
@@ -76,7 +72,7 @@ class _Process:
     """The other process, as seen from here. It ends with this object."""
 
     def __init__(self, model: bytes, wish: _Wish) -> None:
-        self._wish, self._names = wish, output_names(takes_many=False)
+        self._wish = wish
         package = str(Path(__file__).parents[2])
         paths = [package, *filter(None, [os.environ.get("PYTHONPATH")])]
         self._child = subprocess.Popen(
@@ -92,14 +88,34 @@ class _Process:
     def engine(self) -> Engine:
         """What runs the model there."""
         about, _ = self._receive()
-        self._names = output_names(takes_many=bool(about["takes_many"]))
-        return engine_from(about, self._wish.where, self._run)
+        fixed = about["fixed_px"]
+        return Engine(
+            self._run,
+            str(about["provider"]),
+            str(about["metadata"]),
+            info_from_metadata({METADATA_KEY: str(about["metadata"])}, self._wish.where),
+            None if fixed is None else (int(fixed[0]), int(fixed[1])),
+        )
 
-    def _run(self, batch: Planes) -> tuple[Numbers, ...]:
-        self._send({"shape": list(batch.shape)}, np.ascontiguousarray(batch, np.uint8).tobytes())
+    def _run(self, planes: Planes) -> tuple[Numbers, ...]:
+        self._send({"shape": list(planes.shape)}, np.ascontiguousarray(planes, np.uint8).tobytes())
         head, data = self._receive()
         try:
-            return outputs_from(head, data, self._names)
+            # A model's outputs from their shapes and bytes. Raises KeyError, TypeError or ValueError where they do not fit
+            out, start = [], 0
+            for name in OUTPUTS:
+                shape = [int(each) for each in head["shapes"][name]]
+                if (
+                    len(shape) > 2
+                    or min(shape, default=0) < 0
+                    or max(shape, default=0) > _MOST_ROWS
+                ):
+                    raise ValueError(f"{name} of shape {shape}")
+                kind = np.dtype(_TYPES[name])
+                count = int(np.prod(shape, dtype=np.int64))
+                out.append(np.frombuffer(data, kind, count, start).reshape(shape))
+                start += count * kind.itemsize
+            return tuple(out)
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(
                 f"{self._wish.where} answers with no boxes, scores and labels ({error})"
@@ -119,39 +135,15 @@ class _Process:
         except EOFError as error:
             raise self._ended() from error
         if (kind := head.get("error")) is not None:
-            raise ERRORS.get(kind, InputError)(str(head["text"]))
+            raise _ERRORS.get(kind, InputError)(str(head["text"]))
         return head, data
 
     def _ended(self) -> InputError:
         self.end()
         return InputError(
             f"{self._wish.where}: the process that ran this model ended; it asks for more than "
-            f"{self._wish.most_bytes / (1 << 30):.0f} GB of memory or is damaged. Show it smaller tiles, or get another"
+            f"{MOST_BYTES / (1 << 30):.0f} GB of memory or is damaged. Show it smaller tiles, or get another"
         )
-
-
-def about_engine(engine: Engine) -> dict[str, Any]:
-    """What another process has to know of an engine."""
-    return {
-        "provider": engine.provider,
-        "metadata": engine.metadata,
-        "fixed_px": engine.fixed_px,
-        "takes_many": engine.takes_many,
-    }
-
-
-def engine_from(about: Mapping[str, Any], where: str, run: Run) -> Engine:
-    """The engine of another process, by what `about_engine` gave of it there. Raises InputError for one of a model
-    that breaks the contract."""
-    fixed = about["fixed_px"]
-    return Engine(
-        run,
-        str(about["provider"]),
-        str(about["metadata"]),
-        info_from_metadata({METADATA_KEY: str(about["metadata"])}, where),
-        None if fixed is None else (int(fixed[0]), int(fixed[1])),
-        bool(about["takes_many"]),
-    )
 
 
 def _end(child: "subprocess.Popen[bytes]") -> None:
@@ -176,11 +168,16 @@ def serve(source: IO[bytes], sink: IO[bytes]) -> None:
             if wish.describes
             else open_engine(model, wish.where, wish.provider, wish.threads)
         )
-        write_message(sink, about_engine(engine))
+        about = {name: getattr(engine, name) for name in ("provider", "metadata", "fixed_px")}
+        write_message(sink, about)
         while not wish.describes:
             head, data = read_message(source)
             found = engine.run(np.frombuffer(data, np.uint8).reshape(head["shape"]))
-            write_outputs(sink, output_names(takes_many=engine.takes_many), found)
+            arrays = [
+                np.ascontiguousarray(each, _TYPES[name]) for name, each in zip(OUTPUTS, found)
+            ]
+            shapes = {name: list(each.shape) for name, each in zip(OUTPUTS, arrays)}
+            write_message(sink, {"shapes": shapes}, b"".join(each.tobytes() for each in arrays))
     except (InputError, SettingsError) as error:
         write_message(sink, {"error": type(error).__name__, "text": str(error)})
     except EOFError:
@@ -189,7 +186,7 @@ def serve(source: IO[bytes], sink: IO[bytes]) -> None:
         reason = " ".join(str(error).split())[:200]
         text = (
             f"{wish.where}: the model cannot be run ({reason or type(error).__name__}); it may ask for more than "
-            f"{wish.most_bytes / (1 << 30):.0f} GB of memory: show it smaller tiles, or get another"
+            f"{MOST_BYTES / (1 << 30):.0f} GB of memory: show it smaller tiles, or get another"
         )
         write_message(sink, {"error": "InputError", "text": text})
 
@@ -204,24 +201,11 @@ def _limit(wish: _Wish) -> None:
 
     if wish.provider in ("auto", "cuda") and CUDA in onnxruntime.get_available_providers():
         return
-    most = wish.most_bytes + wish.threads * _PER_THREAD_BYTES
+    most = MOST_BYTES + wish.threads * _PER_THREAD_BYTES
     resource.setrlimit(resource.RLIMIT_AS, (most, most))
 
 
-class Stream(Protocol):
-    """What messages are sent to and read from: a pipe's end, or a socket's file."""
-
-    def write(self, data: bytes | memoryview, /) -> int:
-        """Send bytes."""
-
-    def read(self, size: int, /) -> bytes:
-        """So many bytes; fewer where the other side has ended."""
-
-    def flush(self) -> None:
-        """Send what waits."""
-
-
-def write_message(stream: Stream, head: Mapping[str, Any], data: bytes | memoryview = b"") -> None:
+def write_message(stream: IO[bytes], head: Mapping[str, Any], data: bytes = b"") -> None:
     """Send one message. Raises OSError where the other side has ended."""
     text = json.dumps(head).encode()
     stream.write(struct.pack("<II", len(text), len(data)) + text)
@@ -229,7 +213,7 @@ def write_message(stream: Stream, head: Mapping[str, Any], data: bytes | memoryv
     stream.flush()
 
 
-def read_message(stream: Stream) -> tuple[dict[str, Any], bytes]:
+def read_message(stream: IO[bytes]) -> tuple[dict[str, Any], bytes]:
     """Head and data of one message. Raises EOFError where the other side has ended or sends what is no message."""
     lengths = stream.read(8)
     if len(lengths) < 8:
@@ -245,27 +229,6 @@ def read_message(stream: Stream) -> tuple[dict[str, Any], bytes]:
     except ValueError as error:
         raise EOFError from error
     return (head, data) if isinstance(head, dict) else ({}, data)
-
-
-def write_outputs(stream: Stream, names: Sequence[str], outputs: Sequence[Numbers]) -> None:
-    """Send a model's outputs, by name: boxes, scores, labels, perhaps pictures."""
-    arrays = [np.ascontiguousarray(each, _TYPES[name]) for name, each in zip(names, outputs)]
-    shapes = {name: list(each.shape) for name, each in zip(names, arrays)}
-    write_message(stream, {"shapes": shapes}, b"".join(each.tobytes() for each in arrays))
-
-
-def outputs_from(head: Mapping[str, Any], data: bytes, names: Sequence[str]) -> tuple[Numbers, ...]:
-    """A model's outputs from their shapes and bytes. Raises KeyError, TypeError or ValueError where they do not fit."""
-    out, start = [], 0
-    for name in names:
-        shape = [int(each) for each in head["shapes"][name]]
-        if len(shape) > 2 or min(shape, default=0) < 0 or max(shape, default=0) > _MOST_ROWS:
-            raise ValueError(f"{name} of shape {shape}")
-        kind = np.dtype(_TYPES[name])
-        count = int(np.prod(shape, dtype=np.int64))
-        out.append(np.frombuffer(data, kind, count, start).reshape(shape))
-        start += count * kind.itemsize
-    return tuple(out)
 
 
 if __name__ == "__main__":

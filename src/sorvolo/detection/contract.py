@@ -85,7 +85,7 @@ class Pyramid:
 
 
 @dataclass(frozen=True)
-class Calibration:
+class ScoreCalibration:
     """How a class's scores become the share of such reports that is right: their log-odds become `shift` and `slope`
     times themselves (Platt 1999)."""
 
@@ -127,7 +127,7 @@ class ModelInfo:
     turned: Mapping[str, float] = field(default_factory=dict)
     second_look: Mapping[str, SecondLook] = field(default_factory=dict)
     pyramid: Mapping[str, Pyramid] = field(default_factory=dict)
-    calibration: Mapping[str, Calibration] = field(default_factory=dict)
+    calibration: Mapping[str, ScoreCalibration] = field(default_factory=dict)
     second_only: bool = False
     layout: str = ""
     columns: tuple[str, ...] = ()
@@ -180,6 +180,31 @@ def _info(fields: Mapping[str, Any]) -> ModelInfo:
     if bool(columns) != bool(fields.get("layout")) or set(columns) - {"", *classes}:
         raise ValueError(f"its columns must name its classes, and its layout, not {list(columns)}")
     texts = {each: _words(fields[each]) for each in _TEXTS if each in fields}
+    found = {}
+    for name, each in fields.get("second_look", {}).items():
+        weights = [float(each[key]) for key in ("own", "again", "shift", "least", "enlarged")]
+        looks_px = tuple(float(side_px) for side_px in each["looks_px"])
+        if (
+            name not in classes
+            or not looks_px
+            or not all(0 < side_px < math.inf for side_px in looks_px)
+        ):
+            raise ValueError(
+                f"its second_look must name classes and sizes of theirs, not {name} {list(looks_px)}"
+            )
+        if not all(map(math.isfinite, weights)) or not 0 <= weights[3] <= 1:
+            raise ValueError(
+                f"its second_look must have finite weights and a least score, not {weights}"
+            )
+        positions = int(each.get("positions", 1))
+        if not 1 <= positions <= len(POSITIONS):
+            raise ValueError(
+                f"its second_look must have 1 to {len(POSITIONS)} positions, not {positions}"
+            )
+        own, again, shift, least, enlarged = weights
+        found[name] = SecondLook(
+            looks_px, own, again, shift, least, enlarged, str(each.get("by", "")), positions
+        )
     return ModelInfo(
         str(fields["name"]),
         classes,
@@ -190,7 +215,7 @@ def _info(fields: Mapping[str, Any]) -> ModelInfo:
         bool(fields.get("daylight", True)),
         on_request=on_request,
         turned=MappingProxyType(turned),
-        second_look=MappingProxyType(_second_look(fields, classes)),
+        second_look=MappingProxyType(found),
         pyramid=MappingProxyType(_pyramid(fields, classes)),
         calibration=MappingProxyType(_calibration(fields, classes)),
         second_only=bool(fields.get("second_only", False)),
@@ -249,36 +274,7 @@ def _pyramid(fields: Mapping[str, Any], classes: Sequence[str]) -> dict[str, Pyr
     return found
 
 
-def _second_look(fields: Mapping[str, Any], classes: Sequence[str]) -> dict[str, SecondLook]:
-    found = {}
-    for name, each in fields.get("second_look", {}).items():
-        weights = [float(each[key]) for key in ("own", "again", "shift", "least", "enlarged")]
-        looks_px = tuple(float(side_px) for side_px in each["looks_px"])
-        if (
-            name not in classes
-            or not looks_px
-            or not all(0 < side_px < math.inf for side_px in looks_px)
-        ):
-            raise ValueError(
-                f"its second_look must name classes and sizes of theirs, not {name} {list(looks_px)}"
-            )
-        if not all(map(math.isfinite, weights)) or not 0 <= weights[3] <= 1:
-            raise ValueError(
-                f"its second_look must have finite weights and a least score, not {weights}"
-            )
-        positions = int(each.get("positions", 1))
-        if not 1 <= positions <= len(POSITIONS):
-            raise ValueError(
-                f"its second_look must have 1 to {len(POSITIONS)} positions, not {positions}"
-            )
-        own, again, shift, least, enlarged = weights
-        found[name] = SecondLook(
-            looks_px, own, again, shift, least, enlarged, str(each.get("by", "")), positions
-        )
-    return found
-
-
-def _calibration(fields: Mapping[str, Any], classes: Sequence[str]) -> dict[str, Calibration]:
+def _calibration(fields: Mapping[str, Any], classes: Sequence[str]) -> dict[str, ScoreCalibration]:
     found = {}
     for name, each in fields.get("calibration", {}).items():
         slope, shift = float(each["slope"]), float(each["shift"])
@@ -286,7 +282,7 @@ def _calibration(fields: Mapping[str, Any], classes: Sequence[str]) -> dict[str,
             raise ValueError(
                 f"its calibration must name classes, with a slope above 0 and a shift, not {name}, {slope} and {shift}"
             )
-        found[name] = Calibration(slope, shift)
+        found[name] = ScoreCalibration(slope, shift)
     return found
 
 

@@ -6,11 +6,9 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import overload
 
 import numpy as np
 
-from sorvolo.detection.calibration import calibrated
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.engine import Provider
 from sorvolo.detection.fusing import (
@@ -18,6 +16,7 @@ from sorvolo.detection.fusing import (
     SeenTile,
     agreed,
     agreed_in_sizes,
+    calibrated,
     merge_tiles,
     turned,
     turned_back,
@@ -259,7 +258,6 @@ class Detector:
             notices.append(Notice("people_too_small", count, text))
         return tuple(notices)
 
-    @overload
     def detect(
         self,
         image: Picture,
@@ -272,36 +270,8 @@ class Detector:
         overlapping: bool = False,
         early: Early | None = None,
         is_part: bool = False,
-    ) -> Detections: ...
-
-    @overload
-    def detect(
-        self,
-        image: Sequence[Picture],
-        *,
-        tiles: Tiles = None,
-        m_per_px: float | None = None,
-        least_score: float | None = None,
-        classes: Sequence[str] | None = None,
-        from_above: bool = False,
-        overlapping: bool = False,
-        is_part: bool = False,
-    ) -> list[Detections]: ...
-
-    def detect(
-        self,
-        image: Picture | Sequence[Picture],
-        *,
-        tiles: Tiles = None,
-        m_per_px: float | None = None,
-        least_score: float | None = None,
-        classes: Sequence[str] | None = None,
-        from_above: bool = False,
-        overlapping: bool = False,
-        early: Early | None = None,
-        is_part: bool = False,
-    ) -> Detections | list[Detections]:
-        """The objects in a picture, best first; for a sequence of pictures, or an array (N, H, W, C), a list of them.
+    ) -> Detections:
+        """The objects in a picture, best first.
 
         A picture is uint8 RGB (H, W, 3), grey (H, W) or (H, W, 1), RGBA (its alpha is dropped), or uint16 of these
         (grey is stretched as a thermal camera's). `tiles` cuts a large one: "auto" by `m_per_px` (the ground's
@@ -310,7 +280,7 @@ class Detector:
         `from_above`: the camera looked about straight down; a model whose file asks for it (`turned`) then looks twice,
         and people by day are not looked for where they are too small to be recognised (`is_too_small`).
         `overlapping`: others show the same (a video's frames), and none is worth looks in several sizes (`pyramid`).
-        `early`, for one picture, is given the classes that have a look of their own (see `looks_for`), and what was
+        `early` is given the classes that have a look of their own (see `looks_for`), and what was
         found of them, while the picture is searched for the others; in the end the same objects are among all.
         `is_part`: it is part of a frame, or made from frames, and counts as none in `notices`.
         Raises InputError for anything that is no picture, SettingsError for a class, score or tile that cannot be.
@@ -318,75 +288,15 @@ class Detector:
         wanted = self._wanted(classes)
         if least_score is not None and not 0 <= least_score <= 1:
             raise SettingsError(f"the least score must lie in 0 to 1, not {least_score}")
-        sampling = math.nan if m_per_px is None else float(m_per_px)
-        if not isinstance(image, Sequence) and getattr(image, "ndim", 0) != 4:
-            return self._seen(
-                image, tiles, sampling, wanted, least_score, from_above, overlapping, is_part, early
-            )
-        return [
-            self._seen(each, tiles, sampling, wanted, least_score, from_above, overlapping, is_part)
-            for each in image
-        ]
-
-    def thresholds_for(
-        self,
-        picture: Picture,
-        *,
-        from_above: bool = False,
-        m_per_px: float | None = None,
-    ) -> Mapping[str, float]:
-        """From which score on each class is reported in such a picture, by the model that looks at it; of those that
-        `detect` looks for in it alone."""
-        thermal = is_thermal(picture)
-        info = self.info if self._is_own(thermal=thermal) else self._night_session().info
-        least = _thresholds(info, from_above)
-        sampling = math.nan if m_per_px is None else m_per_px
-        too_small = _too_small(list(least), sampling, thermal=thermal, from_above=from_above)
-        return {
-            name: score
-            for name, score in least.items()
-            if name in self.classes and name not in too_small
-        }
-
-    def rest(self) -> None:
-        """Give back memory that is kept for the next picture: before work that needs it, and after the last picture."""
-        for each in (self._session, self._at_night, *self._opinions.values()):
-            if each is not None:
-                each.rest()
-
-    def _wanted(self, classes: Sequence[str] | None) -> tuple[str, ...]:
-        if classes is None:
-            return self.classes
-        if isinstance(classes, str):
-            classes = (classes,)
-        if not classes or (unknown := [name for name in classes if name not in self.classes]):
-            named = ", ".join(map(repr, unknown)) if classes else "no class"
-            there = ", ".join(self.classes)
-            raise SettingsError(
-                f"the model '{self.info.name}' does not find {named}; it finds {there}"
-            )
-        return tuple(name for name in self.classes if name in classes)
-
-    def _seen(
-        self,
-        picture: Picture,
-        tiles: Tiles,
-        m_per_px: float,
-        wanted: Sequence[str],
-        least_score: float | None,
-        from_above: bool,
-        overlapping: bool,
-        is_part: bool,
-        early: Early | None = None,
-    ) -> Detections:
         # which model looks, and for what
-        thermal = is_thermal(picture)
+        sampling = math.nan if m_per_px is None else float(m_per_px)
+        thermal = is_thermal(image)
         session = self._session if self._is_own(thermal=thermal) else self._night_session()
         info = session.info
         self._looks[info.name] += session is not self._session
-        rgb = rgb_from_picture(picture)
+        rgb = rgb_from_picture(image)
         names = [name for name in wanted if name in info.classes]
-        small = _too_small(names, m_per_px, thermal=thermal, from_above=from_above)
+        small = _too_small(names, sampling, thermal=thermal, from_above=from_above)
         if not is_part:
             self._daylight_frames += not (thermal or self.info.daylight)
             self._thermal_frames += not self._is_own(thermal=thermal)
@@ -394,7 +304,7 @@ class Detector:
         names = [name for name in names if name not in small]
         if not names:
             return no_detections(self.classes)
-        search = _Search(session, tuple(names), tiles, m_per_px, thermal, overlapping)
+        search = _Search(session, tuple(names), tiles, sampling, thermal, overlapping)
 
         def report(seen: Seen, names: Sequence[str]) -> Detections:
             """What is reported of these classes, in this detector's labels."""
@@ -451,6 +361,45 @@ class Detector:
             mine = {label: how for label, how in second_look_by_label.items() if how.by == by}
             seen = rescore(seen, rgb, see_again, mine)
         return report(seen, names)
+
+    def thresholds_for(
+        self,
+        picture: Picture,
+        *,
+        from_above: bool = False,
+        m_per_px: float | None = None,
+    ) -> Mapping[str, float]:
+        """From which score on each class is reported in such a picture, by the model that looks at it; of those that
+        `detect` looks for in it alone."""
+        thermal = is_thermal(picture)
+        info = self.info if self._is_own(thermal=thermal) else self._night_session().info
+        least = _thresholds(info, from_above)
+        sampling = math.nan if m_per_px is None else m_per_px
+        too_small = _too_small(list(least), sampling, thermal=thermal, from_above=from_above)
+        return {
+            name: score
+            for name, score in least.items()
+            if name in self.classes and name not in too_small
+        }
+
+    def rest(self) -> None:
+        """Give back memory that is kept for the next picture: before work that needs it, and after the last picture."""
+        for each in (self._session, self._at_night, *self._opinions.values()):
+            if each is not None:
+                each.rest()
+
+    def _wanted(self, classes: Sequence[str] | None) -> tuple[str, ...]:
+        if classes is None:
+            return self.classes
+        if isinstance(classes, str):
+            classes = (classes,)
+        if not classes or (unknown := [name for name in classes if name not in self.classes]):
+            named = ", ".join(map(repr, unknown)) if classes else "no class"
+            there = ", ".join(self.classes)
+            raise SettingsError(
+                f"the model '{self.info.name}' does not find {named}; it finds {there}"
+            )
+        return tuple(name for name in self.classes if name in classes)
 
     def _is_own(self, *, thermal: bool) -> bool:
         """Whether this model itself looks at frames of such light, and no other is sought."""

@@ -24,13 +24,12 @@ Provider = Literal["auto", "cpu", "cuda", "openvino"]
 """Where a model runs; "auto" takes CUDA where there is one, else OpenVINO where it is installed, else the CPU."""
 
 Planes: TypeAlias = NDArray[np.uint8]
-"""(1, 3, H, W): a picture as a model takes it; (N, 3, H, W) for a model that takes many."""
+"""(1, 3, H, W): a picture as a model takes it."""
 
 Run = Callable[[Planes], tuple[Numbers, ...]]
-"""A picture's planes to boxes, scores and labels; of many also which picture each of these is of, from 0."""
+"""A picture's planes to boxes, scores and labels."""
 
 INPUT, OUTPUTS = "image", ("boxes", "scores", "labels")
-PICTURES = "pictures"
 CUDA = "CUDAExecutionProvider"
 _OPENVINO_PRECISION = "f32"
 
@@ -39,8 +38,8 @@ _OPENVINO_PRECISION = "f32"
 class Engine:
     """A model that runs: `provider` in words, its `metadata` as it stands in the file, and what that means.
 
-    `fixed_px` is the (height, width) of its input where the model takes only one size, else None; `takes_many`
-    whether it takes several pictures of one size at once. `rest` gives back memory that it keeps between pictures.
+    `fixed_px` is the (height, width) of its input where the model takes only one size, else None. `rest`
+    gives back memory that it keeps between pictures.
     """
 
     run: Run
@@ -48,13 +47,7 @@ class Engine:
     metadata: str
     info: ModelInfo
     fixed_px: tuple[int, int] | None
-    takes_many: bool = False
     rest: Callable[[], None] = lambda: None
-
-
-def output_names(*, takes_many: bool) -> tuple[str, ...]:
-    """What a model gives, in this order."""
-    return (*OUTPUTS, PICTURES) if takes_many else OUTPUTS
 
 
 def open_engine(model: bytes, where: str, provider: Provider, threads: int) -> Engine:
@@ -132,8 +125,10 @@ def _engine(provider: str, session: Any, where: str) -> Engine:
             _foreign(info, inputs, call, where), provider, metadata[METADATA_KEY], info, fixed_px
         )
     fixed_px = _input_size(session, where, info.stride)
-    takes_many = PICTURES in {each.name for each in session.get_outputs()}
-    run = _runner(session, output_names(takes_many=takes_many))
+
+    def run(planes: Planes) -> tuple[Numbers, ...]:
+        return tuple(session.run(list(OUTPUTS), {INPUT: planes}))
+
     side_px = fixed_px or (info.stride, info.stride)
     return Engine(
         run,
@@ -141,7 +136,6 @@ def _engine(provider: str, session: Any, where: str) -> Engine:
         metadata[METADATA_KEY],
         info,
         fixed_px,
-        takes_many,
         lambda: _shrink(session, side_px),
     )
 
@@ -216,13 +210,6 @@ def _refusal(message: str) -> str:
     return f"{runtime} refuses it ({first}); export it again with opset 17"
 
 
-def _runner(session: Any, names: Sequence[str]) -> Run:
-    def run(batch: Planes) -> tuple[Numbers, ...]:
-        return tuple(session.run(list(names), {INPUT: batch}))
-
-    return run
-
-
 def _openvino_runner(model: bytes, threads: int, described: Engine, where: str) -> Run:
     import openvino
 
@@ -234,11 +221,10 @@ def _openvino_runner(model: bytes, threads: int, described: Engine, where: str) 
     }
     compiled = core.compile_model(core.read_model(model=model), "CPU", wishes)
     request = compiled.create_infer_request()
-    names = output_names(takes_many=described.takes_many)
 
-    def run(batch: Planes) -> tuple[Numbers, ...]:
-        request.infer({INPUT: batch}, share_inputs=True)
-        return tuple(request.get_tensor(name).data.copy() for name in names)
+    def run(planes: Planes) -> tuple[Numbers, ...]:
+        request.infer({INPUT: planes}, share_inputs=True)
+        return tuple(request.get_tensor(name).data.copy() for name in OUTPUTS)
 
     def call(feeds: Mapping[str, Any]) -> dict[str, Numbers]:
         found = request.infer(dict(feeds))
@@ -264,21 +250,9 @@ def _input_size(session: Any, where: str, stride: int) -> tuple[int, int] | None
         lacking, given = ", ".join(sorted(missing)), ", ".join(sorted(outputs))
         raise InputError(f"{where} gives no {lacking}, but {given}; needed is {needed}")
     shape = inputs[0].shape
-    if not _is_one_picture(shape):
+    if len(shape) != 4 or shape[1] != 3 or (isinstance(shape[0], int) and shape[0] != 1):
         raise InputError(f"{where} takes {found}; needed is {needed}")
-    if PICTURES in outputs and isinstance(shape[0], int):
-        raise InputError(
-            f"{where} gives '{PICTURES}' but takes one picture; leave the number of pictures free"
-        )
-    return _fixed_size(shape, stride, f"{where} takes {found}")
-
-
-def _is_one_picture(shape: Sequence[int | str]) -> bool:
-    """Whether an input's shape is (1 or free, 3, height, width)."""
-    return len(shape) == 4 and (shape[0] == 1 or not isinstance(shape[0], int)) and shape[1] == 3
-
-
-def _fixed_size(shape: Sequence[Any], stride: int, found: str) -> tuple[int, int] | None:
+    found = f"{where} takes {found}"
     fixed = [isinstance(each, int) for each in shape[2:]]
     if not any(fixed):
         return None

@@ -1,16 +1,83 @@
-"""What several looks at one picture saw, put together: of neighbouring tiles, of turned copies, of several sizes."""
+"""Detections put together: looks at neighbouring tiles, turned copies and several sizes; and scores as shares (Platt 1999)."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+from scipy.optimize import minimize
 
-from sorvolo.detection.calibration import log_odds
-from sorvolo.detection.contract import Pyramid
+from sorvolo.detection.contract import ModelInfo, Pyramid, ScoreCalibration
 from sorvolo.detection.session import Seen
 from sorvolo.geometry.arrays import BoxesPx, Floats, ImageRGB, Labels, Mask, Matrix3, Numbers, Rows
 from sorvolo.geometry.box_overlap import areas, cover_matrix, iou_matrix
+
+_LEAST = 1e-6  # no score counts for less, nor for more than 1 less this: log-odds stay finite
+
+
+def calibrated(seen: Seen, info: ModelInfo) -> Seen:
+    """What all looks at a picture came to, its scores as the model's `calibration` states them, best first."""
+    if not info.calibration:
+        return seen
+    scores = seen.scores.copy()
+    for label, name in enumerate(info.classes):
+        if name in info.calibration:
+            rows = seen.labels == label
+            scores[rows] = platt_scaled(scores[rows], info.calibration[name])
+    order = np.argsort(-scores, kind="stable")
+    return Seen(seen.boxes_px[order], scores[order], seen.labels[order])
+
+
+def platt_scaled(scores: Floats | float, how: ScoreCalibration) -> Floats:
+    """Scores of any shape, 0 to 1, whose log-odds become `shift` and `slope` times themselves (Platt 1999)."""
+    return np.asarray(1 / (1 + np.exp(-how.shift - how.slope * log_odds(scores, _LEAST))))
+
+
+def platt_fit(scores: Floats, right: Mask) -> ScoreCalibration | None:
+    """The scale by which scores (N,) of the model's own become shares, from what of them is `right` (N,) (Platt 1999).
+
+    A right one aims a little below 1, a wrong one a little above 0, by how few
+    there are (eq. 4 there). None where right ones do not score higher than wrong ones, or there are none of either.
+    """
+    if right.all() or not right.any():
+        return None
+    hits, misses = np.count_nonzero(right), np.count_nonzero(~right)
+    aims = np.where(right, (hits + 1) / (hits + 2), 1 / (misses + 2))
+    odds = log_odds(scores, _LEAST)
+
+    def loss(weights: Floats) -> float:
+        logits = weights[0] * odds + weights[1]
+        return float(np.mean(np.logaddexp(0, logits) - aims * logits))
+
+    slope, shift = minimize(loss, np.array([1.0, 0.0])).x.tolist()
+    return ScoreCalibration(slope, shift) if slope > 0 else None
+
+
+def in_own_scale(info: ModelInfo) -> dict[str, float]:
+    """The model's thresholds in its networks' own scale: what reports as much where nothing is calibrated."""
+    return {
+        name: float(platt_scaled(least, ScoreCalibration(1 / how.slope, -how.shift / how.slope)))
+        if (how := info.calibration.get(name))
+        else least
+        for name, least in info.thresholds.items()
+    }
+
+
+def scaled_thresholds(
+    own: Mapping[str, float], calibration: Mapping[str, ScoreCalibration]
+) -> dict[str, float]:
+    """Thresholds in a model's own scale as they are after its calibration: `in_own_scale` the other way round."""
+    return {
+        name: float(platt_scaled(least, calibration[name])) if name in calibration else least
+        for name, least in own.items()
+    }
+
+
+def log_odds(scores: Floats | float, least: float) -> Floats:
+    """log(p / (1 - p)) of scores p of any shape, which count for `least` at least and for 1 - `least` at most."""
+    inside = np.clip(scores, least, 1 - least)
+    return np.asarray(np.log(inside / (1 - inside)))
+
 
 SAME_IOU = 0.4
 """Two tiles' boxes of a class are one object if they overlap this much in what both tiles show."""

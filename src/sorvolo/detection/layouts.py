@@ -142,7 +142,7 @@ def _ended(outputs: Mapping[str, Numbers], size: Size) -> Decoded:
 
 
 @dataclass(frozen=True)
-class Layout:
+class NetworkLayout:
     """One maker's convention: how a picture is given, what comes back, whether its boxes must be suppressed."""
 
     decode: Callable[[Mapping[str, Numbers], Size], Decoded]
@@ -151,15 +151,15 @@ class Layout:
     suppresses: bool = True
 
 
-LAYOUTS: Mapping[str, Layout] = {
-    "yolov8": Layout(_yolov8),
-    "yolov5": Layout(_yolov5),
-    "yolox": Layout(_yolox, _RAW, is_bgr=True),
-    "nanodet": Layout(_nanodet, _IMAGENET, is_bgr=True),
-    "rtdetr": Layout(_detr, suppresses=False),
-    "dfine": Layout(_detr, suppresses=False),
-    "rfdetr": Layout(_detr, _IMAGENET, suppresses=False),
-    "yolov10": Layout(_ended, suppresses=False),
+LAYOUTS: Mapping[str, NetworkLayout] = {
+    "yolov8": NetworkLayout(_yolov8),
+    "yolov5": NetworkLayout(_yolov5),
+    "yolox": NetworkLayout(_yolox, _RAW, is_bgr=True),
+    "nanodet": NetworkLayout(_nanodet, _IMAGENET, is_bgr=True),
+    "rtdetr": NetworkLayout(_detr, suppresses=False),
+    "dfine": NetworkLayout(_detr, suppresses=False),
+    "rfdetr": NetworkLayout(_detr, _IMAGENET, suppresses=False),
+    "yolov10": NetworkLayout(_ended, suppresses=False),
 }
 """By name; yolov8 is also YOLO11's, yolov10 that of any network with NMS inside."""
 

@@ -36,7 +36,25 @@ class SceneMagnifier:
     def m_per_px(self, picture: ImageRGB, look: Look) -> float | None:
         """Of the next frame (H, W, 3); None where the scene does not show it, or shows only people large enough."""
         if self._frames == self._next:
-            self._probe(picture, look)
+            height, width = (min(side, most) for side, most in zip(picture.shape[:2], _SIZE_PX))
+            top, left = (picture.shape[0] - height) // 2, (picture.shape[1] - width) // 2
+            middle = np.ascontiguousarray(picture[top : top + height, left : left + width])
+            for times in _TIMES:
+                size = round(width * times), round(height * times)
+                shown = (
+                    middle
+                    if times == 1
+                    else cv2.resize(middle, size, interpolation=cv2.INTER_LINEAR)
+                )
+                seen = look(np.asarray(shown, np.uint8))
+                boxes_px = seen.boxes_px / np.float32(times) + np.array(
+                    [left, top, left, top], np.float32
+                )
+                self._scale.see(
+                    Detections(boxes_px, seen.scores, seen.labels, seen.classes),
+                    picture.shape[:2],
+                    (left, top, left + width, top + height),
+                )
             self._next = max(_FIRST_AGAIN, self._next * _GROWTH)
         self._frames += 1
         m_per_px = self._scale.m_per_px()
@@ -47,22 +65,3 @@ class SceneMagnifier:
     def see(self, found: Detections, picture: ImageRGB) -> None:
         """Take in what was detected in the whole frame."""
         self._scale.see(found, picture.shape[:2])
-
-    def _probe(self, picture: ImageRGB, look: Look) -> None:
-        height, width = (min(side, most) for side, most in zip(picture.shape[:2], _SIZE_PX))
-        top, left = (picture.shape[0] - height) // 2, (picture.shape[1] - width) // 2
-        middle = np.ascontiguousarray(picture[top : top + height, left : left + width])
-        for times in _TIMES:
-            size = round(width * times), round(height * times)
-            shown = (
-                middle if times == 1 else cv2.resize(middle, size, interpolation=cv2.INTER_LINEAR)
-            )
-            seen = look(np.asarray(shown, np.uint8))
-            boxes_px = seen.boxes_px / np.float32(times) + np.array(
-                [left, top, left, top], np.float32
-            )
-            self._scale.see(
-                Detections(boxes_px, seen.scores, seen.labels, seen.classes),
-                picture.shape[:2],
-                (left, top, left + width, top + height),
-            )

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sorvolo.detection.calibration import log_odds
 from sorvolo.detection.contract import POSITIONS, SecondLook
-from sorvolo.detection.fusing import turned, turned_back
+from sorvolo.detection.fusing import log_odds, turned, turned_back
 from sorvolo.detection.session import Seen
 from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.geometry.box_overlap import iou_matrix

@@ -198,18 +198,7 @@ def _auto_plan(
         return TilePlan(scale, _places(size_px, sides, overlap_px, step))
     if height * width * scale**2 <= MOST_WHOLE_PX:
         return TilePlan(scale, ((0, 0, width, height),))
-    return TilePlan(
-        scale, _places(size_px, _cheapest_sides(size_px, overlap_px, step, scale), overlap_px, step)
-    )
-
-
-def _cheapest_sides(
-    size_px: tuple[int, int], overlap_px: float, step: float, scale: float
-) -> tuple[float, float]:
-    """(height, width) of the tiles of at most MOST_WHOLE_PX, as the model sees them, that show least in all.
-
-    Largest tiles are at most about twice as long one way: what lies near a border is seen less well.
-    """
+    # (height, width) of the tiles of at most MOST_WHOLE_PX, as the model sees them, that show least in all
     most = MOST_WHOLE_PX / (scale * step) ** 2  # in steps
     best = (math.inf, (math.sqrt(most) * step, math.sqrt(most) * step))
     for height in range(math.ceil(math.sqrt(most / 2)), math.ceil(math.sqrt(most * 2))):
@@ -217,7 +206,8 @@ def _cheapest_sides(
         places = np.array(_places(size_px, sides, overlap_px, step))
         shown_px = float(np.prod(places[:, 2:] - places[:, :2], axis=1).sum())
         best = min(best, (shown_px, sides))
-    return best[1]
+    cheapest_sides = best[1]
+    return TilePlan(scale, _places(size_px, cheapest_sides, overlap_px, step))
 
 
 def _places(

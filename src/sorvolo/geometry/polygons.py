@@ -168,6 +168,11 @@ def _open(ring: Any) -> PointsM:
     return np.asarray(shapely.get_coordinates(ring)[:-1], dtype=np.float64)
 
 
+def gap(a: PointsM, b: PointsM) -> float:
+    """The distance of the areas within two rings, (N, 2) each, in their unit; 0 where they overlap."""
+    return float(shapely.distance(*(shapely.make_valid(_polygon([ring])) for ring in (a, b))))
+
+
 def union_of_boxes(boxes: Floats) -> list[list[PointsM]]:
     """The polygons that boxes, (N, 4) west, south, east, north, cover together: each its outline, then its holes."""
     joined = shapely.union_all(shapely.box(*np.asarray(boxes, float).T))

@@ -14,7 +14,7 @@ from real_data import real_data
 from sorvolo.errors import InputError, SettingsError, SorvoloError
 from sorvolo.lab.datasets import READERS, read_dataset, read_datasets
 from sorvolo.lab.datasets.checking import turned
-from sorvolo.lab.datasets.groups import group_of
+from sorvolo.lab.datasets.splits import group_of
 from sorvolo.lab.datasets.yolo import names_in_yaml
 
 FUZZ = settings(
@@ -278,8 +278,7 @@ def test_coco_scaled_labels_are_scaled_and_those_of_another_shape_left_out(tmp_p
 
 
 def test_simulated_pictures_read_as_they_were_written(tmp_path):
-    from sorvolo.lab.simulation.picture_sets import simulate_pictures
-    from sorvolo.lab.simulation.pictures import PictureSettings
+    from sorvolo.lab.simulation.pictures import PictureSettings, simulate_pictures
 
     wanted = PictureSettings(pictures=2, seed=4, ground="sand", empty_share=0, m_per_px=(0.08, 0.1))
     *_, last = simulate_pictures(tmp_path / "sim", wanted)

@@ -12,18 +12,21 @@ from toy_models import rectangle_model
 from sorvolo.cli.main import main
 from sorvolo.detection.detector import Detector
 from sorvolo.errors import InputError, SettingsError
+from sorvolo.lab.datasets.splits import hold_out
 from sorvolo.lab.evaluation.detector import (
     FOUND,
     NUMBERS,
     PAGE,
     EvaluationSettings,
+    FoundSet,
+    FoundSets,
     evaluate_detector,
     evaluation_numbers,
+    read_found,
     read_sets,
     write_evaluation,
+    write_found,
 )
-from sorvolo.lab.evaluation.detector_files import FoundSet, FoundSets, read_found, write_found
-from sorvolo.lab.training.holding_out import hold_out
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES, Detections
 

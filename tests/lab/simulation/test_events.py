@@ -21,8 +21,7 @@ from sorvolo.lab.simulation.settings import (
     SimulationSettings,
     WeatherSettings,
 )
-from sorvolo.lab.simulation.true_changes import JOINED_GAP_M, event_features, true_events
-from sorvolo.lab.simulation.truth import change_mask
+from sorvolo.lab.simulation.truth import JOINED_GAP_M, change_mask, event_features, true_events
 from sorvolo.lab.simulation.world import World, build_day
 
 SETTINGS = SimulationSettings(

@@ -7,8 +7,7 @@ import pytest
 
 from sorvolo.errors import SettingsError
 from sorvolo.lab.simulation.flight import SimulatedFlight, simulate_flight
-from sorvolo.lab.simulation.ground_painting import Area
-from sorvolo.lab.simulation.relief import LEVEL, Relief
+from sorvolo.lab.simulation.ground_painting import GroundArea
 from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     MotionSettings,
@@ -18,9 +17,10 @@ from sorvolo.lab.simulation.settings import (
     SimulationSettings,
 )
 from sorvolo.lab.simulation.truth import frame_features, ground_heights, surface_heights
+from sorvolo.lab.simulation.world import LEVEL, Relief
 from sorvolo.search.drawing.view import map_view
 
-_AREA = Area(-60.0, -40.0, 60.0, 40.0)
+_AREA = GroundArea(-60.0, -40.0, 60.0, 40.0)
 _HILLS = Relief.hills(8.0, 25.0, _AREA, np.random.default_rng(3))
 
 

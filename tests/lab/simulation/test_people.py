@@ -4,21 +4,21 @@ import numpy as np
 import pytest
 
 from sorvolo.search.drawing.bodies import build_body
-from sorvolo.search.drawing.objects import POSES, Label, Light, Limb, Thing, new_size
-from sorvolo.search.drawing.view import Patch, opaque
+from sorvolo.search.drawing.objects import POSES, Light, Limb, Thing, ThingLabel, new_size
+from sorvolo.search.drawing.view import DrawnPatch, opaque
 
 _LIGHT = Light(np.array([0.5, 0.2, 0.84]) / np.linalg.norm([0.5, 0.2, 0.84]))
 _ABOVE, _BESIDE = np.array([0.0, 0, 1, 0]), np.array([0.0, -1, 0, 0])
 _HERE = np.zeros(3)
 
 
-def _sides_m(patch: Patch) -> tuple[float, float]:
+def _sides_m(patch: DrawnPatch) -> tuple[float, float]:
     return tuple(float(np.linalg.norm(patch.corners_m[k] - patch.corners_m[0])) for k in (1, 3))
 
 
 def _person(kind: str, seed: int) -> Thing:
-    size_m = new_size(Label.PERSON, kind, np.random.default_rng(seed))
-    return Thing(1, Label.PERSON, kind, 0.0, 0.0, 0.0, size_m, seed)
+    size_m = new_size(ThingLabel.PERSON, kind, np.random.default_rng(seed))
+    return Thing(1, ThingLabel.PERSON, kind, 0.0, 0.0, 0.0, size_m, seed)
 
 
 def _limbs(thing: Thing) -> list[Limb]:

@@ -8,8 +8,7 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.pose import Pose
 from sorvolo.geometry.sun import direction_from_angles, sun_direction
 from sorvolo.lab.simulation.flight import line_kernel
-from sorvolo.search.drawing.frame_light import FrameLight, frame_light
-from sorvolo.search.drawing.planted import new_plant, plant
+from sorvolo.search.drawing.planted import FrameLight, frame_light, new_plant, plant
 
 HEIGHT_M, FOCAL_PX = 30.0, 600.0
 CAMERA = Camera(640, 480, FOCAL_PX, FOCAL_PX, 319.5, 239.5)

@@ -14,11 +14,10 @@ from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import site_from_gimbal_rotation
 from sorvolo.geometry.sun import sun_direction
-from sorvolo.lab.simulation.clock import start_ns, sun_of_flight
 from sorvolo.lab.simulation.flight import simulate_flight, simulate_flights
 from sorvolo.lab.simulation.ground import GroundKind, orthophoto_ground, paint_ground
-from sorvolo.lab.simulation.ground_painting import Area
-from sorvolo.lab.simulation.path import fly, planned_waypoints
+from sorvolo.lab.simulation.ground_painting import GroundArea
+from sorvolo.lab.simulation.path import fly, observe, planned_waypoints
 from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     MotionSettings,
@@ -29,8 +28,7 @@ from sorvolo.lab.simulation.settings import (
     SimulationSettings,
     WeatherSettings,
 )
-from sorvolo.lab.simulation.telemetry import observe
-from sorvolo.lab.simulation.world import needed_area
+from sorvolo.lab.simulation.world import needed_area, start_ns, sun_of_flight
 from sorvolo.search.drawing.noise import smooth_series
 
 LONG = PathSettings(height_m=30, speed_m_s=5, length_m=100, strips=4, strip_spacing_m=12)
@@ -132,7 +130,7 @@ def test_frames_do_not_depend_on_their_order():
 
 @pytest.mark.parametrize("kind", list(GroundKind))
 def test_grounds_are_textured_and_never_repeat(kind):
-    raster = paint_ground(kind, Area(-15, -15, 15, 15), 0.03, np.random.default_rng(5)).raster
+    raster = paint_ground(kind, GroundArea(-15, -15, 15, 15), 0.03, np.random.default_rng(5)).raster
     gray = raster.rgb.astype(np.float32).mean(axis=2)
     fine = gray - np.asarray(cv2.GaussianBlur(gray, (0, 0), 10))
     spread = float(fine.std())

@@ -21,7 +21,7 @@ from sorvolo.lab.simulation.settings import (
 )
 from sorvolo.lab.simulation.world import _with_shadows
 from sorvolo.search.drawing.bodies import build_body
-from sorvolo.search.drawing.objects import Label, Light, Thing
+from sorvolo.search.drawing.objects import Light, Thing, ThingLabel
 
 GRID_M = 2.0
 RASTER_M = 0.02
@@ -121,7 +121,14 @@ def test_a_roof_stands_at_its_height():
     pose, camera = flight.true_poses[2], flight.camera
     middle = ground_from_pixels(camera, pose, np.array([[160.0, 130.0]]))[0]
     thing = Thing(
-        1, Label.HOUSE, "flat roof", float(middle[0]), float(middle[1]), 20.0, (4.0, 3.0, 5.0), 3
+        1,
+        ThingLabel.HOUSE,
+        "flat roof",
+        float(middle[0]),
+        float(middle[1]),
+        20.0,
+        (4.0, 3.0, 5.0),
+        3,
     )
     light = Light(np.array([0.0, 0.3, 0.954]))
     body = build_body(thing, light, 0.03)
@@ -146,10 +153,17 @@ def test_what_stands_nearer_hides_what_is_behind():
     pose = flight.true_poses[2]
     below = pose.translation_m[:2]
     wall = Thing(
-        1, Label.HOUSE, "flat roof", float(below[0] + 3), float(below[1]), 0.0, (2.0, 6.0, 6.0), 3
+        1,
+        ThingLabel.HOUSE,
+        "flat roof",
+        float(below[0] + 3),
+        float(below[1]),
+        0.0,
+        (2.0, 6.0, 6.0),
+        3,
     )
     hidden = Thing(
-        2, Label.SMALL, "box", float(below[0] + 4.6), float(below[1]), 0.0, (0.4, 0.3, 0.3), 4
+        2, ThingLabel.SMALL, "box", float(below[0] + 4.6), float(below[1]), 0.0, (0.4, 0.3, 0.3), 4
     )
     light = Light(np.array([0.0, 0.3, 0.954]))
     bodies = {thing.id: build_body(thing, light, 0.03) for thing in (wall, hidden)}
@@ -169,7 +183,7 @@ def test_shadows_fall_away_from_the_sun():
         (0.05, 0.05),
     )
     sun = np.array([np.sin(0.9), 0.0, np.cos(0.9)])  # in the east
-    pole = Thing(1, Label.SMALL, "big box", 0.0, 0.0, 0.0, (0.6, 0.6, 2.0), 5)
+    pole = Thing(1, ThingLabel.SMALL, "big box", 0.0, 0.0, 0.0, (0.6, 0.6, 2.0), 5)
     light = Light(sun)
     dark = _with_shadows(gray, [pole], {1: build_body(pole, light, 0.05)}, light).rgb[..., 1] < 150
     rows, columns = np.nonzero(dark)

@@ -9,8 +9,12 @@ from PIL import Image
 
 from sorvolo.errors import SettingsError
 from sorvolo.lab.simulation.ground import orthophoto_ground
-from sorvolo.lab.simulation.picture_sets import simulate_pictures
-from sorvolo.lab.simulation.pictures import SMALLEST_PX, PictureSettings, simulate_picture
+from sorvolo.lab.simulation.pictures import (
+    SMALLEST_PX,
+    PictureSettings,
+    simulate_picture,
+    simulate_pictures,
+)
 
 SETTINGS = PictureSettings(
     seed=11, empty_share=0.0, m_per_px=(0.04, 0.1), height_m=(15.0, 60.0), ground="sand"

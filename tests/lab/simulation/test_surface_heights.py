@@ -4,14 +4,14 @@ import numpy as np
 
 from sorvolo.lab.simulation.truth import surface_heights
 from sorvolo.search.drawing.bodies import build_body
-from sorvolo.search.drawing.objects import Label, Light, Thing
+from sorvolo.search.drawing.objects import Light, Thing, ThingLabel
 from sorvolo.search.drawing.view import map_view
 
 
 def test_roofs_have_their_height_and_gables_slope_to_the_eaves() -> None:
     light = Light(np.array([0.3, 0.2, 0.93]))
-    flat = Thing(1, Label.HOUSE, "flat roof", -10.0, 0.0, 0.0, (8.0, 6.0, 5.0), 3)
-    gabled = Thing(2, Label.HOUSE, "gable roof", 10.0, 0.0, 0.0, (8.0, 6.0, 5.0), 4)
+    flat = Thing(1, ThingLabel.HOUSE, "flat roof", -10.0, 0.0, 0.0, (8.0, 6.0, 5.0), 3)
+    gabled = Thing(2, ThingLabel.HOUSE, "gable roof", 10.0, 0.0, 0.0, (8.0, 6.0, 5.0), 4)
     bodies = {each.id: build_body(each, light, 0.1) for each in (flat, gabled)}
     view = map_view(-20.0, 10.0, (0.1, 0.1), (400, 200))
     heights = surface_heights((flat, gabled), bodies, view)

@@ -10,7 +10,7 @@ import pytest
 from real_data import real_data
 from sorvolo.capture.flight_telemetry import local_prior
 from sorvolo.geometry.camera import Camera
-from sorvolo.lab.evaluation.frame_deviation import MapDeviation
+from sorvolo.lab.evaluation.map_quality import MapDeviation
 from sorvolo.lab.thesis.mapping import StitchedFlight, ThesisMapping
 from sorvolo.lab.thesis.stitching import RoiStitcher, Stitched
 from sorvolo.missions.flight.log import Ending

@@ -11,12 +11,18 @@ torch = pytest.importorskip("torch")
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.lab.thesis.four_steps import FourStepSettings, FourStepTraining
-from sorvolo.lab.training.checkpoint import checkpoint_bytes, read_checkpoint, restore
-from sorvolo.lab.training.drawing import batches_from, draws
+from sorvolo.lab.training.faster_rcnn import build
 from sorvolo.lab.training.joint import JointSettings, JointTraining, Progress
-from sorvolo.lab.training.presets import build
-from sorvolo.lab.training.progress import Check, History, Learner, seconds_left
-from sorvolo.lab.training.samples import Augmentation, Sample, Share
+from sorvolo.lab.training.progress import (
+    Check,
+    History,
+    Learner,
+    checkpoint_bytes,
+    read_checkpoint,
+    restore,
+    seconds_left,
+)
+from sorvolo.lab.training.samples import Augmentation, Share, TrainingSample, batches_from, draws
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 
 _CLASSES = ("person", "car")
@@ -47,7 +53,7 @@ def _shares(count: int = 5) -> list[Share]:
     return [Share(labelled, 2.0, (0.9, 1.2)), Share(labelled.only(pictures[:2]), 1.0, (0.9, 1.2))]
 
 
-def _batches(start: int = 0, threads: int = 1) -> Iterator[list[Sample]]:
+def _batches(start: int = 0, threads: int = 1) -> Iterator[list[TrainingSample]]:
     return batches_from(
         _shares(),
         _CLASSES,

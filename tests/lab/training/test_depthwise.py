@@ -6,9 +6,8 @@ torch = pytest.importorskip("torch")
 
 from torch.nn import functional
 
-from sorvolo.lab.training import depthwise as module
-from sorvolo.lab.training.backbone import SamePadded
-from sorvolo.lab.training.depthwise import Depthwise, depthwise
+from sorvolo.lab.training import backbones as module
+from sorvolo.lab.training.backbones import Depthwise, SamePadded, depthwise
 
 _CHANNELS = 6
 

@@ -14,13 +14,10 @@ import onnxruntime
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.lab.thesis.network import thesis_network
-from sorvolo.lab.training.exported import load_exported
-from sorvolo.lab.training.faster_rcnn import FasterRCNN
-from sorvolo.lab.training.onnx_export import check_export, export_onnx
-from sorvolo.lab.training.presets import accurate, fast
-from sorvolo.lab.training.proposals import Stem
+from sorvolo.lab.training.backbones import ResNet50
+from sorvolo.lab.training.faster_rcnn import FasterRCNN, Stem, accurate, fast
+from sorvolo.lab.training.onnx_export import check_export, export_onnx, load_exported
 from sorvolo.lab.training.quantise import quantise
-from sorvolo.lab.training.resnet import ResNet50
 
 _CLASSES = ("person", "car")
 

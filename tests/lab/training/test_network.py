@@ -16,35 +16,43 @@ from onnx import TensorProto, helper
 from sorvolo.errors import SettingsError
 from sorvolo.lab.thesis.four_steps import proposal_loss
 from sorvolo.lab.thesis.network import ExtendedStack
-from sorvolo.lab.training.backbone import EfficientNetLite0
-from sorvolo.lab.training.boxes import (
-    boxes_from_offsets,
-    iou_matrix,
-    offsets_from_boxes,
-    suppress,
-    suppress_all_pairs,
+from sorvolo.lab.training.backbones import EfficientNetLite0, FeaturePyramid
+from sorvolo.lab.training.faster_rcnn import (
+    AnchorSettings,
+    FasterRCNN,
+    ProposalNetwork,
+    Proposed,
+    Reach,
+    ResidualStack,
+    fast,
+    proposal_stem,
 )
-from sorvolo.lab.training.faster_rcnn import FasterRCNN, Reach
-from sorvolo.lab.training.feature_pyramid import Pyramid
-from sorvolo.lab.training.heads import TwoLayerHead, pooled_levels, roi_align
-from sorvolo.lab.training.joint import JointSettings, JointTraining
-from sorvolo.lab.training.losses import (
+from sorvolo.lab.training.joint import (
     Answer,
+    JointSettings,
+    JointTraining,
     joint_proposal_loss,
     match_boxes,
     region_loss,
 )
 from sorvolo.lab.training.onnx_export import check_export, export_onnx
-from sorvolo.lab.training.presets import fast
-from sorvolo.lab.training.proposals import (
-    AnchorSettings,
-    ProposalNetwork,
-    Proposed,
-    ResidualStack,
-    proposal_stem,
+from sorvolo.lab.training.regions import (
+    TwoLayerHead,
+    boxes_from_offsets,
+    iou_matrix,
+    offsets_from_boxes,
+    pooled_levels,
+    roi_align,
+    suppress,
+    suppress_all_pairs,
 )
-from sorvolo.lab.training.samples import Augmentation, Sample, Share, cut_sample
-from sorvolo.lab.training.sprites import paste_small_objects
+from sorvolo.lab.training.samples import (
+    Augmentation,
+    Share,
+    TrainingSample,
+    cut_sample,
+    paste_small_objects,
+)
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 
 _SIDE_PX = 64
@@ -78,7 +86,7 @@ class _TinyBackbone(torch.nn.Module):
 def tiny(stem="extended-residual"):
     torch.manual_seed(5)
     backbone = _TinyBackbone()
-    neck = Pyramid(backbone.channels, 16, light=True)
+    neck = FeaturePyramid(backbone.channels, 16, light=True)
     anchors = (AnchorSettings((8, 14)), AnchorSettings((22, 32)))
     proposals = ProposalNetwork(neck.channels, backbone.strides, anchors, stem, 16, light=True)
     return FasterRCNN(
@@ -112,7 +120,9 @@ def squares(count, seed):
             boxes.append((x, y, x + side, y + side))
             labels.append(label)
         known = np.ones(2, bool)
-        out.append(Sample(image, np.array(boxes, float), np.array(labels), np.zeros((0, 4)), known))
+        out.append(
+            TrainingSample(image, np.array(boxes, float), np.array(labels), np.zeros((0, 4)), known)
+        )
     return out
 
 

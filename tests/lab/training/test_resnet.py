@@ -7,8 +7,8 @@ torch = pytest.importorskip("torch")
 
 from numpy.typing import NDArray
 
-from sorvolo.lab.training.keras_resnet import resnet50_from_keras
-from sorvolo.lab.training.resnet import FrozenNorm, ResNet50, load_stage, resnet_stage
+from sorvolo.lab.training.backbones import FrozenNorm, ResNet50, load_stage, resnet_stage
+from sorvolo.lab.training.weights import resnet50_from_keras
 
 Array = NDArray[np.float32]
 _STAGES = {2: (64, 3), 3: (128, 4), 4: (256, 6), 5: (512, 3)}

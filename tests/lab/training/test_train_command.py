@@ -18,9 +18,9 @@ from square_pictures import labelled_squares
 from sorvolo.cli.main import main
 from sorvolo.detection.detector import Detector
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.lab.training.checkpoint import read_checkpoint
 from sorvolo.lab.training.detector import TrainingUpdate, train_detector
 from sorvolo.lab.training.page import training_page
+from sorvolo.lab.training.progress import read_checkpoint
 from sorvolo.lab.training.sets import (
     DataOptions,
     TrainingSets,

@@ -16,15 +16,15 @@ from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import find_model
 from sorvolo.errors import InputError
 from sorvolo.lab.training.detector import train_detector
-from sorvolo.lab.training.exported import ExportedModel
+from sorvolo.lab.training.onnx_export import ExportedModel
 from sorvolo.lab.training.sets import DataOptions
 from sorvolo.lab.training.settings import TrainSettings
 from sorvolo.lab.training.start import (
+    begin_notices,
+    kept_notices,
     kept_on_request,
     kept_thermal_by,
     load_start,
-    part_notices,
-    threshold_notices,
 )
 
 _BRIEFLY = ("--batch", "2", "--side", "64", "--val", "0.25")
@@ -32,7 +32,7 @@ _BRIEFLY = ("--batch", "2", "--side", "64", "--val", "0.25")
 
 def _settle_by_a_hundred(patch: pytest.MonkeyPatch) -> None:
     """So many of the pictures settle a model's norms: by a memory of 6 MP it would be 1500 of this size."""
-    patch.setattr("sorvolo.lab.training.starting._SETTLING_PX", 100 * 64 * 64)
+    patch.setattr("sorvolo.lab.training.start._SETTLING_PX", 100 * 64 * 64)
 
 
 @pytest.fixture(autouse=True)
@@ -170,12 +170,12 @@ def test_a_model_of_several_networks_without_its_card_keeps_no_thresholds(tmp_pa
     start = load_start(str(own), "fast")
     assert isinstance(start, ExportedModel)
     assert not start.thresholds
-    assert "NanoDet's network" in part_notices(start)[0]
-    (notice,) = threshold_notices(start, ("car", "boat"))
+    assert "NanoDet's network" in begin_notices(start, start.info.classes)[0]
+    notice = kept_notices(start, ("car", "boat"), ())[0]
     assert "the scores from which car are reported are not calibrated" in notice
     packaged = load_start("thermal", "fast")
     assert isinstance(packaged, ExportedModel)
-    assert set(packaged.thresholds) == set(packaged.classes)
+    assert set(packaged.thresholds) == set(packaged.info.classes)
     by_day = load_start("default", "fast")
     assert isinstance(by_day, ExportedModel)
     softening = (
@@ -183,7 +183,7 @@ def test_a_model_of_several_networks_without_its_card_keeps_no_thresholds(tmp_pa
     )
     assert (
         softening in by_day.left
-        and softening in part_notices(by_day)[0]
+        and softening in begin_notices(by_day, by_day.info.classes)[0]
         and softening not in packaged.left
     )
 

@@ -3,26 +3,141 @@
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats
-from sorvolo.lab.datasets.groups import group_of
-from sorvolo.lab.datasets.naming import LOOK_ALIKES, Naming, nothing_maps, of_one_unnamed, plain
 from sorvolo.lab.datasets.parsed import (
     SHARES,
-    Finding,
+    LabelFinding,
     ParsedBox,
     ParsedPicture,
     ParsedSet,
     findings_in,
     notices_of,
+    shown_size_px,
 )
-from sorvolo.lab.datasets.picture_files import shown_size_px
+from sorvolo.lab.datasets.splits import group_of
 from sorvolo.survey.flight import Notice
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
+from sorvolo.survey.objects import CLASSES
+
+PERSON, CAR, SMALL = CLASSES
+
+DEFAULT_CLASSES: Mapping[str, str] = {
+    name: label
+    for label, names in (
+        (
+            PERSON,
+            "person, persons, people, pedestrian, pedestrians, human, humans, man, woman, child, swimmer, victim, mannequin",
+        ),
+        (CAR, "car, cars, vehicle, vehicles, van, minivan, minibus, suv, taxi, pickup, automobile"),
+        (
+            SMALL,
+            "small object, small objects, box, small box, big box, suitcase, metal suitcase, bag, backpack, handbag, luggage, tire, tyre, gas bottle",
+        ),
+    )
+    for name in names.split(", ")
+}
+"""Common names and the class they stand for unless the user maps them; compared as `plain` writes them."""
+
+LOOK_ALIKES = frozenset(
+    [
+        "truck",
+        "lorry",
+        "bus",
+        "othervehicle",
+        "other vehicle",
+        "biker",
+        "bicyclist",
+        "cyclist",
+        "rider",
+        "motorcyclist",
+        "skater",
+        "bicycle",
+        "bike",
+        "motor",
+        "motorcycle",
+        "motorbike",
+        "scooter",
+        "tricycle",
+        "awning tricycle",
+        "cart",
+    ]
+)
+"""Names of what looks like a class of ours but is none: calling a truck a car, or a cyclist a person, is neither right
+nor wrong."""
+
+DEFAULT_IGNORED = LOOK_ALIKES | {
+    "ignored regions",
+    "ignored",
+    "ignore",
+    "dontcare",
+    "dont care",
+    "others",
+    "crowd",
+}
+"""Names that become regions where nothing counts: look-alikes, and what a set ignores itself."""
+
+
+def plain(name: str) -> str:
+    """A name for comparison: lower case, single spaces for any of space, underscore and hyphen."""
+    return " ".join(name.lower().replace("_", " ").replace("-", " ").replace("'", "").split())
+
+
+@dataclass(frozen=True)
+class Naming:
+    """`targets` gives our class of a plain name, `ignored` holds the plain names that become ignored regions."""
+
+    targets: Mapping[str, str]
+    ignored: frozenset[str]
+
+    def classes(self, names: Iterable[str]) -> tuple[str, ...]:
+        """Our classes that these names of the set stand for: the usual ones first, in the order of `CLASSES`."""
+        found = {self.targets[plain(name)] for name in names if self.is_target(name)}
+        usual = [each for each in CLASSES if each in found]
+        return (*usual, *sorted(found - set(CLASSES)))
+
+    def is_target(self, name: str) -> bool:
+        """Whether a name of the set becomes a class."""
+        return plain(name) in self.targets and not self.is_ignored(name)
+
+    def target(self, name: str) -> str:
+        """Our class of a name that becomes one."""
+        return self.targets[plain(name)]
+
+    def is_ignored(self, name: str) -> bool:
+        """Whether a name of the set becomes an ignored region."""
+        return plain(name) in self.ignored
+
+
+def of_one_unnamed(names: Naming) -> Naming:
+    """The naming of a set whose one class has the number 0 and no name, where the user looks for one class only."""
+    targets = set(names.targets.values())
+    return (
+        Naming({**names.targets, "0": targets.pop()}, names.ignored) if len(targets) == 1 else names
+    )
+
+
+def naming(classes: Mapping[str, str] | None, ignore: Iterable[str]) -> Naming:
+    """What the user asked for; without `classes` the usual names are known and their look-alikes ignored."""
+    asked = frozenset(plain(name) for name in ignore)
+    if classes is None:
+        return Naming(DEFAULT_CLASSES, asked | DEFAULT_IGNORED)
+    return Naming({plain(name): target for name, target in classes.items()}, asked)
+
+
+def nothing_maps(place: str, counts: Mapping[str, int], known: Iterable[str]) -> InputError:
+    """The error for a set none of whose names becomes a class."""
+    found = ", ".join(f"{name} ({count} boxes)" for name, count in counts.items()) or "none"
+    return InputError(
+        f"{place}: none of its class names ({found}) is one of those looked for ({', '.join(sorted(known))}); state "
+        f"which stand for which class, such as --classes {next(iter(counts), 'name')}=person"
+    )
+
 
 _SAME_SHAPE = 0.01  # of the aspect: thumbnails and halved frames are rounded to whole pixels
 _CLIPPED_PX = 1.5  # less is rounding, or counting from 1
@@ -80,13 +195,13 @@ def _labelled(
     names: Naming,
     classes: tuple[str, ...],
     pattern: re.Pattern[str] | None,
-) -> tuple[LabelledPicture | None, list[Finding]]:
+) -> tuple[LabelledPicture | None, list[LabelFinding]]:
     """The picture in our classes, None where it cannot be used; what was wrong with it or its boxes."""
     name = parsed.path.name
     try:
         width_px, height_px, orientation = shown_size_px(parsed.path)
     except InputError:
-        return None, [Finding("unreadable_pictures", name)]
+        return None, [LabelFinding("unreadable_pictures", name)]
     edges = np.array([box[1:5] for box in parsed.boxes], np.float64).reshape(-1, 4)
     fitted, scaling = _in_picture_px(
         edges, parsed.labelled_size, (width_px, height_px), orientation, name
@@ -131,7 +246,7 @@ def _in_picture_px(
     shown_px: tuple[int, int],
     orientation: int,
     name: str,
-) -> tuple[Floats | None, list[Finding]]:
+) -> tuple[Floats | None, list[LabelFinding]]:
     """Edges, (N, 4), in pixels of the picture as it is shown; None when the labels are of another shape.
 
     Labels drawn on a picture as stored, before its EXIF orientation, are turned with it.
@@ -144,9 +259,9 @@ def _in_picture_px(
             return _in_picture_px(
                 turned(edges, labelled, orientation), labelled[::-1], shown_px, 1, name
             )
-        return None, [Finding("other_size", name)]
+        return None, [LabelFinding("other_size", name)]
     fitted = edges * np.tile(np.divide(shown_px, labelled), 2)
-    return fitted, [Finding("scaled_labels", name)] if is_scaled else []
+    return fitted, [LabelFinding("scaled_labels", name)] if is_scaled else []
 
 
 def turned(edges: Floats, stored_size: tuple[float, float], orientation: int) -> Floats:
@@ -168,7 +283,7 @@ def _same_shape(size: tuple[float, float], other: tuple[float, float]) -> bool:
 
 def _clipped(
     edges_px: Floats, width_px: int, height_px: int, name: str
-) -> tuple[Floats, list[bool], list[Finding]]:
+) -> tuple[Floats, list[bool], list[LabelFinding]]:
     """Edges within the picture, which boxes are worth keeping, and what was wrong with the others."""
     with np.errstate(invalid="ignore"):
         sides = edges_px[:, 2:] - edges_px[:, :2]
@@ -184,9 +299,9 @@ def _clipped(
         inside,
         list(~empty & ~outside),
         [
-            Finding("empty_boxes", name, int(empty.sum())),
-            Finding("outside_boxes", name, int(outside.sum())),
-            Finding("clipped_boxes", name, int((moved & ~empty & ~outside).sum())),
+            LabelFinding("empty_boxes", name, int(empty.sum())),
+            LabelFinding("outside_boxes", name, int(outside.sum())),
+            LabelFinding("clipped_boxes", name, int((moved & ~empty & ~outside).sum())),
         ],
     )
 

@@ -9,9 +9,16 @@ from pathlib import Path, PureWindowsPath
 from typing import Any
 
 from sorvolo.errors import InputError
-from sorvolo.lab.datasets.parsed import Finding, ParsedBox, ParsedPicture, ParsedSet, joined
-from sorvolo.lab.datasets.picture_files import PICTURE_ENDINGS, pictures_below
-from sorvolo.lab.datasets.text_files import read_text
+from sorvolo.lab.datasets.parsed import (
+    PICTURE_ENDINGS,
+    LabelFinding,
+    ParsedBox,
+    ParsedPicture,
+    ParsedSet,
+    joined,
+    pictures_below,
+    read_text,
+)
 
 FORM = "COCO"
 _VIDEO_FIELDS = ("video_id", "video", "flight", "sequence", "seq_id", "clip")
@@ -126,16 +133,16 @@ def _rows(whole: Mapping[str, Any], key: str, path: Path) -> list[dict[str, Any]
 
 def _boxes(
     rows: Iterable[Mapping[str, Any]], categories: Mapping[Any, str], images: Container[Any]
-) -> tuple[dict[Any, list[ParsedBox]], list[Finding]]:
+) -> tuple[dict[Any, list[ParsedBox]], list[LabelFinding]]:
     """The boxes of each image, by its id; what was wrong with the others."""
     boxes: dict[Any, list[ParsedBox]] = {}
     findings = []
     for row in rows:
         box = _box(row, categories)
         if box is None:
-            findings.append(Finding("malformed_labels", f"annotation {row.get('id')}"))
+            findings.append(LabelFinding("malformed_labels", f"annotation {row.get('id')}"))
         elif row.get("image_id") not in images:
-            findings.append(Finding("labels_without_picture", f"annotation {row.get('id')}"))
+            findings.append(LabelFinding("labels_without_picture", f"annotation {row.get('id')}"))
         else:
             boxes.setdefault(row["image_id"], []).append(box)
     return boxes, findings
@@ -176,7 +183,7 @@ def _finite(value: Any) -> list[float]:
 
 def _pictures(
     path: Path, images: Mapping[Any, Mapping[str, Any]], boxes: Mapping[Any, list[ParsedBox]]
-) -> tuple[list[ParsedPicture], list[Finding]]:
+) -> tuple[list[ParsedPicture], list[LabelFinding]]:
     """The images whose picture is there, and those that have none."""
     pictures, findings = [], []
     folders = _folders(path)
@@ -188,7 +195,9 @@ def _pictures(
         found = _found(name, folders, by_name) if name else None
         if found is None:
             findings.append(
-                Finding("labels_without_picture", name or f"image {image_id} without file_name")
+                LabelFinding(
+                    "labels_without_picture", name or f"image {image_id} without file_name"
+                )
             )
             continue
         pictures.append(

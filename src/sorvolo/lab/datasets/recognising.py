@@ -3,8 +3,7 @@
 from pathlib import Path
 
 from sorvolo.lab.datasets.coco import coco_files
-from sorvolo.lab.datasets.picture_files import files_below
-from sorvolo.lab.datasets.text_files import is_label_file, read_text
+from sorvolo.lab.datasets.parsed import files_below, is_label_file, read_text
 from sorvolo.lab.datasets.visdrone import looks_like_visdrone
 from sorvolo.lab.datasets.voc import looks_like_voc
 from sorvolo.lab.datasets.yolo import looks_like_yolo
@@ -16,19 +15,15 @@ _PARTS = frozenset({"images", "train", "val", "valid", "test"})
 def form_of(place: Path) -> str | None:
     """The form's name among READERS; None for what is of none of them."""
     if place.is_file():
-        return _form_of_file(place)
+        ending = place.suffix.lower()
+        known = {".json": "coco", ".yaml": "yolo", ".yml": "yolo", ".xml": "voc"}
+        return known.get(ending) or (_form_of_text(place) if ending == ".txt" else None)
     if coco_files(place):
         return "coco"
     if any(looks_like_voc(path) for path in files_below(place, ".xml")[:_MOST_LOOKED_AT]):
         return "voc"
     found = (_form_of_text(path) for path in _label_texts(place)[:_MOST_LOOKED_AT])
     return next((form for form in found if form), None)
-
-
-def _form_of_file(path: Path) -> str | None:
-    ending = path.suffix.lower()
-    known = {".json": "coco", ".yaml": "yolo", ".yml": "yolo", ".xml": "voc"}
-    return known.get(ending) or (_form_of_text(path) if ending == ".txt" else None)
 
 
 def _label_texts(folder: Path) -> list[Path]:

@@ -3,6 +3,7 @@
 import re
 from collections import Counter
 from collections.abc import Hashable, Mapping, Sequence
+from pathlib import Path, PurePath
 from typing import TypeVar
 
 import numpy as np
@@ -76,14 +77,15 @@ def split_by_blocks(
         smaller = [row for other in by_share[by_share.index(part) + 1 :] for row in members[other]]
         kept = _far_from(members[part], smaller, places, gap)
         text = f"{{}} pictures of {part} are within {gap} frames of another part and were left out"
-        parts[part] = _part_of(labelled, kept, len(members[part]) - len(kept), text)
+        left_out = len(members[part]) - len(kept)
+        notices = (
+            (Notice("left_out_at_borders", left_out, text.format(left_out)),) if left_out else ()
+        )
+        pictures = tuple(labelled.pictures[row] for row in kept)
+        parts[part] = LabelledSet(
+            labelled.name, labelled.classes, pictures, labelled.unlabelled, notices
+        )
     return parts
-
-
-def _part_of(labelled: LabelledSet, rows: Sequence[int], left_out: int, text: str) -> LabelledSet:
-    notices = (Notice("left_out_at_borders", left_out, text.format(left_out)),) if left_out else ()
-    pictures = tuple(labelled.pictures[row] for row in rows)
-    return LabelledSet(labelled.name, labelled.classes, pictures, labelled.unlabelled, notices)
 
 
 def shared_groups(first: LabelledSet, second: LabelledSet) -> tuple[Notice, ...]:
@@ -210,3 +212,116 @@ def _far_from(
         if sequence not in taken or np.abs(np.array(taken[sequence]) - number).min() > gap:
             kept.append(row)
     return kept
+
+
+_BLOCKS, _GAP = (
+    10,
+    10,
+)  # into which a set of too few videos is cut; frames left out between them, at most
+
+
+def hold_out(
+    labelled: LabelledSet, share: float, seed: int
+) -> tuple[LabelledSet, LabelledSet, list[str]]:
+    """What is learnt from, what is held out, and notices about that; whole videos wherever there are enough.
+
+    `sorvolo train --val SHARE` and `read_sets` take it from here. Raises
+    SettingsError for a share outside 0 to below 1.
+    """
+    if not 0 <= share < 1:
+        raise SettingsError(f"the share to hold out must lie in 0 to below 1, got {share}")
+    shares = {"learnt": 1 - share, "held out": share}
+    empty = labelled.only([])
+    if share == 0:
+        return labelled, empty, []
+    try:
+        parts = split_by_group(labelled, shares, seed)
+        if share / 3 <= len(parts["held out"]) / len(labelled) <= min(3 * share, (1 + share) / 2):
+            return parts["learnt"], parts["held out"], []
+    except InputError:
+        pass  # too few videos: blocks of frames are held out below
+    block = max(1, len(labelled) // _BLOCKS)
+    try:
+        parts = split_by_blocks(labelled, shares, block, min(_GAP, block // 2), seed)
+    except InputError as error:
+        return labelled, empty, [f"nothing of {labelled.name} is held out: {error}"]
+    text = (
+        f"{labelled.name} has too few videos to hold whole ones out: blocks of about {block} neighbouring frames were "
+        "instead; frames of one video look alike, so the score will be too good"
+    )
+    remarks = [
+        f"{labelled.name}: {notice.text}" for each in parts.values() for notice in each.notices
+    ]
+    return parts["learnt"], parts["held out"], [text, *remarks]
+
+
+_NUMBERED = re.compile(
+    r"(?P<video>.*?)[ _.\-]*(?:(?<![a-z])(?:frames?|img|image|picture|[if]))?[ _.\-]*\(?\d+\)?[ _.\-]*",
+    re.IGNORECASE,
+)
+_PLAIN_FOLDERS = frozenset(
+    [
+        "images",
+        "image",
+        "imgs",
+        "img",
+        "jpegimages",
+        "pictures",
+        "photos",
+        "frames",
+        "labels",
+        "annotations",
+        "data",
+        "obj_train_data",
+        "sequences",
+        "train",
+        "training",
+        "val",
+        "valid",
+        "validation",
+        "test",
+        "testing",
+    ]
+)
+
+
+def compiled(pattern: str) -> re.Pattern[str]:
+    """A user's pattern. Raises SettingsError when it is none, or has not exactly one group."""
+    try:
+        found = re.compile(pattern)
+    except re.error as error:
+        raise SettingsError(
+            f"group pattern {pattern!r} is no regular expression: {error}"
+        ) from error
+    if found.groups != 1:
+        raise SettingsError(
+            f"group pattern {pattern!r} has {found.groups} groups; mark the video's name with exactly one (...)"
+        )
+    return found
+
+
+def group_of(path: Path, place: Path, pattern: re.Pattern[str] | None = None) -> str:
+    """The picture's video: the folders below `place` that name something, then the file's name up to its last number.
+
+    "bb_V0014_I0003160_jpg.rf.1f.jpg" is of "bb_V0014"; "flight1/photos/DJI_0031.JPG" of "flight1/DJI"; a name without
+    a number is a video of its own. A `pattern` is searched in the path below `place`, with "/" between folders, and
+    its one group is the answer where it is found.
+    """
+    below = _below(path, place)
+    if pattern is not None and (match := pattern.search(below.as_posix())) and match.group(1):
+        return match.group(1)
+    stem = stem_of(below.name)
+    numbered = _NUMBERED.fullmatch(stem)
+    folders = [
+        part for part in below.parts[:-1] if part.lower() not in _PLAIN_FOLDERS and part != ".."
+    ]
+    video = numbered["video"] if numbered else stem
+    return "/".join([*folders, video] if video else folders) or place.name
+
+
+def _below(path: Path, place: Path) -> PurePath:
+    folder = place if place.is_dir() else place.parent
+    try:
+        return path.relative_to(folder)
+    except ValueError:  # pictures beside the labels' folder
+        return PurePath(*path.parts[-3:])

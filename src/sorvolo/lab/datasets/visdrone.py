@@ -5,10 +5,20 @@ from pathlib import Path
 from typing import TypeAlias
 
 from sorvolo.errors import InputError
-from sorvolo.lab.datasets.pairing import frames_by_video, no_frames, paired, pictures_around
-from sorvolo.lab.datasets.parsed import Finding, ParsedBox, ParsedPicture, ParsedSet, findings_in
-from sorvolo.lab.datasets.picture_files import files_below
-from sorvolo.lab.datasets.text_files import is_label_file, read_text
+from sorvolo.lab.datasets.parsed import (
+    LabelFinding,
+    ParsedBox,
+    ParsedPicture,
+    ParsedSet,
+    files_below,
+    findings_in,
+    frames_by_video,
+    is_label_file,
+    no_frames,
+    paired,
+    pictures_around,
+    read_text,
+)
 
 FORM = "VisDrone"
 NAMES = (
@@ -51,7 +61,17 @@ def read_visdrone(place: Path) -> ParsedSet:
     rows = {
         path: found for path, (found, _) in parsed.items() if found or not read_text(path).strip()
     }
-    length = _numbers_a_line(place, rows)
+    # 8 (DET) or 10 (VID). Raises InputError for no line, and for lines of both lengths
+    lengths = {len(row) for found in rows.values() for row in found}
+    if not lengths:
+        raise InputError(
+            f"{place}: no line is a VisDrone label (8 or 10 whole numbers with commas)"
+        )
+    if len(lengths) > 1:
+        raise InputError(
+            f"{place}: lines of 8 and of 10 numbers; read pictures (DET) and videos (VID) one by one"
+        )
+    length = lengths.pop()
     pictures = pictures_around(place, FORM)
     read = _video_frames if length == _VID else _separate_pictures
     labelled, lonely = read(place, rows, pictures)
@@ -63,29 +83,15 @@ def looks_like_visdrone(line: str) -> bool:
     return _LINE.fullmatch(line) is not None
 
 
-def _rows(path: Path) -> tuple[list[list[int]], list[Finding]]:
+def _rows(path: Path) -> tuple[list[list[int]], list[LabelFinding]]:
     """The numbers of the file's lines, and the lines that are no labels."""
     rows, findings = [], []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         if looks_like_visdrone(line) and len(line) < 300:
             rows.append([int(word) for word in line.strip().strip(",").split(",")])
         elif line.strip():
-            findings.append(Finding("malformed_labels", f"{path.name}, line {number}"))
+            findings.append(LabelFinding("malformed_labels", f"{path.name}, line {number}"))
     return rows, findings
-
-
-def _numbers_a_line(place: Path, rows: _RowsByFile) -> int:
-    """8 (DET) or 10 (VID). Raises InputError for no line, and for lines of both lengths."""
-    lengths = {len(row) for found in rows.values() for row in found}
-    if not lengths:
-        raise InputError(
-            f"{place}: no line is a VisDrone label (8 or 10 whole numbers with commas)"
-        )
-    if len(lengths) > 1:
-        raise InputError(
-            f"{place}: lines of 8 and of 10 numbers; read pictures (DET) and videos (VID) one by one"
-        )
-    return lengths.pop()
 
 
 def _box(row: list[int]) -> ParsedBox:
@@ -98,7 +104,7 @@ def _box(row: list[int]) -> ParsedBox:
 
 def _separate_pictures(
     place: Path, rows: _RowsByFile, pictures: list[Path]
-) -> tuple[tuple[ParsedPicture, ...], list[Finding]]:
+) -> tuple[tuple[ParsedPicture, ...], list[LabelFinding]]:
     label_of, lonely = paired(pictures, rows, place, FORM)
     result = []
     for path in pictures:
@@ -114,7 +120,7 @@ def _separate_pictures(
 
 def _video_frames(
     place: Path, rows: _RowsByFile, pictures: list[Path]
-) -> tuple[tuple[ParsedPicture, ...], list[Finding]]:
+) -> tuple[tuple[ParsedPicture, ...], list[LabelFinding]]:
     frames = frames_by_video(pictures, [path.stem for path in rows])
     if not any(frames.values()):
         raise no_frames(place, FORM, frames)
@@ -129,7 +135,7 @@ def _video_frames(
             else:
                 lonely.add(row[0])
         findings.append(
-            Finding(
+            LabelFinding(
                 "labels_without_picture",
                 f"{path.stem}, frame {min(lonely, default=0)}",
                 len(lonely),

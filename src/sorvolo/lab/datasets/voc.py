@@ -9,10 +9,16 @@ from defusedxml import ElementTree
 from defusedxml.common import DefusedXmlException
 
 from sorvolo.errors import InputError
-from sorvolo.lab.datasets.pairing import paired, pictures_around
-from sorvolo.lab.datasets.parsed import Finding, ParsedBox, ParsedPicture, ParsedSet
-from sorvolo.lab.datasets.picture_files import files_below
-from sorvolo.lab.datasets.text_files import read_text
+from sorvolo.lab.datasets.parsed import (
+    LabelFinding,
+    ParsedBox,
+    ParsedPicture,
+    ParsedSet,
+    files_below,
+    paired,
+    pictures_around,
+    read_text,
+)
 
 FORM = "Pascal VOC"
 
@@ -32,11 +38,16 @@ def read_voc(place: Path) -> ParsedSet:
     findings += lonely
     from_zero = any(min(box.left, box.top) < 0 for each in labelled.values() for box in each.boxes)
     if from_zero:
-        findings.append(Finding("counted_from_zero", str(place), len(labelled)))
+        findings.append(LabelFinding("counted_from_zero", str(place), len(labelled)))
     result = []
     for path in pictures:
         found = labelled[label_of[path]] if path in label_of else ParsedPicture(path, ())
-        boxes = _counted_from_zero(found.boxes) if from_zero else found.boxes
+        # Boxes that were read as counted from 1, as they are when edges are counted from 0
+        boxes = (
+            tuple(box._replace(left=box.left + 1, top=box.top + 1) for box in found.boxes)
+            if from_zero
+            else found.boxes
+        )
         result.append(replace(found, path=path, boxes=boxes))
     return ParsedSet(FORM, tuple(result), findings=tuple(findings))
 
@@ -46,7 +57,7 @@ def looks_like_voc(path: Path) -> bool:
     return "<annotation" in read_text(path)[:2000]
 
 
-def _annotations(place: Path) -> tuple[dict[Path, ParsedPicture], list[Finding]]:
+def _annotations(place: Path) -> tuple[dict[Path, ParsedPicture], list[LabelFinding]]:
     """Every XML file of this form, and what of them is none. Raises InputError when there is none."""
     files = [place] if place.is_file() else files_below(place, ".xml")
     labelled: dict[Path, ParsedPicture] = {}
@@ -54,17 +65,12 @@ def _annotations(place: Path) -> tuple[dict[Path, ParsedPicture], list[Finding]]
     for path in files:
         picture, malformed = _parsed(path)
         if malformed:
-            findings.append(Finding("malformed_labels", path.name, malformed))
+            findings.append(LabelFinding("malformed_labels", path.name, malformed))
         if picture is not None:
             labelled[path] = picture
     if not labelled:
         raise InputError(f"{place}: none of its {len(files)} XML files is a {FORM} annotation")
     return labelled, findings
-
-
-def _counted_from_zero(boxes: tuple[ParsedBox, ...]) -> tuple[ParsedBox, ...]:
-    """Boxes that were read as counted from 1, as they are when edges are counted from 0."""
-    return tuple(box._replace(left=box.left + 1, top=box.top + 1) for box in boxes)
 
 
 def _parsed(path: Path) -> tuple[ParsedPicture | None, int]:

@@ -7,15 +7,18 @@ from pathlib import Path
 
 from sorvolo.errors import InputError
 from sorvolo.lab.datasets.parsed import (
+    PICTURE_ENDINGS,
     SHARES,
-    Finding,
+    LabelFinding,
     ParsedBox,
     ParsedPicture,
     ParsedSet,
+    files_below,
     findings_in,
+    is_label_file,
+    pictures_below,
+    read_text,
 )
-from sorvolo.lab.datasets.picture_files import PICTURE_ENDINGS, files_below, pictures_below
-from sorvolo.lab.datasets.text_files import is_label_file, read_text
 
 FORM = "YOLO"
 _NAME_FILES = (
@@ -41,7 +44,14 @@ def read_yolo(place: Path) -> ParsedSet:
     names = _names(place, folder)
     pictures = pictures_below(folder)
     labels = {path: found for path in pictures if (found := _label_file(path)) is not None}
-    _demand_both(folder, pictures, labels)
+    if not pictures:
+        endings = ", ".join(sorted(PICTURE_ENDINGS))
+        raise InputError(f"{folder} holds no pictures ({endings}); YOLO needs images/ and labels/")
+    if not labels:
+        raise InputError(
+            f"{folder}: none of its {len(pictures)} pictures has a label file of the same name, beside it or in a "
+            f"folder labels/ beside images/ (such as labels/{pictures[0].stem}.txt)"
+        )
     read = {path: _boxes(labels[path], names) if path in labels else ([], []) for path in pictures}
     malformed = findings_in(read.values())
     _demand_shares(folder, [box for boxes, _ in read.values() for box in boxes], malformed)
@@ -68,22 +78,19 @@ def names_in_yaml(text: str) -> list[str]:
         return []
     body = re.sub(r"(^|\s)#.*", "", match.group(1)).strip()
     named: dict[int, str] = {}
-    for index, item in enumerate(_yaml_items(body)):
+    # The entries of a list or mapping, in brackets or one a line; empty ones are left out
+    if body.startswith(("[", "{")):
+        items = [item.strip() for item in body.strip("[]{} \n").replace("\n", " ").split(",")]
+    else:
+        items = [line.strip().removeprefix("- ").strip() for line in body.splitlines()]
+    yaml_items = [item for item in items if item]
+    for index, item in enumerate(yaml_items):
         numbered = re.fullmatch(r"['\"]?(\d{1,6})['\"]?\s*:\s*(.*)", item)
         number, name = (int(numbered[1]), numbered[2]) if numbered else (index, item)
         named[number] = name.strip().strip("'\"")
     if not named or max(named) > 100_000:
         return []
     return [named.get(number, str(number)) for number in range(max(named) + 1)]
-
-
-def _yaml_items(body: str) -> list[str]:
-    """The entries of a list or mapping, in brackets or one a line; empty ones are left out."""
-    if body.startswith(("[", "{")):
-        items = [item.strip() for item in body.strip("[]{} \n").replace("\n", " ").split(",")]
-    else:
-        items = [line.strip().removeprefix("- ").strip() for line in body.splitlines()]
-    return [item for item in items if item]
 
 
 def _names(place: Path, folder: Path) -> list[str]:
@@ -134,18 +141,9 @@ def _label_file(picture: Path) -> Path | None:
     return beside if beside.is_file() and is_label_file(beside) else None
 
 
-def _demand_both(folder: Path, pictures: list[Path], labels: dict[Path, Path]) -> None:
-    if not pictures:
-        endings = ", ".join(sorted(PICTURE_ENDINGS))
-        raise InputError(f"{folder} holds no pictures ({endings}); YOLO needs images/ and labels/")
-    if not labels:
-        raise InputError(
-            f"{folder}: none of its {len(pictures)} pictures has a label file of the same name, beside it or in a "
-            f"folder labels/ beside images/ (such as labels/{pictures[0].stem}.txt)"
-        )
-
-
-def _demand_shares(folder: Path, boxes: Sequence[ParsedBox], malformed: Sequence[Finding]) -> None:
+def _demand_shares(
+    folder: Path, boxes: Sequence[ParsedBox], malformed: Sequence[LabelFinding]
+) -> None:
     far = sum(max(abs(edge) for edge in box[1:5]) > _FARTHEST_SHARE for box in boxes)
     if far > len(boxes) / 2:
         raise InputError(
@@ -159,15 +157,15 @@ def _demand_shares(folder: Path, boxes: Sequence[ParsedBox], malformed: Sequence
         )
 
 
-def _lonely(folder: Path, pictures: list[Path], labels: dict[Path, Path]) -> Iterator[Finding]:
+def _lonely(folder: Path, pictures: list[Path], labels: dict[Path, Path]) -> Iterator[LabelFinding]:
     """Label files of no picture, and pictures without a label file."""
     used = set(labels.values())
     for path in files_below(folder, ".txt"):
         if path not in used and is_label_file(path) and _is_label_place(path, folder):
-            yield Finding("labels_without_picture", path.name)
+            yield LabelFinding("labels_without_picture", path.name)
     for path in pictures:
         if path not in labels:
-            yield Finding("pictures_without_labels", path.name)
+            yield LabelFinding("pictures_without_labels", path.name)
 
 
 def _is_label_place(path: Path, folder: Path) -> bool:
@@ -178,7 +176,7 @@ def _is_label_place(path: Path, folder: Path) -> bool:
     return looks_like_yolo(first)
 
 
-def _boxes(path: Path, names: list[str]) -> tuple[list[ParsedBox], list[Finding]]:
+def _boxes(path: Path, names: list[str]) -> tuple[list[ParsedBox], list[LabelFinding]]:
     """The file's boxes, and its lines that are no labels."""
     boxes, findings = [], []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
@@ -186,7 +184,7 @@ def _boxes(path: Path, names: list[str]) -> tuple[list[ParsedBox], list[Finding]
             continue
         numbers = _numbers(line)
         if len(numbers) < 5 or numbers[0] != int(numbers[0]) or numbers[0] < 0:
-            findings.append(Finding("malformed_labels", f"{path.name}, line {number}"))
+            findings.append(LabelFinding("malformed_labels", f"{path.name}, line {number}"))
             continue
         label = int(numbers[0])
         name = names[label] if label < len(names) else str(label)

@@ -9,11 +9,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.errors import InputError, SettingsError
+from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, Mask, PointsM, TimesNs, frozen
-from sorvolo.geometry.polygons import points_inside, signed_area
+from sorvolo.geometry.polygons import gap, points_inside, signed_area
 from sorvolo.survey.findings import ChangeKind
 
+VIDEO_VIEWS = 3
+"""So many clear views of a video let an event be announced, and make it one that must be found."""
+
+_TOLERANCE_M = 0.5  # between the centres of a report and of the true thing, or half its length where that is more
+_LATE_S = 1.0  # later than this after the view that lets it be announced is late
 _FINEST_CELL_M = 0.1  # of compared ground: finer than any outline is known
 _MOST_CELLS = 4_000_000  # of compared ground, which bounds its memory
 
@@ -66,11 +71,8 @@ class Counts:
 
 
 def pixel_counts(found: Mask, truth: Mask, unknown: Mask | None = None) -> Counts:
-    """The pixels of one frame, all (height, width) bool; `unknown` ones are counted apart.
-
-    Raises InputError when the masks differ in size.
-    """
-    found, truth, known = _checked(found, truth, unknown)
+    """The pixels of one frame, all (height, width) bool; `unknown` ones are counted apart."""
+    known = ~unknown if unknown is not None else np.ones(truth.shape, bool)
     judged = int(np.count_nonzero(known))
     tp = int(np.count_nonzero(found & truth & known))
     positives, there = int(np.count_nonzero(found & known)), int(np.count_nonzero(truth & known))
@@ -85,14 +87,13 @@ def frame_counts(
     """One frame as a whole: positive when at least `least_px` of its known pixels are changed.
 
     A frame whose true change has some pixels, but fewer than `least_px`, and a frame of which nothing is known, are
-    `unknown`. Raises InputError when the masks differ in size, SettingsError
-    for `least_px` under 1.
+    `unknown`. Raises SettingsError for `least_px` under 1.
     """
     if least_px < 1:
         raise SettingsError(
             f"a changed frame has at least 1 changed pixel, got a least of {least_px}"
         )
-    found, truth, known = _checked(found, truth, unknown)
+    known = ~unknown if unknown is not None else np.ones(truth.shape, bool)
     there = int(np.count_nonzero(truth & known))
     if 0 < there < least_px or not known.any():
         return Counts(unknown=1)
@@ -146,19 +147,6 @@ class TrueEvent:
         if self.kind is ChangeKind.MOVING:
             return int(np.count_nonzero(ground.holds(self.path_m))) >= moving_views
         return len(self.clear_ns) >= views and bool(ground.holds(self.outline_m).all())
-
-
-@dataclass(frozen=True)
-class EventSettings:
-    """When a reported event is a true one, and when it came late."""
-
-    tolerance_m: float = 0.5  # between centres, or half the thing's length where that is more
-    views: int = 3  # clear views after which an event can be announced: k of the evidence
-    late_s: float = 1.0  # later than this after that view is late
-
-    def __post_init__(self) -> None:
-        if self.tolerance_m < 0 or self.late_s < 0 or self.views < 1:
-            raise SettingsError(f"tolerances are not negative and views at least 1, got {self}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,18 +236,17 @@ class EventScores:
 def match_events(
     found: Sequence[FoundEvent],
     true: Sequence[TrueEvent],
-    settings: EventSettings = EventSettings(),
 ) -> EventMatch:
     """Pair reports with true events, each used once: those of the same kind first, then the nearest.
 
-    A report is of a true event when their outlines touch or their centres are within max(`tolerance_m`, half the
+    A report is of a true event when their outlines touch or their centres are within max(half a metre, half the
     thing's length); of something that moves, when it is that near to its path or one of its places lies within the
     report's outline.
     """
     offsets = [[_offset_m(each, truth) for truth in true] for each in found]
     near = np.array(
         [
-            [_is_near(each, truth, offsets[i][j], settings) for j, truth in enumerate(true)]
+            [_is_near(each, truth, offsets[i][j]) for j, truth in enumerate(true)]
             for i, each in enumerate(found)
         ],
         bool,
@@ -278,7 +265,7 @@ def match_events(
     is_found[[i for i, _ in needed]] = True
     return EventMatch(
         tuple(
-            EventPair(true[j], found[i], offsets[i][j], _delay_s(found[i], true[j], settings.views))
+            EventPair(true[j], found[i], offsets[i][j], _delay_s(found[i], true[j]))
             for i, j in needed
         ),
         _chosen(true, must_find & ~is_matched),
@@ -302,9 +289,7 @@ def _paired(wishes: Iterable[tuple[bool, float, int, int]]) -> dict[int, int]:
     return of_found
 
 
-def score_events(
-    match: EventMatch, compared_m2: float, settings: EventSettings = EventSettings()
-) -> EventScores:
+def score_events(match: EventMatch, compared_m2: float) -> EventScores:
     """The numbers of a match; `compared_m2` is the ground that was compared with the map."""
     still = [pair for pair in match.pairs if pair.true.kind != ChangeKind.MOVING]
     on_map = [(pair.offset_m, pair.found.sigma_m) for pair in still]
@@ -315,7 +300,7 @@ def score_events(
         must_find=len(match.pairs) + len(match.missed),
         found=len(match.pairs),
         judged_late=int(np.isfinite(delays_s).sum()),
-        late=_late(match.pairs, settings),
+        late=_late(match.pairs),
         twice=len(match.twice),
         false=len(match.false),
         optional=len(match.optional),
@@ -327,7 +312,7 @@ def score_events(
         within_two_sigma=_within_two_sigma(on_map),
         world_sigma_median_m=_sigma_median_m(in_world),
         world_within_two_sigma=_within_two_sigma(in_world),
-        by_kind={str(kind): _kind_score(match, kind, settings) for kind in ChangeKind},
+        by_kind={str(kind): _kind_score(match, kind) for kind in ChangeKind},
     )
 
 
@@ -395,13 +380,13 @@ def compared_ground(views_m: Sequence[PointsM], known_m: Sequence[PointsM]) -> C
     return ComparedGround(layers[0] & layers[1], west_m, north_m, cell_m)
 
 
-def _kind_score(match: EventMatch, kind: ChangeKind, settings: EventSettings) -> KindScore:
+def _kind_score(match: EventMatch, kind: ChangeKind) -> KindScore:
     pairs = [pair for pair in match.pairs if pair.true.kind == kind]
     return KindScore(
         len(pairs) + sum(truth.kind == kind for truth in match.missed),
         len(pairs),
         _named_right(pairs),
-        _late(pairs, settings),
+        _late(pairs),
         sum(each.kind == kind for each in match.twice),
         sum(each.kind == kind for each in match.false),
     )
@@ -411,14 +396,14 @@ def _named_right(pairs: Sequence[EventPair]) -> int:
     return sum(pair.true.kind == pair.found.kind for pair in pairs)
 
 
-def _late(pairs: Sequence[EventPair], settings: EventSettings) -> int:
-    return sum(pair.delay_s > settings.late_s for pair in pairs)
+def _late(pairs: Sequence[EventPair]) -> int:
+    return sum(pair.delay_s > _LATE_S for pair in pairs)
 
 
-def _delay_s(found: FoundEvent, truth: TrueEvent, views: int) -> float:
-    if found.announced_ns is None or len(truth.clear_ns) < views:
+def _delay_s(found: FoundEvent, truth: TrueEvent) -> float:
+    if found.announced_ns is None or len(truth.clear_ns) < VIDEO_VIEWS:
         return math.nan
-    return (found.announced_ns - int(truth.clear_ns[views - 1])) / 1e9
+    return (found.announced_ns - int(truth.clear_ns[VIDEO_VIEWS - 1])) / 1e9
 
 
 def _offset_m(found: FoundEvent, truth: TrueEvent) -> Floats:
@@ -435,32 +420,12 @@ def _offset_m(found: FoundEvent, truth: TrueEvent) -> Floats:
     return np.asarray(offsets[np.argmin((offsets**2).sum(axis=1))])
 
 
-def _is_near(
-    found: FoundEvent, truth: TrueEvent, offset_m: Floats, settings: EventSettings
-) -> bool:
-    if np.hypot(*offset_m) <= max(settings.tolerance_m, truth.length_m / 2):
+def _is_near(found: FoundEvent, truth: TrueEvent, offset_m: Floats) -> bool:
+    if np.hypot(*offset_m) <= max(_TOLERANCE_M, truth.length_m / 2):
         return True
     if len(truth.path_m):
         return bool(points_inside([found.outline_m], truth.path_m).any())
-    return _rings_touch(found.outline_m, truth.outline_m)
-
-
-def _rings_touch(a: PointsM, b: PointsM) -> bool:
-    """Whether the areas of two rings, (N, 2) and (M, 2), overlap."""
-    if (a.max(axis=0) < b.min(axis=0)).any() or (b.max(axis=0) < a.min(axis=0)).any():
-        return False
-    if points_inside([a], b).any() or points_inside([b], a).any():
-        return True
-    a0, b0 = a[:, None], b[None]
-    a1, b1 = np.roll(a, -1, axis=0)[:, None], np.roll(b, -1, axis=0)[None]
-    across_a = _side(a0, a1, b0) * _side(a0, a1, b1) < 0
-    across_b = _side(b0, b1, a0) * _side(b0, b1, a1) < 0
-    return bool((across_a & across_b).any())
-
-
-def _side(start: Floats, end: Floats, points: Floats) -> Floats:
-    along, to = end - start, points - start
-    return along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0]
+    return gap(found.outline_m, truth.outline_m) == 0
 
 
 def _centroid(ring: PointsM) -> Floats:
@@ -472,22 +437,6 @@ def _centroid(ring: PointsM) -> Floats:
     here, there = ring - middle, np.roll(ring, -1, axis=0) - middle
     cross = here[:, 0] * there[:, 1] - there[:, 0] * here[:, 1]
     return np.asarray(middle + ((here + there) * cross[:, None]).sum(axis=0) / (6 * area))
-
-
-def _checked(
-    found: Mask, truth: Mask, unknown: Mask | None
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
-    if found.shape != truth.shape or (unknown is not None and unknown.shape != truth.shape):
-        sizes = " and ".join(
-            "x".join(str(side) for side in mask.shape[::-1])
-            for mask in (found, truth, unknown)
-            if mask is not None
-        )
-        raise InputError(
-            f"masks of one frame have one size, got {sizes} pixels; compare masks of the same pictures"
-        )
-    known = np.ones(truth.shape, bool) if unknown is None else ~unknown.astype(bool)
-    return found.astype(bool), truth.astype(bool), known
 
 
 def _ratio(part: float, whole: float) -> float:

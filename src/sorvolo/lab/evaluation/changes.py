@@ -12,11 +12,11 @@ from sorvolo.geometry.arrays import Matrix3, PointsM, floats
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.geometry.level_ground import is_on_ground
 from sorvolo.lab.evaluation.change_metrics import (
+    VIDEO_VIEWS,
     ComparedGround,
     Counts,
     EventMatch,
     EventScores,
-    EventSettings,
     FoundEvent,
     TrueEvent,
     compared_ground,
@@ -38,8 +38,8 @@ from sorvolo.store.site.archive import Archive
 from sorvolo.survey.findings import ChangeKind
 from sorvolo.survey.flight import Site
 
-VIDEO_VIEWS, PHOTO_VIEWS = 3, 2
-"""So many clear views make an event one that must be found; what moves needs three in any case."""
+PHOTO_VIEWS = 2
+"""So many clear views of photos make an event one that must be found; what moves needs `VIDEO_VIEWS`."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class ClassCounts:
 
 
 @dataclass(frozen=True, eq=False)
-class FlightChanges:
+class MeasuredChanges:
     """One compared flight against the truth; what could not be measured is None, and `remarks` state why.
 
     `map_shift_m` is how far the map lies from the truth (rms over frames); it is taken out before events are matched.
@@ -70,7 +70,7 @@ class FlightChanges:
 
 def evaluate_changes(
     found: AnyPath, truth: AnyPath, *, flight: str | None = None, least_px: int = 1
-) -> tuple[FlightChanges, ...]:
+) -> tuple[MeasuredChanges, ...]:
     """Measure the compared flights of a site folder, or a folder of masks, against the truth.
 
     `truth` is a simulation's folder, the truth folder in it, or a folder of masks; `flight` one of the site's flights;
@@ -91,27 +91,18 @@ def evaluate_changes(
     if not true_flights:
         folders = [(name, _own_masks(found, name)) for name in names]
         return tuple(_masks_alone(name, folder, truth, least_px) for name, folder in folders)
-    return _against_simulation(found, names, truth, true_flights, least_px)
-
-
-def _masks_alone(name: str, found: Path, true: Path, least_px: int) -> FlightChanges:
-    """A folder of masks against another."""
-    return FlightChanges(
-        name, compare_mask_folders(found, true, least_px), None, None, math.nan, ()
-    )
-
-
-def _against_simulation(
-    found: Path, names: Sequence[str], truth: Path, true_flights: Mapping[str, Path], least_px: int
-) -> tuple[FlightChanges, ...]:
-    """The site's compared flights, as far as the truth knows them."""
+    # The site's compared flights, as far as the truth knows them
     with Archive.open(found, write=False) as archive:
         described = archive.site()
     if described.is_local:
         raise InputError(
             f"{found}: a map without geo-reference cannot be compared with a simulation's truth"
         )
-    _check_whole(found, names)
+    for path in (features_path(found / "flights" / name, "frames") for name in names):
+        if not path.is_file():
+            raise InputError(
+                f"{path} is missing: this flight is there only in part; run `sorvolo compare` again"
+            )
     flights = paired_flights(found, truth_file(truth), described)
     known = [name for name in names if flights.true_name(name) in true_flights]
     if not known:
@@ -125,53 +116,47 @@ def _against_simulation(
     )
 
 
-def as_json(measured: Sequence[FlightChanges]) -> list[dict[str, Any]]:
+def _masks_alone(name: str, found: Path, true: Path, least_px: int) -> MeasuredChanges:
+    """A folder of masks against another."""
+    return MeasuredChanges(
+        name, compare_mask_folders(found, true, least_px), None, None, math.nan, ()
+    )
+
+
+def as_json(measured: Sequence[MeasuredChanges]) -> list[dict[str, Any]]:
     """The measures with all their rates, as JSON can hold them."""
-    return [
-        {
-            "flight": each.flight,
-            "pixels": None if each.masks is None else rates(each.masks.pixels),
-            "frames": None if each.masks is None else rates(each.masks.frames),
-            "masks": None
-            if each.masks is None
-            else {
-                "compared": each.masks.compared,
-                "only_found": each.masks.only_found,
-                "only_true": each.masks.only_true,
-                "least_px": each.masks.least_px,
-            },
-            "events": None
-            if each.events is None
-            else plain_json(each.events)
-            | plain_json(
-                {
-                    "found_share": each.events.found_share,
-                    "false_per_hectare": each.events.false_per_hectare,
-                }
-            ),
-            "lists": None if each.match is None else _lists(each.match),
-            "classes": None if each.classes is None else plain_json(each.classes),
-            "map_shift_m": plain_json(each.map_shift_m),
-            "remarks": list(each.remarks),
-        }
-        for each in measured
-    ]
+    written = []
+    for each in measured:
+        masks, events = each.masks, each.events
+        counted = ("compared", "only_found", "only_true", "least_px")
+        written.append(
+            {
+                "flight": each.flight,
+                "pixels": None if masks is None else _rates(masks.pixels),
+                "frames": None if masks is None else _rates(masks.frames),
+                "masks": None
+                if masks is None
+                else {name: getattr(masks, name) for name in counted},
+                "events": None
+                if events is None
+                else plain_json(events)
+                | {
+                    name: plain_json(getattr(events, name))
+                    for name in ("found_share", "false_per_hectare")
+                },
+                "lists": None if each.match is None else _lists(each.match),
+                "classes": None if each.classes is None else plain_json(each.classes),
+                "map_shift_m": plain_json(each.map_shift_m),
+                "remarks": list(each.remarks),
+            }
+        )
+    return written
 
 
-def rates(counts: Counts) -> dict[str, float | int | None]:
+def _rates(counts: Counts) -> dict[str, float | int | None]:
     """Counts with their rates as in Tables 4.3 to 4.5, a rate that does not exist as None."""
-    values = {
-        "tp": counts.tp,
-        "fp": counts.fp,
-        "fn": counts.fn,
-        "tn": counts.tn,
-        "unknown": counts.unknown,
-        "precision": counts.precision,
-        "recall": counts.recall,
-        "accuracy": counts.accuracy,
-        "f1": counts.f1,
-    }
-    return {name: plain_json(value) for name, value in values.items()}
+    names = ("tp", "fp", "fn", "tn", "unknown", "precision", "recall", "accuracy", "f1")
+    return {name: plain_json(getattr(counts, name)) for name in names}
 
 
 def _lists(match: EventMatch) -> dict[str, Any]:
@@ -247,14 +232,6 @@ def _compared_flights(site: Path, flight: str | None) -> list[str]:
     return [flight]
 
 
-def _check_whole(site: Path, flights: Sequence[str]) -> None:
-    for path in (features_path(site / "flights" / name, "frames") for name in flights):
-        if not path.is_file():
-            raise InputError(
-                f"{path} is missing: this flight is there only in part; run `sorvolo compare` again"
-            )
-
-
 def _own_masks(site: Path, flight: str) -> Path:
     folder = site / "flights" / flight / "masks"
     if not has_masks(folder):
@@ -271,7 +248,7 @@ def _evaluate(
     flight: str,
     true_folder: Path,
     least_px: int,
-) -> FlightChanges:
+) -> MeasuredChanges:
     remarks = []
     masks = None
     if has_masks(site / "flights" / flight / "masks"):
@@ -280,45 +257,37 @@ def _evaluate(
         remarks.append(
             "no masks were written: frames and pixels are judged after `sorvolo compare` with --masks DIR"
         )
-    makers = _map_makers(site, flights, flight)
+    # The flights that made the map: those not compared themselves, which may have been laid onto it less well
+    others = [name for name in flights.mine if name != flight]
+    makers = [
+        name for name in others if not features_path(site / "flights" / name, "changes").is_file()
+    ] or others
     map_from_truth, shift_m = flights.map_from_truth(makers)
     if math.isnan(shift_m):
         remarks.append("no frame of the map is known to the truth: events are compared as they lie")
     ground = compared_ground(
         *([row.outline_m for _, row in flights.placed(names)] for names in ([flight], makers))
     )
-    settings = EventSettings(views=VIDEO_VIEWS)
+    is_photos = any(not row.name.isdecimal() for row in flights.mine[flight])
+    least_views = PHOTO_VIEWS if is_photos else VIDEO_VIEWS
     true = _read_true(
         true_folder / "events.geojson",
         described,
         map_from_truth,
         ground,
-        _least_views(flights, flight),
+        least_views,
     )
     found = _read_found(
         features_path(site / "flights" / flight, "changes"), described, flights.clock(flight)
     )
-    match = match_events(found, true, settings)
-    scores = score_events(match, ground.area_m2, settings)
+    match = match_events(found, true)
+    scores = score_events(match, ground.area_m2)
     if match.pairs and not scores.judged_late:
         remarks.append("when events were announced is not known: none is judged late")
     classes = _class_counts(
         match, features_path(site / "flights" / flight, "changes"), true_folder / "events.geojson"
     )
-    return FlightChanges(flight, masks, scores, match, shift_m, tuple(remarks), classes)
-
-
-def _map_makers(site: Path, flights: PairedFlights, flight: str) -> list[str]:
-    """The flights that made the map: those not compared themselves, which may have been laid onto it less well."""
-    others = [name for name in flights.mine if name != flight]
-    return [
-        name for name in others if not features_path(site / "flights" / name, "changes").is_file()
-    ] or others
-
-
-def _least_views(flights: PairedFlights, flight: str) -> int:
-    is_photos = any(not row.name.isdecimal() for row in flights.mine[flight])
-    return PHOTO_VIEWS if is_photos else VIDEO_VIEWS
+    return MeasuredChanges(flight, masks, scores, match, shift_m, tuple(remarks), classes)
 
 
 def _class_counts(match: EventMatch, found: Path, true: Path) -> ClassCounts | None:
@@ -356,41 +325,33 @@ def _read_true(
     events = []
     for feature in read_features(path):
         try:
-            events.append(_true_event(feature, described, map_from_truth, ground, views, path))
+            properties = feature["properties"]
+            true_m = _ring(feature, described, path)
+            outline_m = apply_homography(map_from_truth, true_m)
+            places = properties["path"]
+            path_m = (
+                apply_homography(map_from_truth, described.frame.ground_from_lonlat(places))
+                if places
+                else floats(())
+            )
+            event = TrueEvent(
+                _event_name(properties),
+                ChangeKind(properties["kind"]),
+                outline_m,
+                float(properties["length_m"]),
+                [time_ns_of(text) for text in properties["clear_views"]],
+                path_m,
+                map_off_m=outline_m.mean(axis=0) - true_m.mean(axis=0),
+            )
+            true_event = replace(
+                event, must_find=event.is_shown(ground, views, max(views, VIDEO_VIEWS))
+            )
+            events.append(true_event)
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise InputError(
                 f"{path}: an event is not as docs/simulation.md has it ({error!r})"
             ) from error
     return events
-
-
-def _true_event(
-    feature: Mapping[str, Any],
-    described: Site,
-    map_from_truth: Matrix3,
-    ground: ComparedGround,
-    views: int,
-    path: Path,
-) -> TrueEvent:
-    properties = feature["properties"]
-    true_m = _ring(feature, described, path)
-    outline_m = apply_homography(map_from_truth, true_m)
-    places = properties["path"]
-    path_m = (
-        apply_homography(map_from_truth, described.frame.ground_from_lonlat(places))
-        if places
-        else floats(())
-    )
-    event = TrueEvent(
-        _event_name(properties),
-        ChangeKind(properties["kind"]),
-        outline_m,
-        float(properties["length_m"]),
-        [time_ns_of(text) for text in properties["clear_views"]],
-        path_m,
-        map_off_m=outline_m.mean(axis=0) - true_m.mean(axis=0),
-    )
-    return replace(event, must_find=event.is_shown(ground, views, max(views, VIDEO_VIEWS)))
 
 
 def _read_found(path: Path, described: Site, clock: tuple[int, int]) -> list[FoundEvent]:

@@ -149,7 +149,29 @@ def match_pictures(
         raise InputError(
             f"{labelled.name}: {len(labelled)} pictures, but detections in {len(found)}"
         )
-    truth, truth_rows = _truth(labelled, judged)
+    # COCO's records of the labels, and of each label that counts its picture and box by id
+    annotations: list[dict[str, Any]] = []
+    rows: dict[int, tuple[int, BoxesPx]] = {}
+    category = {labelled.classes.index(name): k for k, name in enumerate(judged)}
+    for index, picture in enumerate(labelled.pictures):
+        for box, label in zip(picture.boxes_px, picture.labels.tolist()):
+            if label in category:
+                rows[len(annotations) + 1] = index, box
+                annotations.append(_annotation(len(annotations) + 1, index, category[label], box))
+        for region in picture.ignored_px:
+            annotations += [
+                _annotation(len(annotations) + 1 + k, index, k, region) | {"iscrowd": 1}
+                for k in range(len(judged))
+            ]
+    truth, truth_rows = (
+        {
+            "info": {},
+            "images": [_image(index, each) for index, each in enumerate(labelled.pictures)],
+            "categories": [{"id": k, "name": name} for k, name in enumerate(judged)],
+            "annotations": annotations,
+        },
+        rows,
+    )
     with redirect_stdout(io.StringIO()):  # pycocotools prints as it goes
         judge = COCOeval(
             _indexed(truth), _indexed(truth | {"annotations": _candidates(found, judged)}), "bbox"
@@ -346,31 +368,6 @@ def _wrong_detection(
     return Mistake("false alarm", picture, _tuple(box), match.label, score, overlap=near), None
 
 
-def _truth(
-    labelled: LabelledSet, judged: Sequence[str]
-) -> tuple[dict[str, Any], dict[int, tuple[int, BoxesPx]]]:
-    """COCO's records of the labels, and of each label that counts its picture and box by id."""
-    annotations: list[dict[str, Any]] = []
-    rows: dict[int, tuple[int, BoxesPx]] = {}
-    category = {labelled.classes.index(name): k for k, name in enumerate(judged)}
-    for index, picture in enumerate(labelled.pictures):
-        for box, label in zip(picture.boxes_px, picture.labels.tolist()):
-            if label in category:
-                rows[len(annotations) + 1] = index, box
-                annotations.append(_annotation(len(annotations) + 1, index, category[label], box))
-        for region in picture.ignored_px:
-            annotations += [
-                _annotation(len(annotations) + 1 + k, index, k, region) | {"iscrowd": 1}
-                for k in range(len(judged))
-            ]
-    return {
-        "info": {},
-        "images": [_image(index, each) for index, each in enumerate(labelled.pictures)],
-        "categories": [{"id": k, "name": name} for k, name in enumerate(judged)],
-        "annotations": annotations,
-    }, rows
-
-
 def _candidates(found: Sequence[Detections], judged: Sequence[str]) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for index, detections in enumerate(found):
@@ -432,7 +429,13 @@ def _class_match(
 ) -> ClassMatch:
     """The class's pictures of COCO's evaluation (all areas) as columns."""
     seen = [row for row in rows if row is not None]
-    true_ids = _counted_labels(seen)
+    # COCO's ids of the labels that are not to be ignored, one picture after another
+    true_ids = [
+        gt
+        for row in seen
+        for gt, ignored in zip(row["gtIds"], np.asarray(row["gtIgnore"]))
+        if not ignored
+    ]
     scores = np.array(list(chain.from_iterable(row["dtScores"] for row in seen)), np.float64)
     ids = chain.from_iterable(row["dtIds"] for row in seen)
     boxes = np.array([_edges(judge.cocoDt.anns[dt]["bbox"]) for dt in ids], np.float32).reshape(
@@ -457,16 +460,6 @@ def _class_match(
         np.array([truth_rows[gt][1] for gt in true_ids], np.float32).reshape(-1, 4),
         true_scores,
     )
-
-
-def _counted_labels(rows: Sequence[dict[str, Any]]) -> list[int]:
-    """COCO's ids of the labels that are not to be ignored, one picture after another."""
-    return [
-        gt
-        for row in rows
-        for gt, ignored in zip(row["gtIds"], np.asarray(row["gtIgnore"]))
-        if not ignored
-    ]
 
 
 def _rows_of(ids: Floats, wanted: Sequence[int]) -> Rows:

@@ -46,7 +46,7 @@ class Interval:
 
 
 @dataclass(frozen=True)
-class Difference:
+class ScoreDifference:
     """How much higher B measures than A: the value, its 95 % interval, the share of draws in which it is above 0."""
 
     value: float
@@ -166,7 +166,7 @@ def intervals(tables: GroupTables, *, draws: int = DRAWS, seed: int = 0) -> dict
 
 def differences(
     a: Sequence[GroupTables], b: Sequence[GroupTables], *, draws: int = DRAWS, seed: int = 0
-) -> dict[str, Difference]:
+) -> dict[str, ScoreDifference]:
     """How much higher B measures than A on the same pictures; an arm is a model, or one trained with several seeds.
 
     Values are means over an arm's seeds; every draw draws groups, the same for both, and seeds of each arm. With one
@@ -178,16 +178,20 @@ def differences(
         name: float(exact[1][name][0] - exact[0][name][0]) for name in exact[0] if name in exact[1]
     }
     if groups < 2 and len(a) < 2 and len(b) < 2:
-        return {name: Difference(value, np.nan, np.nan, np.nan) for name, value in values.items()}
+        return {
+            name: ScoreDifference(value, np.nan, np.nan, np.nan) for name, value in values.items()
+        }
     weights = draw_groups(groups, draws, seed)
     rng = np.random.default_rng([seed, 4302])
     of_a, of_b = (_drawn_means(arm, weights, values, rng) for arm in (a, b))
     return {name: _difference(value, of_b[name] - of_a[name]) for name, value in values.items()}
 
 
-def _difference(value: float, drawn: Floats) -> Difference:
+def _difference(value: float, drawn: Floats) -> ScoreDifference:
     known = drawn[~np.isnan(drawn)]
-    return Difference(value, *_bounds(drawn), float((known > 0).mean()) if len(known) else np.nan)
+    return ScoreDifference(
+        value, *_bounds(drawn), float((known > 0).mean()) if len(known) else np.nan
+    )
 
 
 def _drawn_means(
@@ -313,7 +317,7 @@ class SetComparison:
     groups: int
     labels: Mapping[str, int]
     arms: tuple[ArmScores, ...]
-    differences: tuple[Mapping[str, Difference], ...]
+    differences: tuple[Mapping[str, ScoreDifference], ...]
 
 
 def score_set(
@@ -384,7 +388,14 @@ def compare_arms(
     shared = [name for name in arms[0].classes if all(name in arm.classes for arm in arms)]
     judged = judged_classes(labelled, shared)
     groups = _groups(labelled)
-    tables = [_arm_tables(labelled, arm, judged, groups) for arm in arms]
+    # The tables of each of an arm's seeds
+    tables = [
+        [
+            group_tables(match_pictures(labelled, found, judged)[0], groups, thresholds)
+            for found, thresholds in zip(arm.found, arm.thresholds)
+        ]
+        for arm in arms
+    ]
     first = tables[0][0]
     return SetComparison(
         labelled.name,
@@ -394,16 +405,6 @@ def compare_arms(
         tuple(_arm_scores(arm.name, each) for arm, each in zip(arms, tables)),
         tuple(differences(tables[0], each, draws=draws, seed=seed) for each in tables[1:]),
     )
-
-
-def _arm_tables(
-    labelled: LabelledSet, arm: Arm, judged: Sequence[str], groups: Rows
-) -> list[GroupTables]:
-    """The tables of each of an arm's seeds."""
-    return [
-        group_tables(match_pictures(labelled, found, judged)[0], groups, thresholds)
-        for found, thresholds in zip(arm.found, arm.thresholds)
-    ]
 
 
 def _arm_scores(name: str, tables: Sequence[GroupTables]) -> ArmScores:

@@ -1,10 +1,14 @@
 """Measure detectors on labelled pictures, each by itself and side by side: Table 4.6 of the thesis and more."""
 
+import json
 import time
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Unpack
+
+import cv2
+import numpy as np
 
 from sorvolo.capture.photos import read_picture
 from sorvolo.detection.detector import Detector
@@ -12,7 +16,8 @@ from sorvolo.detection.models import find_model
 from sorvolo.detection.session import read_info
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import BoxesPx, ImageRGB
-from sorvolo.lab.datasets import read_datasets
+from sorvolo.lab.datasets import LabelOptions, read_datasets
+from sorvolo.lab.datasets.splits import hold_out
 from sorvolo.lab.evaluation.detection_metrics import Mistake, judged_classes
 from sorvolo.lab.evaluation.detection_scores import (
     DRAWS,
@@ -22,22 +27,124 @@ from sorvolo.lab.evaluation.detection_scores import (
     compare_arms,
     score_set,
 )
-from sorvolo.lab.evaluation.detector_files import (
-    FoundSet,
-    FoundSets,
-    mistake_picture,
-    read_found,
-    write_found,
-)
 from sorvolo.lab.evaluation.detector_page import detector_page
-from sorvolo.lab.training.holding_out import hold_out
 from sorvolo.paths import AnyPath, Inputs, listed
 from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.exports.plain import json_bytes
 from sorvolo.survey.flight import Notice
-from sorvolo.survey.labels import LabelledPicture, LabelledSet
+from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import Detections, no_detections
 from sorvolo.survey.wording import counted
+
+_MADE_BY = "sorvolo evaluate detector"
+_FORMAT = 2
+_CROP_PX = 220  # side of a picture on a page
+_LABEL_COLOUR, _FOUND_COLOUR = (40, 220, 90), (255, 150, 30)
+
+
+@dataclass(frozen=True, eq=False)
+class FoundSet:
+    """What a model found in one set: its pictures' file names, one Detections a picture, and from which score on each
+    class is reported there; a model may have other thresholds for thermal frames."""
+
+    files: tuple[str, ...]
+    detections: tuple[Detections, ...]
+    thresholds: Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class FoundSets:
+    """What one model found, by the sets' names.
+
+    `seconds_per_picture` is NaN where it was not measured; `notices` are the detector's own notices.
+    """
+
+    name: str
+    classes: tuple[str, ...]
+    sets: Mapping[str, FoundSet]
+    seconds_per_picture: float = float("nan")
+    notices: tuple[str, ...] = ()
+
+
+def write_found(path: Path, found: FoundSets) -> None:
+    """Write detections.json (docs/formats.md): boxes to 0.01 px, scores to 1e-5. Raises StoreError on a full disk."""
+    content = {
+        "made_by": _MADE_BY,
+        "format": _FORMAT,
+        "model": found.name,
+        "classes": list(found.classes),
+        "sets": {
+            name: {
+                "thresholds": dict(one.thresholds),
+                "pictures": [
+                    {
+                        "file": file,
+                        "boxes_px": np.round(each.boxes_px.astype(float), 2).tolist(),
+                        "scores": np.round(each.scores, 5).tolist(),
+                        "labels": each.labels.tolist(),
+                    }
+                    for file, each in zip(one.files, one.detections)
+                ],
+            }
+            for name, one in found.sets.items()
+        },
+    }
+    atomic_write_bytes(path, (json.dumps(content, separators=(",", ":")) + "\n").encode())
+
+
+def read_found(path: Path) -> FoundSets:
+    """Read what `write_found` wrote. Raises InputError for any other file."""
+    try:
+        content = json.loads(path.read_bytes())
+        if content["format"] != _FORMAT:
+            raise ValueError(f"format {content['format']!r}, not {_FORMAT}")
+        classes = tuple(str(name) for name in content["classes"])
+        sets = {
+            str(name): FoundSet(
+                tuple(str(row["file"]) for row in one["pictures"]),
+                tuple(_detections(row, classes) for row in one["pictures"]),
+                {each: float(one["thresholds"][each]) for each in classes},
+            )
+            for name, one in content["sets"].items()
+        }
+        return FoundSets(str(content["model"]), classes, sets)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(
+            f"{path}: not detections.json of `sorvolo evaluate detector --out` ({error}); give that file, or a model"
+        ) from error
+
+
+def mistake_picture(
+    image: ImageRGB, box_px: Sequence[float], labels_px: BoxesPx, found_px: BoxesPx
+) -> ImageRGB:
+    """A square crop around a box, enlarged, with the labels in it (green) and what was reported (orange)."""
+    left, top, right, bottom = box_px
+    side = max(3.0 * max(right - left, bottom - top), 48.0)
+    x0, y0 = (left + right - side) / 2, (top + bottom - side) / 2
+    scale = _CROP_PX / side
+    matrix = np.array(
+        [[scale, 0, -scale * x0 + (scale - 1) / 2], [0, scale, -scale * y0 + (scale - 1) / 2]]
+    )
+    crop = cv2.warpAffine(
+        image, matrix, (_CROP_PX, _CROP_PX), flags=cv2.INTER_LINEAR, borderValue=(60, 60, 60)
+    )
+    for boxes, colour in ((labels_px, _LABEL_COLOUR), (found_px, _FOUND_COLOUR)):
+        for edges in boxes:
+            low, high = (
+                np.round((edges[k : k + 2] - [x0, y0]) * scale).astype(int).tolist() for k in (0, 2)
+            )
+            cv2.rectangle(crop, low, high, colour, 2, cv2.LINE_AA)
+    return np.asarray(crop, np.uint8)
+
+
+def _detections(row: Mapping[str, Any], classes: tuple[str, ...]) -> Detections:
+    boxes = np.array(row["boxes_px"], np.float32).reshape(-1, 4)
+    return Detections(
+        boxes, np.array(row["scores"], float), np.array(row["labels"], np.int64), classes
+    )
+
 
 LEAST_SCORE = 1e-4
 """Candidates from this score on are measured: average precision needs the doubtful ones, which packaged models score
@@ -89,30 +196,18 @@ class DetectorEvaluation:
 def read_sets(
     places: Inputs,
     *,
-    form: str | None = None,
-    classes: Mapping[str, str] | None = None,
-    ignore: Iterable[str] = (),
-    unlabelled: Iterable[str] = (),
-    group_pattern: str | None = None,
     held_out: float = 0.0,
     seed: int = 1,
     known: Iterable[str] = (),
+    **options: Unpack[LabelOptions],
 ) -> tuple[LabelledSet, ...]:
-    """The labelled sets in these files and folders, all read with the same options (those of `read_datasets`).
+    """The labelled sets in these files and folders, all read with the same options.
 
     With `held_out` only the share that a training with this share and seed holds out. Raises InputError and
     SettingsError as `read_datasets`, SettingsError for a share that cannot be.
     """
     folders = [Path(each) for each in listed(places)]
-    read = read_datasets(
-        folders,
-        form=form,
-        classes=classes,
-        ignore=ignore,
-        unlabelled=unlabelled,
-        group_pattern=group_pattern,
-        known=known,
-    )
+    read = read_datasets(folders, known=known, **options)
     return tuple(_held_out(part, held_out, seed) if held_out else part for part in read)
 
 
@@ -143,7 +238,9 @@ def evaluate_detector(
     that cannot be read is left out for all models, and named in `notices`.
     """
     settings = settings or EvaluationSettings()
-    _demand_distinct(labelled)
+    names = [each.name for each in labelled]
+    if len(set(names)) < len(names):
+        raise InputError(f"two data sets have one name ({', '.join(names)}); rename a folder")
     reader = _PictureReader()
     seen = _seen_by_all(arms, labelled, settings, progress, reader)
     labelled = [_readable(each, reader.damaged) for each in labelled]
@@ -154,7 +251,11 @@ def evaluate_detector(
         each.name: tuple(_worst(each, score, first.sets[each.name]))
         for each, score in zip(labelled, scores)
     }
-    notices = (*_damage_notices(reader.damaged), *_model_notices(seen))
+    # What the models note, each once
+    notices = (
+        *_damage_notices(reader.damaged),
+        *tuple(dict.fromkeys(text for arm in seen for each in arm for text in each.notices)),
+    )
     return DetectorEvaluation(first, scores, comparisons, worst, notices)
 
 
@@ -180,17 +281,6 @@ def _seen_by_all(
     """What every model of every arm finds in the pictures that can be read."""
     seen = [[_found(place, labelled, settings, progress, reader) for place in arm] for arm in arms]
     return [[_without(each, labelled, reader.damaged) for each in arm] for arm in seen]
-
-
-def _demand_distinct(labelled: Sequence[LabelledSet]) -> None:
-    names = [each.name for each in labelled]
-    if len(set(names)) < len(names):
-        raise InputError(f"two data sets have one name ({', '.join(names)}); rename a folder")
-
-
-def _model_notices(seen: Sequence[Sequence[FoundSets]]) -> tuple[str, ...]:
-    """What the models note, each once."""
-    return tuple(dict.fromkeys(text for arm in seen for each in arm for text in each.notices))
 
 
 def write_evaluation(
@@ -298,7 +388,7 @@ def _found(
             )
         sets[each.name] = FoundSet(_names(each), tuple(detections), usual)
     return FoundSets(
-        _arm_name(place),
+        Path(place).stem if Path(place).suffix == ".onnx" else place,
         detector.classes,
         sets,
         seconds / max(count, 1),
@@ -357,10 +447,6 @@ def _damage_notices(damaged: Mapping[str, str]) -> tuple[str, ...]:
     return (f"{counted(len(damaged), 'picture')} left out that cannot be read: {some}",)
 
 
-def _arm_name(place: str) -> str:
-    return Path(place).stem if Path(place).suffix == ".onnx" else place
-
-
 def _names(labelled: LabelledSet) -> tuple[str, ...]:
     return tuple(Path(picture.path).name for picture in labelled.pictures)
 
@@ -378,7 +464,12 @@ def _same_pictures(
     if one.files == wanted:
         return one
     by_name = dict(zip(one.files, one.detections))
-    missing = _readable_beside(labelled, by_name, reader)
+    # The set's pictures that are not known by name, and can be read
+    missing = [
+        name
+        for name, picture in zip(_names(labelled), labelled.pictures)
+        if name not in by_name and reader.read(picture.path) is not None
+    ]
     repeats = len(by_name) < len(one.files) or len(set(wanted)) < len(wanted)
     if missing or repeats:
         raise InputError(
@@ -389,17 +480,6 @@ def _same_pictures(
     return replace(
         one, files=wanted, detections=tuple(by_name.get(name, nothing) for name in wanted)
     )
-
-
-def _readable_beside(
-    labelled: LabelledSet, known: Container[str], reader: _PictureReader
-) -> list[str]:
-    """The set's pictures that are not known by name, and can be read."""
-    return [
-        name
-        for name, picture in zip(_names(labelled), labelled.pictures)
-        if name not in known and reader.read(picture.path) is not None
-    ]
 
 
 def _side_by_side(
@@ -437,9 +517,11 @@ def _worst(
             reported = _reported(found.detections[mistake.picture], found.thresholds)
             image = reader.read(picture.path)
             if image is not None:  # of detections.json the pictures were not needed so far
-                crop = mistake_picture(
-                    image, mistake.box_px, _judged_boxes(picture, labelled, scores), reported
-                )
+                judged = {labelled.classes.index(each.label) for each in scores.classes}
+                judged_boxes = picture.boxes_px[
+                    [label in judged for label in picture.labels.tolist()]
+                ]
+                crop = mistake_picture(image, mistake.box_px, judged_boxes, reported)
                 yield mistake, Path(picture.path).name, crop
 
 
@@ -456,11 +538,6 @@ def _few_of_each_picture(mistakes: Iterable[Mistake]) -> Iterator[Mistake]:
             yield mistake
         if sum(min(count, _SHOWN_OF_ONE) for count in shown.values()) >= _SHOWN:
             return
-
-
-def _judged_boxes(picture: LabelledPicture, labelled: LabelledSet, scores: SetScores) -> BoxesPx:
-    judged = {labelled.classes.index(each.label) for each in scores.classes}
-    return picture.boxes_px[[label in judged for label in picture.labels.tolist()]]
 
 
 def _reported(found: Detections, thresholds: Mapping[str, float]) -> BoxesPx:

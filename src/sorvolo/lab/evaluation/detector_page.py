@@ -74,7 +74,20 @@ def detector_page(
         headline="; ".join(f"{each.name}: AP50 {_class_words(each.classes)}" for each in sets),
         summary=f"Measured on {pictures} labelled pictures of {_videos(sets)}. All shares are in per cent.",
         overview_names=_SET_NAMES,
-        overview=[_overview_row(each) for each in sets],
+        overview=[
+            [
+                each.name,
+                each.pictures,
+                each.groups,
+                *(_with_interval(each.intervals[name]) for name in ("AP", "AP50", "AP75")),
+                *(
+                    _share(value)
+                    for value in (each.coco.ap_small, each.coco.ap_medium, each.coco.ap_large)
+                ),
+                _with_interval(each.intervals["thesis_map"]),
+            ]
+            for each in sets
+        ],
         remarks=_remarks(sets),
         comparisons=[_comparison(each) for each in comparisons],
         class_names=_CLASS_NAMES,
@@ -90,7 +103,24 @@ def _set(scores: Any, worst: Sequence[tuple[Any, str, ImageRGB]]) -> dict[str, A
     labels = [row.label for row in scores.classes]
     return {
         "name": scores.name,
-        "classes": _class_rows(scores),
+        "classes": [
+            [
+                row.label,
+                row.labels,
+                _with_interval(scores.intervals[f"AP {row.label}"]),
+                _with_interval(scores.intervals[f"AP50 {row.label}"]),
+                _share(row.coco.ap75),
+                _number(row.reported.score),
+                *(
+                    _share(value)
+                    for value in (row.reported.precision, row.reported.recall, row.reported.f1)
+                ),
+                _share(row.thesis_ap),
+                _share(row.best.f1),
+                _number(row.best.score),
+            ]
+            for row in scores.classes
+        ],
         "curves": _curves(scores),
         "by_score": _by_score(scores),
         "sizes": _sizes(scores),
@@ -110,17 +140,6 @@ def _class_words(classes: Sequence[Any]) -> str:
         ", ".join(f"{row.label} {_share(row.coco.ap50)}" for row in classes if row.labels)
         or "unknown"
     )
-
-
-def _overview_row(each: Any) -> list[Any]:
-    return [
-        each.name,
-        each.pictures,
-        each.groups,
-        *(_with_interval(each.intervals[name]) for name in ("AP", "AP50", "AP75")),
-        *(_share(value) for value in (each.coco.ap_small, each.coco.ap_medium, each.coco.ap_large)),
-        _with_interval(each.intervals["thesis_map"]),
-    ]
 
 
 def _remarks(sets: Sequence[Any]) -> list[str]:
@@ -158,27 +177,6 @@ def _comparison_row(each: Any, name: str) -> list[Any]:
         words = _interval(measured.value, measured.low, measured.high, _points)
         row.append(cell("strong", words) if measured.is_clear else words)
     return row
-
-
-def _class_rows(scores: Any) -> list[list[Any]]:
-    return [
-        [
-            row.label,
-            row.labels,
-            _with_interval(scores.intervals[f"AP {row.label}"]),
-            _with_interval(scores.intervals[f"AP50 {row.label}"]),
-            _share(row.coco.ap75),
-            _number(row.reported.score),
-            *(
-                _share(value)
-                for value in (row.reported.precision, row.reported.recall, row.reported.f1)
-            ),
-            _share(row.thesis_ap),
-            _share(row.best.f1),
-            _number(row.best.score),
-        ]
-        for row in scores.classes
-    ]
 
 
 def _curves(scores: Any) -> dict[str, Any] | None:
@@ -318,5 +316,5 @@ def _with_interval(measured: Any) -> Markup:
 def _interval(value: float, low: float, high: float, words: Callable[[float], str]) -> Markup:
     """The value, and its bounds on a line of their own where they are known."""
     return cell(
-        "interval", words(value), *((words(low), words(high)) if math.isfinite(low) else ("", ""))
+        "interval", words(value), *(words(low), words(high)) if math.isfinite(low) else ("", "")
     )

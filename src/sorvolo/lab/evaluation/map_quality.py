@@ -2,14 +2,25 @@
 4.1).
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from sorvolo.errors import GeometryError
-from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, Mask, PointsM, frozen
+from sorvolo.geometry.arrays import (
+    Floats,
+    ImageGray,
+    ImageRGB,
+    ImageRGBA,
+    Mask,
+    Matrix3,
+    PointsM,
+    frozen,
+)
+from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.geometry.homography import apply_homography, fit_similarity
+from sorvolo.mosaic.canvas_frame import CanvasFrame, coverage, warp
 from sorvolo.registration.features import gray_from_rgb
 
 DEVIATION_BINS = 32
@@ -73,11 +84,7 @@ class Shift:
 
 
 def spread_of(distances_m: Floats, gsd_m: float) -> Spread:
-    """Sum up distances, any shape; NaN everywhere when there is none. Raises GeometryError for a gsd not
-    above 0.
-    """
-    if not gsd_m > 0:
-        raise GeometryError(f"the ground sampling distance must be positive, got {gsd_m}")
+    """Sum up distances, any shape; NaN everywhere when there is none."""
     distances_m = np.asarray(distances_m, dtype=np.float64).ravel()
     if not len(distances_m):
         nan = float("nan")
@@ -108,16 +115,12 @@ def corner_errors(
     """Compare estimated and true outlines, (N, 4, 2) m each, of the same frames.
 
     `true_cameras_m` and `fixes_m`, (M, 2) each, give the floor; the fixes may be of more frames than were
-    placed, because the floor is a property of the flight. Raises GeometryError when shapes differ.
+    placed, because the floor is a property of the flight.
     """
     estimated, true = (
         np.asarray(estimated_m, dtype=np.float64),
         np.asarray(true_m, dtype=np.float64),
     )
-    if estimated.shape != true.shape or estimated.shape[1:] != (4, 2):
-        raise GeometryError(
-            f"outlines must be (N, 4, 2) both, got {estimated.shape} and {true.shape}"
-        )
     estimated, true = estimated.reshape(-1, 2), true.reshape(-1, 2)
     none = spread_of(np.zeros(0), gsd_m)
     if not len(true):
@@ -138,13 +141,10 @@ def position_errors(
 ) -> tuple[Spread, Spread]:
     """Camera positions, (N, 2) or (N, 3) m, against a reference: as they lie, and after the best similarity.
 
-    The similarity acts on east and north only and needs three cameras; heights stay as they are. Raises
-    GeometryError when shapes differ.
+    The similarity acts on east and north only and needs three cameras; heights stay as they are.
     """
     estimated = np.asarray(estimated_m, dtype=np.float64)
     reference = np.asarray(reference_m, dtype=np.float64)
-    if estimated.shape != reference.shape or estimated.ndim != 2:
-        raise GeometryError(f"positions differ in shape: {estimated.shape} and {reference.shape}")
     absolute = spread_of(np.linalg.norm(estimated - reference, axis=1), gsd_m)
     if len(reference) < 3:
         return absolute, spread_of(np.zeros(0), gsd_m)
@@ -163,8 +163,6 @@ def deviation(mosaic: ImageRGB, frame: ImageRGB, mask: Mask) -> Deviation:
     histogram is of the same differences. The frame is compared as it was taken, without the gain that the
     mosaic gave it.
     """
-    if mosaic.shape != frame.shape or mosaic.shape[:2] != mask.shape:
-        raise GeometryError(f"cannot compare {mosaic.shape}, {frame.shape} and mask {mask.shape}")
     difference = cv2.absdiff(gray_from_rgb(mosaic), gray_from_rgb(frame))[mask]
     if not len(difference):
         return Deviation(float("nan"), np.zeros(DEVIATION_BINS), 0)
@@ -176,8 +174,6 @@ def correlation(a: Floats | ImageGray, b: Floats | ImageGray, mask: Mask) -> flo
     """Eq. 4.1 of two gray pictures, (height, width), over the pixels in `mask`; NaN where one has no
     contrast.
     """
-    if a.shape != b.shape or a.shape != mask.shape:
-        raise GeometryError(f"cannot correlate {a.shape} and {b.shape} under mask {mask.shape}")
     if not mask.any():
         return float("nan")
     da, db = a[mask].astype(np.float64), b[mask].astype(np.float64)
@@ -192,8 +188,6 @@ def residual_shift(a: Floats | ImageGray, b: Floats | ImageGray, mask: Mask) -> 
     Phase correlation (Kuglin and Hines 1975) of the gradients, so that light and shade weigh little; to a
     fraction of a pixel, and for shifts up to a quarter of the picture's side.
     """
-    if a.shape != b.shape or a.shape != mask.shape:
-        raise GeometryError(f"cannot compare {a.shape} and {b.shape} under mask {mask.shape}")
     if min(a.shape) < 16 or not mask.any():
         return Shift(float("nan"), float("nan"), 0.0)
     inner = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(np.float64)
@@ -206,3 +200,135 @@ def residual_shift(a: Floats | ImageGray, b: Floats | ImageGray, mask: Mask) -> 
     window = cv2.createHanningWindow(a.shape[::-1], cv2.CV_64F)
     (x, y), response = cv2.phaseCorrelate(edges[0], edges[1], window)
     return Shift(float(x), float(y), float(response))
+
+
+_UNSEEN = 236  # a light grey
+_RECENT = 64  # tiles remembered: neighbouring frames share most
+
+
+@dataclass(frozen=True, eq=False)
+class DeviationSummary:
+    """The thesis's deviation over frames: mean, median and worst share, and the mean histogram."""
+
+    mean: float
+    median: float
+    worst: float
+    histogram: Floats
+    frames: int
+
+
+@dataclass(frozen=True, eq=False)
+class DeviationPictures:
+    """A part of the map, the frame that it was made of, and how they differ, (H, W, 3) each; grey where unknown."""
+
+    mosaic: ImageRGB
+    frame: ImageRGB
+    difference: ImageRGB
+
+
+class MapDeviation:
+    """Compares frames with the map one after another; remembers the map's last tiles."""
+
+    def __init__(self, tiles: Mapping[TileIndex, ImageRGBA], site_grid: SiteGrid) -> None:
+        self._tiles, self._site_grid = tiles, site_grid
+        self._recent: dict[TileIndex, ImageRGBA] = {}
+
+    def of(self, image: ImageRGB, site_from_image: Matrix3) -> Deviation:
+        """The deviation of one undistorted frame, (H, W, 3), from the map under it."""
+        return deviation(*self._both(image, site_from_image))
+
+    def shown(self, image: ImageRGB, site_from_image: Matrix3) -> DeviationPictures:
+        """The pictures of the thesis's Figure 4.1 of one undistorted frame."""
+        mosaic, frame, mask = self._both(image, site_from_image)
+        mosaic[~mask], frame[~mask] = _UNSEEN, _UNSEEN
+        difference = np.abs(mosaic.astype(np.int16) - frame).astype(np.uint8)
+        difference[~mask] = _UNSEEN
+        return DeviationPictures(mosaic, frame, difference)
+
+    def under(self, outline_m: Floats, width_px: int, height_px: int) -> ImageRGB:
+        """(height, width, 3) the map as a frame sees it whose corners lie at `outline_m`, (4, 2) in the site frame.
+
+        The corners are those of the top left pixel, the top right, the bottom right and the bottom left.
+        """
+        grid_from_site = self._site_grid.grid_from_site_affine(np.mean(outline_m, axis=0), 100.0)
+        corners = apply_homography(grid_from_site, np.asarray(outline_m, np.float64))
+        low, high = np.floor(corners.min(axis=0)), np.ceil(corners.max(axis=0)) + 1
+        window = int(low[0]), int(low[1]), int(high[0]), int(high[1])
+        ends = np.array(
+            [[0, 0], [width_px - 1, 0], [width_px - 1, height_px - 1], [0, height_px - 1]],
+            np.float32,
+        )
+        frame_from_window = cv2.getPerspectiveTransform((corners - low).astype(np.float32), ends)
+        found = cv2.warpPerspective(
+            self._crop(window, self._site_grid.grid.tile_px),
+            frame_from_window,
+            (width_px, height_px),
+        )
+        found[found[..., 3] == 0] = _UNSEEN
+        return np.ascontiguousarray(found[..., :3])
+
+    def _both(self, image: ImageRGB, site_from_image: Matrix3) -> tuple[ImageRGB, ImageRGB, Mask]:
+        """The map and the frame in one window of the grid, and where both are known."""
+        height, width = image.shape[:2]
+        x, y, z = site_from_image @ np.array([width / 2, height / 2, 1.0])
+        grid_from_site = self._site_grid.grid_from_site_affine(np.array([x / z, y / z]), 100.0)
+        frame = CanvasFrame(0, 0, width, height, grid_from_site @ site_from_image)
+        low, high = (
+            np.floor(frame.outline_px.min(axis=0)),
+            np.ceil(frame.outline_px.max(axis=0)) + 1,
+        )
+        window = int(low[0]), int(low[1]), int(high[0]), int(high[1])
+        mosaic = self._crop(window, self._site_grid.grid.tile_px)
+        mask = (coverage(frame, window) > 0) & (mosaic[..., 3] > 0)
+        return np.ascontiguousarray(mosaic[..., :3]), warp(image, frame, window), mask
+
+    def _crop(self, window: tuple[int, int, int, int], side: int) -> ImageRGBA:
+        """(height, width, 4) the map in a window of grid pixels (x0, y0, x1, y1, ends exclusive)."""
+        x0, y0, x1, y1 = window
+        result = np.zeros((y1 - y0, x1 - x0, 4), np.uint8)
+        for row in range(y0 // side, (y1 - 1) // side + 1):
+            for column in range(x0 // side, (x1 - 1) // side + 1):
+                if (column, row) not in self._tiles:
+                    continue
+                left, top = max(x0, column * side), max(y0, row * side)
+                right, bottom = min(x1, (column + 1) * side), min(y1, (row + 1) * side)
+                tile = self._tile((column, row))
+                result[top - y0 : bottom - y0, left - x0 : right - x0] = tile[
+                    top - row * side : bottom - row * side,
+                    left - column * side : right - column * side,
+                ]
+        return result
+
+    def _tile(self, index: TileIndex) -> ImageRGBA:
+        tile = self._recent.pop(index, None)
+        if tile is None:
+            tile = self._tiles[index]
+            if len(self._recent) >= _RECENT:
+                del self._recent[next(iter(self._recent))]
+        self._recent[index] = tile
+        return tile
+
+
+def frames_to_compare(count: int, most: int) -> list[int]:
+    """At most this many of a flight's frames, by number, evenly chosen."""
+    return (
+        list(range(count))
+        if count <= most
+        else np.linspace(0, count - 1, most).astype(int).tolist()
+    )
+
+
+def summed_up(deviations: Sequence[Deviation]) -> DeviationSummary:
+    """The deviations of frames together; those that show none of the map are left out."""
+    found = [each for each in deviations if each.count]
+    if not found:
+        nan = float("nan")
+        return DeviationSummary(nan, nan, nan, np.zeros(DEVIATION_BINS), 0)
+    shares = np.array([each.share for each in found])
+    return DeviationSummary(
+        float(shares.mean()),
+        float(np.median(shares)),
+        float(shares.max()),
+        np.mean([each.histogram for each in found], axis=0),
+        len(found),
+    )

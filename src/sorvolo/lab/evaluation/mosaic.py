@@ -10,14 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGBA, Mask, PointsPx
+from sorvolo.geometry.arrays import Floats, ImageGray, Mask, PointsPx
 from sorvolo.geometry.geodesy import Projection
-from sorvolo.lab.evaluation.frame_deviation import (
-    DeviationSummary,
-    MapDeviation,
-    frames_to_compare,
-    summed_up,
-)
 from sorvolo.lab.evaluation.frame_rows import (
     map_frames,
     refuse_simulation,
@@ -26,13 +20,17 @@ from sorvolo.lab.evaluation.frame_rows import (
 )
 from sorvolo.lab.evaluation.map_quality import (
     CornerErrors,
+    DeviationSummary,
+    MapDeviation,
     Shift,
     Spread,
     corner_errors,
     correlation,
+    frames_to_compare,
     position_errors,
     residual_shift,
     spread_of,
+    summed_up,
 )
 from sorvolo.paths import AnyPath, as_path
 from sorvolo.registration.features import gray_from_rgb
@@ -65,9 +63,12 @@ def truth_errors(
     name: str, pairs: Sequence[tuple[FrameRow, FrameRow]], m_per_px: float
 ) -> TruthErrors:
     """The errors of a flight's frames, each given beside the true one."""
-    corners = corner_errors(
-        *_outlines_m(pairs, Status.VISION), m_per_px, *_true_cameras_and_fixes_m(pairs)
-    )
+    # (N, 2) the true camera positions and the GPS fixes of the frames that have both
+    fixed = [true for _, true in pairs if true.has_fix and true.has_camera]
+    true_cameras_m = np.array([true.camera_m for true in fixed]).reshape(-1, 2)
+    fixes_m = np.array([true.fix_m for true in fixed]).reshape(-1, 2)
+    outlines_m = _outlines_m(pairs, Status.VISION)
+    corners = corner_errors(*outlines_m, m_per_px, true_cameras_m, fixes_m)
     by_gps_m = [
         np.linalg.norm(mine - true, axis=1)
         for mine, true in zip(*_outlines_m(pairs, Status.GPS_ONLY))
@@ -112,25 +113,8 @@ def _outlines_m(
     return mine, np.array([each.outline_m for _, each in both]).reshape(-1, 4, 2)
 
 
-def _true_cameras_and_fixes_m(pairs: Sequence[tuple[FrameRow, FrameRow]]) -> tuple[Floats, Floats]:
-    """(N, 2) the true camera positions and the GPS fixes of the frames that have both."""
-    fixed = [true for _, true in pairs if true.has_fix and true.has_camera]
-    cameras_m = np.array([true.camera_m for true in fixed]).reshape(-1, 2)
-    return cameras_m, np.array([true.fix_m for true in fixed]).reshape(-1, 2)
-
-
 _LEAST_PX = 1000  # of common ground
 _LATTICE_PX = 64  # between the points that are taken from CRS to CRS
-
-
-@dataclass(frozen=True, eq=False)
-class MapPicture:
-    """A north-up map: `rgba` (H, W, 4), the centre of pixel (0, 0) at `origin_m` in `crs`."""
-
-    rgba: ImageRGBA
-    origin_m: tuple[float, float]
-    m_per_px: float
-    crs: str
 
 
 @dataclass(frozen=True)
@@ -146,7 +130,7 @@ class ReferenceMatch:
     area_m2: float
 
 
-def match_reference(mine: MapPicture, other: MapPicture) -> ReferenceMatch | None:
+def match_reference(mine: Raster, other: Raster) -> ReferenceMatch | None:
     """A map beside a reference; None where they show hardly any common ground."""
     gray, known = _resampled(other, mine)
     mask = known & (mine.rgba[..., 3] > 0)
@@ -169,7 +153,7 @@ def match_reference(mine: MapPicture, other: MapPicture) -> ReferenceMatch | Non
     )
 
 
-def _resampled(raster: MapPicture, onto: MapPicture) -> tuple[ImageGray, Mask]:
+def _resampled(raster: Raster, onto: Raster) -> tuple[ImageGray, Mask]:
     """A raster's gray in the pixels of another, and where it knows them; CRS to CRS by a lattice of points."""
     places = _places(raster, onto)
     source, m_per_px = raster.rgba, raster.m_per_px
@@ -183,7 +167,7 @@ def _resampled(raster: MapPicture, onto: MapPicture) -> tuple[ImageGray, Mask]:
     return gray_from_rgb(np.ascontiguousarray(moved[..., :3])), moved[..., 3] > 254
 
 
-def _places(raster: MapPicture, onto: MapPicture) -> NDArray[np.float32]:
+def _places(raster: Raster, onto: Raster) -> NDArray[np.float32]:
     """(H, W, 2) where the pixels of `onto` lie in the raster."""
     height, width = onto.rgba.shape[:2]
     step = _LATTICE_PX
@@ -321,11 +305,6 @@ def _against_truth(
     if len(pairs) > 1:
         together = [pair for found in pairs.values() for pair in found]
         errors.append(truth_errors("all", together, described.m_per_px))
-    _refuse_far(errors, path)
-    return _tally(flights, true), tuple(errors)
-
-
-def _refuse_far(errors: Sequence[TruthErrors], path: Path) -> None:
     far_m = min(
         (each.corners.absolute.rms_m for each in errors if each.corners.absolute.count), default=0.0
     )
@@ -333,6 +312,7 @@ def _refuse_far(errors: Sequence[TruthErrors], path: Path) -> None:
         raise InputError(
             f"{path}: lies {far_m / 1000:.0f} km from the map; give the truth of its own flight"
         )
+    return _tally(flights, true), tuple(errors)
 
 
 def _paired(
@@ -362,16 +342,12 @@ def _against_reference(mosaic_path: Path, reference: Path) -> ReferenceMatch:
         raise InputError(
             f"{reference}: has no coordinate system; a reference map needs one (a GeoTIFF)"
         )
-    found = match_reference(_map_picture(mine), _map_picture(other))
+    found = match_reference(mine, other)
     if found is None:
         raise InputError(
             f"{reference}: shows hardly any ground of this map; give a map of the same place"
         )
     return found
-
-
-def _map_picture(raster: Raster) -> MapPicture:
-    return MapPicture(raster.rgba, raster.origin_m, raster.m_per_px, raster.crs)
 
 
 def _against_positions(
@@ -412,7 +388,13 @@ def _positions(path: Path) -> dict[tuple[str, str], _TablePlace]:
         with path.open(newline="", encoding="utf-8-sig") as file:
             table = csv.DictReader(file)
             rows = list(table)
-        _demand_columns(path, table.fieldnames or ())
+        columns = table.fieldnames or ()
+        missing = [name for name in _POSITION_COLUMNS if name not in columns]
+        if missing:
+            there = ", ".join(columns) or "none at all"
+            raise InputError(
+                f"{path}: no column {', '.join(missing)}, but {there}; {_POSITIONS_NEED}"
+            )
         return {
             ((row.get("flight") or "").strip(), row["frame"].strip()): _TablePlace(
                 float(row["longitude_deg"]),
@@ -425,10 +407,3 @@ def _positions(path: Path) -> dict[tuple[str, str], _TablePlace]:
         raise InputError(
             f"{path}: cannot be read as camera positions ({error}); {_POSITIONS_NEED}"
         ) from error
-
-
-def _demand_columns(path: Path, columns: Sequence[str]) -> None:
-    missing = [name for name in _POSITION_COLUMNS if name not in columns]
-    if missing:
-        there = ", ".join(columns) or "none at all"
-        raise InputError(f"{path}: no column {', '.join(missing)}, but {there}; {_POSITIONS_NEED}")

@@ -14,17 +14,23 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.geometry.homography import apply_homography, site_from_image_homography
 from sorvolo.geometry.pose import Pose
-from sorvolo.lab.simulation.clock import start_ns
 from sorvolo.lab.simulation.ground import PaintedGround
-from sorvolo.lab.simulation.path import LEAD_S, FlownPath, fly, path_of_flight, planned_waypoints
+from sorvolo.lab.simulation.path import (
+    LEAD_S,
+    FlownPath,
+    Observation,
+    fly,
+    observe,
+    path_of_flight,
+    planned_waypoints,
+)
 from sorvolo.lab.simulation.rendering import render
 from sorvolo.lab.simulation.settings import TELEMETRY_FORMATS, SimulationSettings
-from sorvolo.lab.simulation.telemetry import Observation, observe
-from sorvolo.lab.simulation.world import Day, World, build_day, build_world
+from sorvolo.lab.simulation.world import Day, World, build_day, build_world, start_ns
 from sorvolo.search.drawing.bodies import build_body
 from sorvolo.search.drawing.noise import SmoothSeries, layer, smooth_series
 from sorvolo.search.drawing.objects import Body, Thing
-from sorvolo.search.drawing.view import RaysF32, View, camera_view, ray_grid, remapped
+from sorvolo.search.drawing.view import DrawnView, RaysF32, camera_view, ray_grid, remapped
 from sorvolo.survey.flight import Frame, Telemetry, no_telemetry
 
 _CLOUD_CELL_M = 7.0  # of ground for a cell of the clouds' shade
@@ -106,7 +112,7 @@ class SimulatedFlight:
         """The photo's file name, or the frame's index in the video as text."""
         return f"IMG_{index + 1:04d}.jpg" if self.settings.output.photos else str(index)
 
-    def view(self, index: int) -> View:
+    def view(self, index: int) -> DrawnView:
         """How the camera sees the site at this frame."""
         return camera_view(self.camera, self.true_poses[index], self.imaging.rays)
 

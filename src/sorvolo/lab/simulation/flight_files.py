@@ -3,10 +3,14 @@
 import csv
 import io
 import json
+import os
+import platform
+import shutil
 from collections.abc import Callable, Iterator, Mapping, Set
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from fractions import Fraction
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +22,12 @@ from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
 from PIL.TiffImagePlugin import IFDRational
 
-from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB
+from sorvolo import __version__
+from sorvolo.errors import InputError, SettingsError
+from sorvolo.geometry.arrays import ImageGray, ImageRGB
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.units import KNOT_M_S
-from sorvolo.store.atomic import atomic_path, atomic_write_bytes
+from sorvolo.store.atomic import atomic_path, atomic_write_bytes, writing
 from sorvolo.store.rasters.geotiff import open_raster
 from sorvolo.survey.flight import Frame, Telemetry
 
@@ -177,8 +182,40 @@ def write_photo(path: Path, frame: Frame, camera: Camera, row: Mapping[str, floa
     detail[Base.ExifImageWidth], detail[Base.ExifImageHeight] = camera.width_px, camera.height_px
     xmp = b""
     if row:
-        exif.get_ifd(IFD.GPSInfo).update(_gps_tags(row, moment))
-        xmp = _xmp(row, moment)
+        # EXIF's GPS directory
+        exif.get_ifd(IFD.GPSInfo).update(
+            {
+                GPS.GPSLatitudeRef: "N" if row["latitude_deg"] >= 0 else "S",
+                GPS.GPSLatitude: _degrees_minutes_seconds(row["latitude_deg"]),
+                GPS.GPSLongitudeRef: "E" if row["longitude_deg"] >= 0 else "W",
+                GPS.GPSLongitude: _degrees_minutes_seconds(row["longitude_deg"]),
+                GPS.GPSAltitudeRef: b"\x00" if row["orthometric_height_m"] >= 0 else b"\x01",
+                GPS.GPSAltitude: IFDRational(round(abs(row["orthometric_height_m"]) * 1000), 1000),
+                GPS.GPSDateStamp: moment.strftime("%Y:%m:%d"),
+                GPS.GPSTimeStamp: (
+                    IFDRational(moment.hour, 1),
+                    IFDRational(moment.minute, 1),
+                    IFDRational(moment.second * 1000 + moment.microsecond // 1000, 1000),
+                ),
+            }
+        )
+        values = {
+            "UTCAtExposure": f"{moment:%Y-%m-%dT%H:%M:%S}.{moment.microsecond:06d}",
+            "GpsLatitude": f"{row['latitude_deg']:.9f}",
+            "GpsLongitude": f"{row['longitude_deg']:.9f}",
+            "AbsoluteAltitude": f"{row['orthometric_height_m']:+.3f}",
+            "RelativeAltitude": f"{row['height_above_takeoff_m']:+.3f}",
+            "GimbalYawDegree": f"{(row['camera_yaw_deg'] + 180) % 360 - 180:+.3f}",
+            "GimbalPitchDegree": f"{row['camera_pitch_deg']:+.3f}",
+            "GimbalRollDegree": f"{row['camera_roll_deg']:+.3f}",
+        }
+        attributes = " ".join(f'drone-dji:{name}="{value}"' for name, value in values.items())
+        xmp = (
+            '<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="adobe:ns:meta/">'
+            '<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+            f'<rdf:Description rdf:about="" xmlns:drone-dji="{_DJI}" {attributes}/>'
+            '</rdf:RDF></x:xmpmeta><?xpacket end="w"?>'
+        ).encode()
     buffer = io.BytesIO()
     Image.fromarray(frame.image).save(buffer, "JPEG", quality=93, subsampling=0, exif=exif, xmp=xmp)
     atomic_write_bytes(path, buffer.getvalue(), durable=False)
@@ -279,16 +316,12 @@ def _moment(time_ns: int) -> datetime:
     return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=time_ns // 1000)
 
 
-def _since_first_s(telemetry: Telemetry) -> Floats:
-    return (telemetry.time_ns - telemetry.time_ns[:1]) / 1e9
-
-
 def _umcd(telemetry: Telemetry) -> str:
     """Table 2.2's columns, those that no simulated instrument measures at their idle values."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(UMCD_COLUMNS)
-    times_s = _since_first_s(telemetry)
+    times_s = (telemetry.time_ns - telemetry.time_ns[:1]) / 1e9
     speed = telemetry["speed_m_s"]
     travelled_m = (
         np.concatenate([[0.0], np.cumsum(speed[1:] * np.diff(times_s))])
@@ -297,66 +330,53 @@ def _umcd(telemetry: Telemetry) -> str:
     )
     for i, time_s in enumerate(times_s):
         row = {name: float(column[i]) for name, column in telemetry.columns.items()}
+        # Columns `Tick#` to `relativeHeight`: time since the first row, place, satellites, heights
+        height = f"{row['orthometric_height_m']:.3f}"
+        umcd_place = [
+            round(time_s * 600),
+            f"{time_s:.3f}",
+            round(time_s * 1000),
+            f"{row['longitude_deg']:.10f}",
+            f"{row['latitude_deg']:.10f}",
+            14,
+            height,
+            height,
+            "0.0",
+            f"{row['height_above_takeoff_m']:.3f}",
+        ]
+        # Columns `velN(M/S)` to `vel(M/S)`
+        course_rad, speed_m_s = np.radians(row["course_deg"]), row["speed_m_s"]
+        north_m_s, east_m_s = speed_m_s * np.cos(course_rad), speed_m_s * np.sin(course_rad)
+        umcd_velocity = [f"{north_m_s:.3f}", f"{east_m_s:.3f}", "0.0", f"{speed_m_s:.3f}"]
+        # Columns `quatW` to `Yaw`
+        yaw, pitch, roll = (row[f"body_{axis}_deg"] for axis in ("yaw", "pitch", "roll"))
+        umcd_attitude = [
+            *(f"{q:.6f}" for q in _quaternion(yaw, pitch, roll)),
+            *(f"{angle:.3f}" for angle in (roll, pitch, yaw)),
+        ]
+        # Columns `IMUTemp(C)` to `batteryLifePercentage`: the charge falls with the flight's time
         writer.writerow(
             [
-                *_umcd_place(time_s, row),
+                *umcd_place,
                 *_UMCD_IDLE_INSTRUMENTS,
-                *_umcd_velocity(row),
-                *_umcd_attitude(row),
+                *umcd_velocity,
+                *umcd_attitude,
                 *_UMCD_IDLE_ERRORS,
                 *[f"{travelled_m[i]:.2f}"] * 2,
                 f"{row['course_deg']:.2f}",
-                *_umcd_battery(time_s),
+                *[
+                    "42.0",
+                    "31.0",
+                    "4480",
+                    f"{4480 - time_s:.0f}",
+                    "12",
+                    f"{max(5.0, 98 - time_s / 12):.0f}",
+                ],
                 *[f"{row[f'camera_{axis}_deg']:.4f}" for axis in ("roll", "pitch", "yaw")] * 2,
                 *_UMCD_MOTORS,
             ]
         )
     return text.getvalue()
-
-
-def _umcd_place(time_s: float, row: Mapping[str, float]) -> list[Any]:
-    """Columns `Tick#` to `relativeHeight`: time since the first row, place, satellites, heights."""
-    height = f"{row['orthometric_height_m']:.3f}"
-    return [
-        round(time_s * 600),
-        f"{time_s:.3f}",
-        round(time_s * 1000),
-        f"{row['longitude_deg']:.10f}",
-        f"{row['latitude_deg']:.10f}",
-        14,
-        height,
-        height,
-        "0.0",
-        f"{row['height_above_takeoff_m']:.3f}",
-    ]
-
-
-def _umcd_velocity(row: Mapping[str, float]) -> list[str]:
-    """Columns `velN(M/S)` to `vel(M/S)`."""
-    course_rad, speed_m_s = np.radians(row["course_deg"]), row["speed_m_s"]
-    north_m_s, east_m_s = speed_m_s * np.cos(course_rad), speed_m_s * np.sin(course_rad)
-    return [f"{north_m_s:.3f}", f"{east_m_s:.3f}", "0.0", f"{speed_m_s:.3f}"]
-
-
-def _umcd_attitude(row: Mapping[str, float]) -> list[str]:
-    """Columns `quatW` to `Yaw`."""
-    yaw, pitch, roll = (row[f"body_{axis}_deg"] for axis in ("yaw", "pitch", "roll"))
-    return [
-        *(f"{q:.6f}" for q in _quaternion(yaw, pitch, roll)),
-        *(f"{angle:.3f}" for angle in (roll, pitch, yaw)),
-    ]
-
-
-def _umcd_battery(time_s: float) -> list[str]:
-    """Columns `IMUTemp(C)` to `batteryLifePercentage`: the charge falls with the flight's time."""
-    return [
-        "42.0",
-        "31.0",
-        "4480",
-        f"{4480 - time_s:.0f}",
-        "12",
-        f"{max(5.0, 98 - time_s / 12):.0f}",
-    ]
 
 
 def _quaternion(
@@ -468,24 +488,6 @@ def _gpx(telemetry: Telemetry) -> str:
     )
 
 
-def _gps_tags(row: Mapping[str, float], moment: datetime) -> dict[int, Any]:
-    """EXIF's GPS directory."""
-    return {
-        GPS.GPSLatitudeRef: "N" if row["latitude_deg"] >= 0 else "S",
-        GPS.GPSLatitude: _degrees_minutes_seconds(row["latitude_deg"]),
-        GPS.GPSLongitudeRef: "E" if row["longitude_deg"] >= 0 else "W",
-        GPS.GPSLongitude: _degrees_minutes_seconds(row["longitude_deg"]),
-        GPS.GPSAltitudeRef: b"\x00" if row["orthometric_height_m"] >= 0 else b"\x01",
-        GPS.GPSAltitude: IFDRational(round(abs(row["orthometric_height_m"]) * 1000), 1000),
-        GPS.GPSDateStamp: moment.strftime("%Y:%m:%d"),
-        GPS.GPSTimeStamp: (
-            IFDRational(moment.hour, 1),
-            IFDRational(moment.minute, 1),
-            IFDRational(moment.second * 1000 + moment.microsecond // 1000, 1000),
-        ),
-    }
-
-
 def _degrees_minutes_seconds(angle_deg: float) -> tuple[IFDRational, IFDRational, IFDRational]:
     millionths = round(abs(angle_deg) * 3600 * 10**6)
     degrees, rest = divmod(millionths, 3600 * 10**6)
@@ -493,21 +495,74 @@ def _degrees_minutes_seconds(angle_deg: float) -> tuple[IFDRational, IFDRational
     return IFDRational(degrees, 1), IFDRational(minutes, 1), IFDRational(seconds, 10**6)
 
 
-def _xmp(row: Mapping[str, float], moment: datetime) -> bytes:
-    values = {
-        "UTCAtExposure": f"{moment:%Y-%m-%dT%H:%M:%S}.{moment.microsecond:06d}",
-        "GpsLatitude": f"{row['latitude_deg']:.9f}",
-        "GpsLongitude": f"{row['longitude_deg']:.9f}",
-        "AbsoluteAltitude": f"{row['orthometric_height_m']:+.3f}",
-        "RelativeAltitude": f"{row['height_above_takeoff_m']:+.3f}",
-        "GimbalYawDegree": f"{(row['camera_yaw_deg'] + 180) % 360 - 180:+.3f}",
-        "GimbalPitchDegree": f"{row['camera_pitch_deg']:+.3f}",
-        "GimbalRollDegree": f"{row['camera_roll_deg']:+.3f}",
+MARK = "simulation.json"
+"""The file that marks a folder that holds simulated flights, and may be replaced by another simulation."""
+
+PICTURES_MARK = "boxes.json"
+"""The same of simulated pictures: their COCO file, so that it is the one JSON file of its folder."""
+
+_MADE_BY = "sorvolo simulate"
+
+
+@contextmanager
+def simulation_folder(folder: Path, mark: str, description: Mapping[str, Any]) -> Iterator[Path]:
+    """A hidden folder beside `folder`, holding the file `mark` with the description; renamed when the block ends well.
+
+    Raises SettingsError for a folder that holds anything but an earlier simulation, StoreError for a full disk.
+    """
+    folder = folder.resolve()
+    if folder.exists() and not folder.is_dir():
+        raise SettingsError(f"{folder} is a file; choose a folder for the simulation")
+    if folder.is_dir() and any(folder.iterdir()) and not _is_ours(folder):
+        raise SettingsError(
+            f"{folder} is not empty and holds no earlier simulation; choose another folder, or empty it"
+        )
+    partial = folder.with_name(f".{folder.name}.partial")
+    with writing(folder):
+        _remove_ours(partial)
+        partial.mkdir(parents=True)
+    write_json(partial / mark, description)
+    yield partial
+    # Rename the finished folder to its place; an earlier simulation steps aside first and goes last
+    old = folder.with_name(f".{folder.name}.old")
+    with writing(folder):
+        _remove_ours(old)
+        if folder.exists():
+            os.replace(folder, old)
+        os.replace(partial, folder)
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def simulation_description(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """What made the simulation: settings, seed and versions, by which it can be made again."""
+    return {
+        "made_by": _MADE_BY,
+        "versions": {
+            "sorvolo": __version__,
+            "python": platform.python_version(),
+            "numpy": version("numpy"),
+            "opencv": version("opencv-contrib-python-headless"),
+            "av": version("av"),
+        },
+        "settings": settings,
     }
-    attributes = " ".join(f'drone-dji:{name}="{value}"' for name, value in values.items())
-    return (
-        '<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="adobe:ns:meta/">'
-        '<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
-        f'<rdf:Description rdf:about="" xmlns:drone-dji="{_DJI}" {attributes}/>'
-        '</rdf:RDF></x:xmpmeta><?xpacket end="w"?>'
-    ).encode()
+
+
+def _is_ours(folder: Path) -> bool:
+    return any(
+        f'"made_by":"{_MADE_BY}"' in _start_of(folder / mark) for mark in (MARK, PICTURES_MARK)
+    )
+
+
+def _start_of(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return file.read(4096).decode("utf-8", "replace")
+    except OSError:
+        return ""
+
+
+def _remove_ours(folder: Path) -> None:
+    """Delete what a killed simulation left; it wrote its mark first."""
+    if folder.is_dir() and (_is_ours(folder) or not any(folder.iterdir())):
+        shutil.rmtree(folder)

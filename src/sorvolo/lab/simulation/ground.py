@@ -11,8 +11,8 @@ import numpy as np
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.lab.simulation.ground_painting import (
-    Area,
-    Canvas,
+    GroundArea,
+    GroundCanvas,
     GroundRaster,
     away_from,
     distance_to_curve,
@@ -36,7 +36,7 @@ class GroundKind(StrEnum):
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
+class GroundLayout:
     """Where on the ground things may stand, in site metres: rows of (east, north, yaw_deg), each (N, 3)."""
 
     houses: Floats
@@ -50,7 +50,7 @@ class PaintedGround:
     """The ground's picture and the places on it where things stand."""
 
     raster: GroundRaster
-    layout: Layout
+    layout: GroundLayout
 
 
 def orthophoto_ground(rgb: ImageRGB, m_per_px: float) -> PaintedGround:
@@ -65,14 +65,14 @@ def orthophoto_ground(rgb: ImageRGB, m_per_px: float) -> PaintedGround:
         height * m_per_px / 2,
         (m_per_px, m_per_px),
     )
-    return PaintedGround(raster, Layout(_NOWHERE, _NOWHERE, _NOWHERE, _NOWHERE))
+    return PaintedGround(raster, GroundLayout(_NOWHERE, _NOWHERE, _NOWHERE, _NOWHERE))
 
 
 def paint_ground(
-    kind: GroundKind, area: Area, m_per_px: float, rng: np.random.Generator
+    kind: GroundKind, area: GroundArea, m_per_px: float, rng: np.random.Generator
 ) -> PaintedGround:
     """Paint `area` at `m_per_px`; the same `rng` state gives the same ground."""
-    canvas = Canvas.over(area, m_per_px, rng)
+    canvas = GroundCanvas.over(area, m_per_px, rng)
     painter = {
         GroundKind.DIRT: _dirt,
         GroundKind.COUNTRYSIDE: _countryside,
@@ -86,7 +86,7 @@ def paint_ground(
     return PaintedGround(raster, layout)
 
 
-def _dirt(canvas: Canvas) -> Layout:
+def _dirt(canvas: GroundCanvas) -> GroundLayout:
     ones = np.ones(canvas.coarse_shape, np.float32)
     field = canvas.field
     canvas.lay(ones, (158, 134, 104), 0.085, 0.07 * field(14, 5, 1.6) + 0.03 * field(0.6, 0.3))
@@ -108,10 +108,10 @@ def _dirt(canvas: Canvas) -> Layout:
             )
     canvas.develop()
     canvas.stones(1.4, (0.05, 0.4), (164, 152, 136), np.clip(0.25 + gravel, 0, 1))
-    return Layout(_NOWHERE, _NOWHERE, scatter(canvas, 0.004, 3.0, 2.0), _NOWHERE)
+    return GroundLayout(_NOWHERE, _NOWHERE, scatter(canvas, 0.004, 3.0, 2.0), _NOWHERE)
 
 
-def _countryside(canvas: Canvas) -> Layout:
+def _countryside(canvas: GroundCanvas) -> GroundLayout:
     ones = np.ones(canvas.coarse_shape, np.float32)
     field, rng = canvas.field, canvas.rng
     canvas.lay(
@@ -168,11 +168,11 @@ def _countryside(canvas: Canvas) -> Layout:
     trees = scatter(canvas, 1 / 150, 5.0, 3.0, far_from_houses)
     hedge = soft(-np.abs(border), -0.7, 0.2) + far_from_houses * soft(field(9.0, 3.0), 1.0, 0.2)
     bushes = scatter(canvas, 1 / 90, 1.6, 1.0, hedge)
-    return Layout(houses, trees, bushes, _NOWHERE)
+    return GroundLayout(houses, trees, bushes, _NOWHERE)
 
 
 def _plant_rows(
-    canvas: Canvas,
+    canvas: GroundCanvas,
     cover: FieldF32,
     angle_deg: float,
     period_m: float,
@@ -190,7 +190,7 @@ def _plant_rows(
     )
 
 
-def _urban(canvas: Canvas) -> Layout:
+def _urban(canvas: GroundCanvas) -> GroundLayout:
     ones = np.ones(canvas.coarse_shape, np.float32)
     field, rng, area = canvas.field, canvas.rng, canvas.area
     canvas.lay(ones, (98, 98, 100), 0.1, 0.05 * field(12, 4, 1.2) + 0.03 * field(0.5, 0.25))
@@ -201,71 +201,6 @@ def _urban(canvas: Canvas) -> Layout:
     # oil, repairs and wear
     canvas.lay(0.5 * soft(field(3, 0.9, 0.4), 1.6, 0.4), (62, 62, 64), 0.08, 0.03 * field(0.5))
     canvas.develop()
-    _paint_kerbs(canvas, blocks)
-    _paint_cracks(canvas, 0.03)
-    houses, parkings = _build_yards(canvas, yards)
-    _paint_roads(canvas, blocks)
-    garden = sum(
-        (rectangle_cover(canvas, w + 3, s + 3, e - 3, n - 3) for w, s, e, n in lawns), 0 * ones
-    )
-    trees = scatter(canvas, 1 / 90, 5.0, 1.0, garden)
-    kerb_parkings = [
-        (w - 1.3, 0.5 * (s + n) + d, 90.0) for w, s, _, n in blocks for d in (-6.0, 1.0)
-    ]
-    return Layout(
-        np.array(houses).reshape(-1, 3),
-        trees,
-        _NOWHERE,
-        np.array(parkings + kerb_parkings).reshape(-1, 3),
-    )
-
-
-def _build_yards(
-    canvas: Canvas, yards: Sequence[_Block]
-) -> tuple[list[tuple[float, float, float]], list[tuple[float, float, float]]]:
-    """The places (east, north, yaw) of houses in the yards, and of the parked cars, whose places are painted."""
-    houses: list[tuple[float, float, float]] = []
-    parkings: list[tuple[float, float, float]] = []
-    for west, south, east, north in yards:
-        parkings += _paint_parking(canvas, west + 2.2, south + 2.2, east - 2.2)
-        if north - south > 22 and east - west > 18:
-            houses.append(((west + east) / 2, north - 8.5, 0.0))
-    return houses, parkings
-
-
-def _paint_blocks(
-    canvas: Canvas, blocks: Sequence[_Block], lawns: Sequence[_Block], yards: Sequence[_Block]
-) -> None:
-    """Lawns and paved yards within their pavements."""
-    field = canvas.field
-    for west, south, east, north in lawns:
-        inside = rectangle_cover(canvas, west + 1.8, south + 1.8, east - 1.8, north - 1.8)
-        canvas.lay(inside, (96, 112, 62), 0.18, 0.1 * field(5, 1.5, 0.4), is_plant=True)
-    for west, south, east, north in yards:
-        inside = rectangle_cover(canvas, west + 1.8, south + 1.8, east - 1.8, north - 1.8)
-        canvas.lay(inside, (118, 117, 115), 0.09, 0.05 * field(6, 1.5, 0.5))
-    for west, south, east, north in blocks:
-        rim = rectangle_cover(canvas, west, south, east, north)
-        rim = rim * (1 - rectangle_cover(canvas, west + 1.8, south + 1.8, east - 1.8, north - 1.8))
-        canvas.lay(rim, (168, 164, 156), 0.06, 0.04 * field(3, 0.8))
-
-
-def _city_blocks(area: Area, rng: np.random.Generator) -> list[_Block]:
-    """West, south, east, north of the blocks that roads leave between them."""
-
-    def cuts(low: float, high: float) -> list[tuple[float, float]]:
-        spans, at = [], low - rng.uniform(5, 25)
-        while at < high:
-            size = rng.uniform(26, 42)
-            spans.append((at, at + size))
-            at += size + rng.uniform(6.5, 8.5)
-        return spans
-
-    columns, rows = cuts(area.west_m, area.east_m), cuts(area.south_m, area.north_m)
-    return [(w, s, e, n) for w, e in columns for s, n in rows]
-
-
-def _paint_kerbs(canvas: Canvas, blocks: Sequence[_Block]) -> None:
     for west, south, east, north in blocks:
         for inset, tone in ((0.0, 196.0), (1.8, 140.0)):
             ring = np.array(
@@ -284,9 +219,17 @@ def _paint_kerbs(canvas: Canvas, blocks: Sequence[_Block]) -> None:
         for at in np.arange(south + 0.6, north - 0.4, 0.9):
             for low, high in ((west, west + 1.8), (east - 1.8, east)):
                 canvas.stroke(np.array([[low, at], [high, at]]), 0.02, np.array([146, 143, 138]))
-
-
-def _paint_roads(canvas: Canvas, blocks: Sequence[_Block]) -> None:
+    width_m, height_m = canvas.area.size_m
+    for _ in range(int(0.03 * width_m * height_m)):
+        start = np.array(
+            [
+                canvas.rng.uniform(canvas.area.west_m, canvas.area.east_m),
+                canvas.rng.uniform(canvas.area.south_m, canvas.area.north_m),
+            ]
+        )
+        steps = np.cumsum(canvas.rng.normal(0, 0.35, (8, 2)) + canvas.rng.normal(0, 0.3, 2), axis=0)
+        canvas.stroke(start + steps, 0.02, np.array([66.0, 65, 64]))
+    houses, parkings = _build_yards(canvas, yards)
     white = np.array([222.0, 222, 216])
     for west, south, east, north in blocks:
         for at in np.arange(west, east - 2, 5.0):  # the dashed middle of the road to the south
@@ -312,10 +255,68 @@ def _paint_roads(canvas: Canvas, blocks: Sequence[_Block]) -> None:
         canvas.polygon(
             hole + 0.35 * np.column_stack([np.cos(angle), np.sin(angle)]), np.array([70.0, 68, 66])
         )
+    garden = sum(
+        (rectangle_cover(canvas, w + 3, s + 3, e - 3, n - 3) for w, s, e, n in lawns), 0 * ones
+    )
+    trees = scatter(canvas, 1 / 90, 5.0, 1.0, garden)
+    kerb_parkings = [
+        (w - 1.3, 0.5 * (s + n) + d, 90.0) for w, s, _, n in blocks for d in (-6.0, 1.0)
+    ]
+    return GroundLayout(
+        np.array(houses).reshape(-1, 3),
+        trees,
+        _NOWHERE,
+        np.array(parkings + kerb_parkings).reshape(-1, 3),
+    )
+
+
+def _build_yards(
+    canvas: GroundCanvas, yards: Sequence[_Block]
+) -> tuple[list[tuple[float, float, float]], list[tuple[float, float, float]]]:
+    """The places (east, north, yaw) of houses in the yards, and of the parked cars, whose places are painted."""
+    houses: list[tuple[float, float, float]] = []
+    parkings: list[tuple[float, float, float]] = []
+    for west, south, east, north in yards:
+        parkings += _paint_parking(canvas, west + 2.2, south + 2.2, east - 2.2)
+        if north - south > 22 and east - west > 18:
+            houses.append(((west + east) / 2, north - 8.5, 0.0))
+    return houses, parkings
+
+
+def _paint_blocks(
+    canvas: GroundCanvas, blocks: Sequence[_Block], lawns: Sequence[_Block], yards: Sequence[_Block]
+) -> None:
+    """Lawns and paved yards within their pavements."""
+    field = canvas.field
+    for west, south, east, north in lawns:
+        inside = rectangle_cover(canvas, west + 1.8, south + 1.8, east - 1.8, north - 1.8)
+        canvas.lay(inside, (96, 112, 62), 0.18, 0.1 * field(5, 1.5, 0.4), is_plant=True)
+    for west, south, east, north in yards:
+        inside = rectangle_cover(canvas, west + 1.8, south + 1.8, east - 1.8, north - 1.8)
+        canvas.lay(inside, (118, 117, 115), 0.09, 0.05 * field(6, 1.5, 0.5))
+    for west, south, east, north in blocks:
+        rim = rectangle_cover(canvas, west, south, east, north)
+        rim = rim * (1 - rectangle_cover(canvas, west + 1.8, south + 1.8, east - 1.8, north - 1.8))
+        canvas.lay(rim, (168, 164, 156), 0.06, 0.04 * field(3, 0.8))
+
+
+def _city_blocks(area: GroundArea, rng: np.random.Generator) -> list[_Block]:
+    """West, south, east, north of the blocks that roads leave between them."""
+
+    def cuts(low: float, high: float) -> list[tuple[float, float]]:
+        spans, at = [], low - rng.uniform(5, 25)
+        while at < high:
+            size = rng.uniform(26, 42)
+            spans.append((at, at + size))
+            at += size + rng.uniform(6.5, 8.5)
+        return spans
+
+    columns, rows = cuts(area.west_m, area.east_m), cuts(area.south_m, area.north_m)
+    return [(w, s, e, n) for w, e in columns for s, n in rows]
 
 
 def _paint_parking(
-    canvas: Canvas, west: float, south: float, east: float
+    canvas: GroundCanvas, west: float, south: float, east: float
 ) -> list[tuple[float, float, float]]:
     """Lines of a row of parking lots, 2.5 m by 5 m; returns their places."""
     lots = []
@@ -329,20 +330,7 @@ def _paint_parking(
     return lots
 
 
-def _paint_cracks(canvas: Canvas, per_m2: float) -> None:
-    width_m, height_m = canvas.area.size_m
-    for _ in range(int(per_m2 * width_m * height_m)):
-        start = np.array(
-            [
-                canvas.rng.uniform(canvas.area.west_m, canvas.area.east_m),
-                canvas.rng.uniform(canvas.area.south_m, canvas.area.north_m),
-            ]
-        )
-        steps = np.cumsum(canvas.rng.normal(0, 0.35, (8, 2)) + canvas.rng.normal(0, 0.3, 2), axis=0)
-        canvas.stroke(start + steps, 0.02, np.array([66.0, 65, 64]))
-
-
-def _sand(canvas: Canvas) -> Layout:
+def _sand(canvas: GroundCanvas) -> GroundLayout:
     """Bare sand: two to four grey levels of contrast at the scales that features need, and little else."""
     ones = np.ones(canvas.coarse_shape, np.float32)
     field = canvas.field
@@ -353,4 +341,4 @@ def _sand(canvas: Canvas) -> Layout:
         0.012 * field(20, 8) + 0.006 * field(2.5, 0.9) + 0.004 * field(0.4),
     )
     canvas.develop((0.05, 0.12, 0.3), (1.0, 1.0, 1.0))
-    return Layout(_NOWHERE, _NOWHERE, _NOWHERE, _NOWHERE)
+    return GroundLayout(_NOWHERE, _NOWHERE, _NOWHERE, _NOWHERE)

@@ -12,7 +12,7 @@ _COARSE = 4  # materials are mixed on a raster this many times coarser than the 
 
 
 @dataclass(frozen=True)
-class Area:
+class GroundArea:
     """An upright rectangle of ground in site metres."""
 
     west_m: float
@@ -40,10 +40,10 @@ class GroundRaster:
     m_per_px: tuple[float, float]
 
     @property
-    def area(self) -> Area:
+    def area(self) -> GroundArea:
         """The ground that it shows."""
         height, width = self.rgb.shape[:2]
-        return Area(
+        return GroundArea(
             self.west_m,
             self.north_m - height * self.m_per_px[1],
             self.west_m + width * self.m_per_px[0],
@@ -78,11 +78,11 @@ class GroundRaster:
         )
 
 
-class Canvas:
+class GroundCanvas:
     """The ground while it is painted: a coarse mix of materials first, then fine strokes on the full raster."""
 
     def __init__(
-        self, area: Area, m_per_px: float, size_px: tuple[int, int], rng: np.random.Generator
+        self, area: GroundArea, m_per_px: float, size_px: tuple[int, int], rng: np.random.Generator
     ) -> None:
         self.area, self.m_per_px, self.size_px, self.rng = area, m_per_px, size_px, rng
         self.coarse_shape = (-(-size_px[1] // _COARSE), -(-size_px[0] // _COARSE))
@@ -98,7 +98,7 @@ class Canvas:
         self.north = area.north_m - (rows + 0.5) * step
 
     @classmethod
-    def over(cls, area: Area, m_per_px: float, rng: np.random.Generator) -> "Canvas":
+    def over(cls, area: GroundArea, m_per_px: float, rng: np.random.Generator) -> "GroundCanvas":
         """An empty canvas over this area."""
         width_m, height_m = area.size_m
         return cls(
@@ -250,7 +250,7 @@ def soft(field: FieldF32, threshold: float, softness: float) -> FieldF32:
 
 
 def distance_to_curve(
-    canvas: Canvas, angle_deg: float, offset_m: float, wander_m: float, scale_m: float
+    canvas: GroundCanvas, angle_deg: float, offset_m: float, wander_m: float, scale_m: float
 ) -> FieldF32:
     """(height, width) signed metres from a wandering line through the area, positive on its left."""
     angle = np.radians(angle_deg)
@@ -269,7 +269,7 @@ def distance_to_curve(
 
 
 def scatter(
-    canvas: Canvas, per_m2: float, gap_m: float, margin_m: float, keep: FieldF32 | None = None
+    canvas: GroundCanvas, per_m2: float, gap_m: float, margin_m: float, keep: FieldF32 | None = None
 ) -> Floats:
     """(N, 3) random places at least `gap_m` apart, with a random heading, where `keep` is above a half."""
     width_m, height_m = canvas.area.size_m
@@ -294,7 +294,7 @@ def scatter(
 
 
 def rectangle_cover(
-    canvas: Canvas, west: float, south: float, east: float, north: float
+    canvas: GroundCanvas, west: float, south: float, east: float, north: float
 ) -> FieldF32:
     """1 inside an upright rectangle of site metres, 0 outside."""
     inside = np.minimum(
@@ -304,7 +304,7 @@ def rectangle_cover(
     return soft(inside.astype(np.float32), 0.0, canvas.m_per_px * _COARSE)
 
 
-def away_from(canvas: Canvas, places: Floats, radius_m: float) -> FieldF32:
+def away_from(canvas: GroundCanvas, places: Floats, radius_m: float) -> FieldF32:
     """0 within `radius_m` of the places, (N, 3), 1 elsewhere."""
     free = np.ones(canvas.coarse_shape, np.float32)
     for east, north, _ in places:

@@ -1,8 +1,12 @@
 """Single pictures of many small sites, each seen once from its own height, angle and light, with the truth."""
 
-from dataclasses import dataclass, replace
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from sorvolo.errors import SettingsError
@@ -11,16 +15,126 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.level_ground import footprint, ground_from_pixels
 from sorvolo.geometry.polygons import polygon_area
 from sorvolo.geometry.pose import Pose, site_from_body_nadir_rotation
-from sorvolo.lab.simulation.ground import GroundKind, Layout, PaintedGround, paint_ground
-from sorvolo.lab.simulation.ground_painting import Area, GroundRaster
-from sorvolo.lab.simulation.photographed import photographed
+from sorvolo.lab.simulation.flight import line_kernel
+from sorvolo.lab.simulation.flight_files import (
+    PICTURES_MARK,
+    read_orthophoto,
+    simulation_description,
+    simulation_folder,
+    write_json,
+)
+from sorvolo.lab.simulation.ground import (
+    GroundKind,
+    GroundLayout,
+    PaintedGround,
+    orthophoto_ground,
+    paint_ground,
+)
+from sorvolo.lab.simulation.ground_painting import GroundArea, GroundRaster
 from sorvolo.lab.simulation.rendering import render, render_labels
 from sorvolo.lab.simulation.settings import LaterSettings, SimulationSettings, WeatherSettings
-from sorvolo.lab.simulation.thermal import heat_picture, warm_day
-from sorvolo.lab.simulation.truth import box_rows
+from sorvolo.lab.simulation.truth import box_rows, coco_categories
 from sorvolo.lab.simulation.world import Day, World, build_day, is_free, scenery
-from sorvolo.search.drawing.objects import LYING, POSES, Label, Thing, new_kind, new_size
+from sorvolo.paths import AnyPath, as_path
+from sorvolo.search.drawing.noise import layer
+from sorvolo.search.drawing.objects import (
+    GROUND_LEVEL,
+    LYING,
+    POSES,
+    Thing,
+    ThingLabel,
+    new_kind,
+    new_size,
+    warm_body,
+)
 from sorvolo.search.drawing.view import camera_view, ray_grid
+from sorvolo.store.ahead import in_order
+from sorvolo.store.atomic import atomic_write_bytes, writing
+from sorvolo.store.images import jpeg_from_image
+
+
+def photographed(image: ImageRGB, gains: Floats, rng: np.random.Generator) -> ImageRGB:
+    """The rendered picture as a camera records it; `gains` (3,) is the light's colour and strength.
+
+    In the dark the camera turns its own gain up, and its noise with it.
+    """
+    height, width = image.shape[:2]
+    light = image.astype(np.float32) * gains.astype(np.float32)
+    light *= (
+        1 + 0.12 * np.clip(layer(rng, (height, width), 0.4 * width), -2, 2)[..., None]
+    )  # clouds' shadows
+    if rng.uniform() < 0.2:
+        air = rng.uniform(170, 230) * np.array([0.96, 1.0, 1.05]) * gains
+        haze = np.float32(rng.uniform(0.05, 0.4))
+        light += haze * (air.astype(np.float32) - light)
+    y, x = np.mgrid[0:height, 0:width].astype(np.float32)
+    radius2 = ((x - width / 2) ** 2 + (y - height / 2) ** 2) / (width / 2) ** 2
+    light /= (1 + np.float32(rng.uniform(0, 0.3)) * radius2)[..., None]
+    camera_gain = float(np.clip(rng.uniform(60, 150) / max(light.mean(), 1.0), 0.6, 5.0))
+    light *= np.float32(camera_gain if rng.uniform() < 0.7 else np.clip(camera_gain, 0.8, 1.25))
+    balance = rng.normal(1, 0.05, 3).astype(np.float32)
+    light = _blurred(light * balance, rng)
+    noise = rng.uniform(0.5, 3.5) * max(1.0, camera_gain) ** 0.7
+    light += np.float32(noise) * rng.standard_normal(light.shape, dtype=np.float32)
+    bent = 255 * np.clip(light / 255, 0, 1) ** np.float32(rng.uniform(0.8, 1.25))
+    return recompressed(np.round(bent).astype(np.uint8), rng)
+
+
+def recompressed(image: ImageRGB, rng: np.random.Generator) -> ImageRGB:
+    """The picture after lossy compression, colour at half its resolution as in videos."""
+    quality = int(rng.integers(45, 96))
+    _, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return np.ascontiguousarray(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1])  # type: ignore[index]
+
+
+def _blurred(
+    image: np.ndarray[tuple[int, ...], np.dtype[np.float32]], rng: np.random.Generator
+) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
+    """Out of focus a little, and in a third of the pictures moved during the exposure."""
+    sigma_px = rng.uniform(0.0, 1.1)
+    if sigma_px > 0.3:
+        image = np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px), np.float32)
+    if rng.uniform() < 0.33:
+        length_px, angle = rng.uniform(1, 7), rng.uniform(0, np.pi)
+        kernel = line_kernel(length_px * np.array([np.cos(angle), np.sin(angle)]))
+        image = np.asarray(cv2.filter2D(image, -1, kernel), np.float32)
+    return image
+
+
+def warm_day(day: Day, bare: GroundRaster, rng: np.random.Generator) -> Day:
+    """The day with warmth for colour, the same in its three channels; `bare` is its ground without shadows.
+
+    By day the sun's shadows are cool; by night they are gone. Two cars in three have a warm engine.
+    """
+    has_sun = rng.uniform() < 0.4
+    raster = day.ground if has_sun else bare.resampled(day.ground.m_per_px[0])
+    spread, turn = rng.uniform(0.1, 0.5), 1.0 if has_sun else rng.choice((-1.0, 1.0))
+    grey = cv2.GaussianBlur(raster.rgb.mean(axis=2).astype(np.float32), (0, 0), 1.2)
+    warmth = GROUND_LEVEL + np.float32(spread * turn) * (grey - grey.mean())
+    warmth += np.float32(rng.uniform(2, 9)) * layer(rng, warmth.shape[:2], 4.0 / raster.m_per_px[0])
+    ground = replace(raster, rgb=np.dstack([np.clip(warmth, 0, 255).astype(np.uint8)] * 3))
+    bodies = {thing.id: warm_body(thing, day.bodies[thing.id], rng) for thing in day.things}
+    return replace(day, ground=ground, bodies=bodies)
+
+
+def heat_picture(image: ImageRGB, rng: np.random.Generator) -> ImageRGB:
+    """The rendered warmth as a thermal camera shows it: soft, noisy, striped, stretched to its own range."""
+    warmth = image[..., 0].astype(np.float32)
+    warmth = np.asarray(cv2.GaussianBlur(warmth, (0, 0), rng.uniform(0.5, 1.3)), np.float32)
+    warmth = warmth + np.float32(rng.uniform(0.5, 3.0)) * rng.standard_normal(
+        warmth.shape, dtype=np.float32
+    )
+    stripes = rng.standard_normal(warmth.shape[1], dtype=np.float32)
+    warmth += np.float32(rng.uniform(0, 1.5)) * stripes
+    low, high = np.percentile(warmth, (0.5, 99.8))
+    room = max(float(high - low), 40.0)
+    shown = np.clip(
+        (warmth - low + rng.uniform(0, 0.3) * room) / (room * rng.uniform(1.0, 1.5)), 0, 1
+    )
+    if rng.uniform() < 0.35:  # black hot
+        shown = 1 - shown
+    return recompressed(np.dstack([np.round(255 * shown).astype(np.uint8)] * 3), rng)
+
 
 SMALLEST_PX = 4
 """An object whose box has no side this long, or of which less than `LEAST_VISIBLE` shows, is a region to ignore."""
@@ -116,7 +230,18 @@ def simulate_picture(
     things = scenery(ground, painted.layout, rng) if ground != "orthophoto" else ()
     if rng.uniform() >= settings.empty_share:
         things += _targets(things, painted.layout, camera, pose, rng)
-    day = _new_day(painted.raster, things, m_per_px, rng)
+    # The site under a light of its own: mostly day, sometimes dusk, street lamps or snow
+    sky = rng.uniform()
+    weather = WeatherSettings(
+        has_clouds=False,
+        wind_m=0.0,
+        brightness=float(
+            rng.uniform(0.05, 0.12) if sky < 0.05 else rng.uniform(0.2, 0.6) if sky < 0.15 else 1.0
+        ),
+        snow=float(rng.uniform(0.3, 1.0)) if rng.uniform() < 0.05 else 0.0,
+    )
+    lit = SimulationSettings(seed=int(rng.integers(2**31)), later=LaterSettings(weather=weather))
+    day = build_day(World(painted.raster, (things, things)), lit, 2, m_per_px)
     view = camera_view(camera, pose, ray_grid(camera))
     if is_thermal:
         image = heat_picture(render(warm_day(day, painted.raster, rng), view, pose, 0.0), rng)
@@ -177,13 +302,13 @@ def _m_per_px(camera: Camera, pose: Pose) -> float:
     return float(np.linalg.norm(pose.translation_m - [*middle, 0.0])) / camera.fx_px
 
 
-def _needed_area(camera: Camera, pose: Pose) -> Area:
+def _needed_area(camera: Camera, pose: Pose) -> GroundArea:
     outline_m = footprint(camera, pose)
     low, high = outline_m.min(axis=0) - _MARGIN_M, outline_m.max(axis=0) + _MARGIN_M
-    return Area(float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+    return GroundArea(float(low[0]), float(low[1]), float(high[0]), float(high[1]))
 
 
-def _cut(orthophoto: PaintedGround, area: Area, rng: np.random.Generator) -> PaintedGround:
+def _cut(orthophoto: PaintedGround, area: GroundArea, rng: np.random.Generator) -> PaintedGround:
     """A random piece of an orthophoto laid where the area is."""
     raster = orthophoto.raster
     columns, rows = (round(size / step) for size, step in zip(area.size_m, raster.m_per_px))
@@ -196,42 +321,27 @@ def _cut(orthophoto: PaintedGround, area: Area, rng: np.random.Generator) -> Pai
     return PaintedGround(piece, orthophoto.layout)
 
 
-def _new_day(
-    ground: GroundRaster, things: tuple[Thing, ...], m_per_px: float, rng: np.random.Generator
-) -> Day:
-    """The site under a light of its own: mostly day, sometimes dusk, street lamps or snow."""
-    sky = rng.uniform()
-    weather = WeatherSettings(
-        has_clouds=False,
-        wind_m=0.0,
-        brightness=float(
-            rng.uniform(0.05, 0.12) if sky < 0.05 else rng.uniform(0.2, 0.6) if sky < 0.15 else 1.0
-        ),
-        snow=float(rng.uniform(0.3, 1.0)) if rng.uniform() < 0.05 else 0.0,
-    )
-    settings = SimulationSettings(
-        seed=int(rng.integers(2**31)), later=LaterSettings(weather=weather)
-    )
-    return build_day(World(ground, (things, things)), settings, 2, m_per_px)
-
-
 def _targets(
-    others: tuple[Thing, ...], layout: Layout, camera: Camera, pose: Pose, rng: np.random.Generator
+    others: tuple[Thing, ...],
+    layout: GroundLayout,
+    camera: Camera,
+    pose: Pose,
+    rng: np.random.Generator,
 ) -> tuple[Thing, ...]:
     """People, cars and small objects in sight, as many as a lonely field, a street or a crowd has."""
     ground_m2 = polygon_area([footprint(camera, pose)])
     counts = {
         label: int(min(rng.poisson(rng.choice(means)), ground_m2 / room_m2))
         for label, means, room_m2 in (
-            (Label.PERSON, (0.5, 3.0, 9.0), 10.0),
-            (Label.CAR, (0.2, 2.0, 8.0), 45.0),
-            (Label.SMALL, (0.5, 2.0, 6.0), 6.0),
+            (ThingLabel.PERSON, (0.5, 3.0, 9.0), 10.0),
+            (ThingLabel.CAR, (0.2, 2.0, 8.0), 45.0),
+            (ThingLabel.SMALL, (0.5, 2.0, 6.0), 6.0),
         )
     }
     placed: list[Thing] = []
-    for label in (Label.CAR, Label.PERSON, Label.SMALL):
+    for label in (ThingLabel.CAR, ThingLabel.PERSON, ThingLabel.SMALL):
         for _ in range(counts[label]):
-            kind = _person(rng) if label is Label.PERSON else new_kind(label, rng)
+            kind = _person(rng) if label is ThingLabel.PERSON else new_kind(label, rng)
             size_m = new_size(label, kind, rng)
             new = Thing(
                 len(others) + len(placed) + 1,
@@ -255,25 +365,25 @@ def _targets(
 def _person(rng: np.random.Generator) -> str:
     """A kind of person: mostly one drawn limb by limb, else the plain figures of simulated flights."""
     if rng.uniform() < 0.25:
-        return LYING if rng.uniform() < 0.2 else str(Label.PERSON)
+        return LYING if rng.uniform() < 0.2 else str(ThingLabel.PERSON)
     return str(rng.choice(list(POSES), p=(0.28, 0.34, 0.08, 0.08, 0.1, 0.12)))
 
 
 def _place(
-    label: Label,
+    label: ThingLabel,
     placed: list[Thing],
-    layout: Layout,
+    layout: GroundLayout,
     camera: Camera,
     pose: Pose,
     rng: np.random.Generator,
 ) -> tuple[float, float, float]:
     """East, north and yaw of a likely place: anywhere in the picture, on a parking lot, or beside another thing."""
-    if label is Label.CAR and len(layout.parkings) and rng.uniform() < 0.6:
+    if label is ThingLabel.CAR and len(layout.parkings) and rng.uniform() < 0.6:
         east, north, yaw_deg = layout.parkings[rng.integers(len(layout.parkings))]
         return float(east), float(north), float(yaw_deg + 180 * rng.integers(2) + rng.normal(0, 2))
     if placed and rng.uniform() < 0.35:
         near = placed[int(rng.integers(len(placed)))]
-        if label is Label.CAR and near.label is Label.CAR:  # parked side by side
+        if label is ThingLabel.CAR and near.label is ThingLabel.CAR:  # parked side by side
             side_m = near.turn[:2, 1] * float(rng.choice((-1, 1)) * rng.uniform(3.2, 4.0))
             return (
                 near.east_m + side_m[0],
@@ -286,3 +396,86 @@ def _place(
     point_px: Floats = rng.uniform([0, 0], [camera.width_px, camera.height_px])[None]
     east, north = ground_from_pixels(camera, pose, point_px)[0]
     return float(east), float(north), float(rng.uniform(0, 360))
+
+
+_MOST_THREADS = 8  # each holds a picture that is drawn, of tens of megabytes
+
+
+@dataclass(frozen=True)
+class PicturesProgress:
+    """How far it is: pictures written, boxes in them (those to be ignored left out), seconds."""
+
+    pictures_done: int
+    pictures_total: int
+    boxes: int
+    seconds: float
+
+
+def simulate_pictures(
+    folder: AnyPath,
+    settings: PictureSettings,
+    ground_file: AnyPath | None = None,
+    ground_m_per_px: float | None = None,
+) -> Iterator[PicturesProgress]:
+    """Write `images/*.jpg` and `boxes.json` (COCO) to `folder`, which appears whole or not at all.
+
+    Each picture is a site of its own; its `flight` in the COCO file names it. `ground_file` is the orthophoto of
+    settings whose ground is "orthophoto". Raises SettingsError for a folder that holds anything but an earlier
+    simulation, InputError for an unreadable orthophoto and StoreError for a full disk.
+    """
+    folder = Path(folder)
+    ground_file = as_path(ground_file)
+    started = time.monotonic()
+    ground = (
+        None
+        if ground_file is None
+        else orthophoto_ground(*read_orthophoto(ground_file, ground_m_per_px))
+    )
+    info = simulation_description(asdict(settings))
+    images: list[dict[str, Any]] = []
+    annotations: list[dict[str, Any]] = []
+    counted = 0
+    with simulation_folder(folder, PICTURES_MARK, {"info": info}) as partial:
+        with writing(folder):
+            (partial / "images").mkdir()
+        pictures = in_order(
+            lambda index: simulate_picture(settings, index, ground),
+            range(settings.pictures),
+            most_threads=_MOST_THREADS,
+        )
+        for picture in pictures:
+            row = _image_row(picture, settings.seed)
+            atomic_write_bytes(
+                partial / row["file_name"], jpeg_from_image(picture.image), durable=False
+            )
+            images.append(row)
+            annotations += [box | {"id": len(annotations) + box["id"]} for box in picture.boxes]
+            counted += sum(1 - box["iscrowd"] for box in picture.boxes)
+            yield PicturesProgress(
+                len(images), settings.pictures, counted, time.monotonic() - started
+            )
+        write_json(
+            partial / PICTURES_MARK,
+            {
+                "info": info,
+                "categories": coco_categories(),
+                "images": images,
+                "annotations": annotations,
+            },
+        )
+
+
+def _image_row(picture: SimulatedPicture, seed: int) -> dict[str, Any]:
+    height_px, width_px = picture.image.shape[:2]
+    name = f"site{seed}-{picture.index + 1:06d}"
+    return {
+        "id": picture.index + 1,
+        "file_name": f"images/{name}.jpg",
+        "width": width_px,
+        "height": height_px,
+        "flight": name,
+        "m_per_px": round(picture.m_per_px, 5),
+        "height_above_ground_m": round(float(picture.site_from_camera.translation_m[2]), 2),
+        "ground": picture.ground,
+        "thermal": picture.is_thermal,
+    }

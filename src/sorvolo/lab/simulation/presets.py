@@ -38,42 +38,15 @@ class _Row:
 
 
 _SD, _HD, _FULL = (720, 540), (1280, 720), (1920, 1080)
-# length s, fps, altitude m, speed m/s: Table 2.1
+# length s, fps, altitude m, speed m/s of one video after another: Table 2.1
 _WITHOUT_TELEMETRY = {
-    "dirt": (
-        (18, 25, 8, 3),
-        (15, 25, 9, 3),
-        (16, 25, 9, 5),
-        (11, 25, 9, 3),
-        (19, 25, 8, 3),
-        (8, 25, 8, 4),
-        (9, 25, 8, 4),
-        (12, 25, 10, 2),
-        (9, 25, 9, 3),
-        (13, 25, 10, 3),
-        (12, 25, 9, 2),
-        (8, 25, 8, 3),
-        (13, 50, 15, 3),
-        (16, 50, 14, 3),
-        (15, 50, 15, 2),
-        (22, 50, 13, 2),
-        (16, 50, 10, 2),
-        (8, 50, 6, 4),
-        (10, 50, 6, 3),
-        (20, 50, 6, 2),
-    ),
-    "countryside": (
-        (11, 30, 12, 5),
-        (7, 50, 12, 4),
-        (6, 50, 11, 4),
-        (9, 50, 10, 2),
-        (8, 50, 10, 6),
-        (14, 50, 10, 6),
-        (8, 50, 8, 7),
-        (12, 50, 8, 5),
-        (8, 50, 9, 4),
-        (13, 25, 8, 2),
-    ),
+    "dirt": """
+        18 25  8 3   15 25  9 3   16 25  9 5   11 25  9 3   19 25  8 3    8 25  8 4    9 25  8 4
+        12 25 10 2    9 25  9 3   13 25 10 3   12 25  9 2    8 25  8 3   13 50 15 3   16 50 14 3
+        15 50 15 2   22 50 13 2   16 50 10 2    8 50  6 4   10 50  6 3   20 50  6 2""",
+    "countryside": """
+        11 30 12 5    7 50 12 4    6 50 11 4    9 50 10 2    8 50 10 6   14 50 10 6    8 50  8 7
+        12 50  8 5    8 50  9 4   13 25  8 2""",
 }
 # Tables 2.3 and 2.4: the mosaicking flight, and the objects that the change flight found on its path
 _WITH_TELEMETRY = {
@@ -117,7 +90,9 @@ def preset(name: str) -> SimulationSettings:
 def _dataset() -> dict[str, _Row]:
     rows: dict[str, _Row] = {}
     for ground, table in _WITHOUT_TELEMETRY.items():
-        for number, (length_s, fps, height_m, speed_m_s) in enumerate(table, start=1):
+        numbers = [int(each) for each in table.split()]
+        videos = zip(*(numbers[column::4] for column in range(4)))
+        for number, (length_s, fps, height_m, speed_m_s) in enumerate(videos, start=1):
             size_px = _HD if fps == 50 else _SD
             rows[f"umcd-{ground}-path{number:02d}"] = _Row(
                 ground, length_s, fps, height_m, speed_m_s, size_px
@@ -211,11 +186,11 @@ def _compare(
     )
 
 
-def _compare_photos(name: str, ground: str = "countryside") -> SimulationSettings:
+def _compare_photos(name: str) -> SimulationSettings:
     """Two survey flights by photos, each place of the ground in four or more of them."""
     return SimulationSettings(
         preset=name,
-        scene=SceneSettings(ground, people=4, cars=3, small_objects=6),
+        scene=SceneSettings("countryside", people=4, cars=3, small_objects=6),
         path=PathSettings(height_m=36, speed_m_s=6, length_m=70, strips=3, strip_spacing_m=17),
         imaging=ImagingSettings(1600, 1200, fps=5),
         sensor=SensorSettings(noise_m=(0.5, 0.5, 0.5)),

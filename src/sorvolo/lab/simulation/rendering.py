@@ -9,16 +9,15 @@ from numpy.typing import NDArray
 from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.geometry.pose import Pose
 from sorvolo.lab.simulation.ground_painting import GroundRaster
-from sorvolo.lab.simulation.relief import Relief
-from sorvolo.lab.simulation.world import Day
+from sorvolo.lab.simulation.world import Day, Relief
 from sorvolo.search.drawing.objects import Body, Thing
-from sorvolo.search.drawing.view import View, blend, remapped, sample_patches
+from sorvolo.search.drawing.view import DrawnView, blend, remapped, sample_patches
 
 Labels = NDArray[np.int32]
 """(height, width) int32: the id of the thing that a pixel shows, 0 for ground."""
 
 
-def render(day: Day, view: View, site_from_camera: Pose, from_middle_s: float) -> ImageRGB:
+def render(day: Day, view: DrawnView, site_from_camera: Pose, from_middle_s: float) -> ImageRGB:
     """The picture before the camera's own faults, this long after the middle of the flight."""
     image = (
         render_ground(day.ground, view)
@@ -38,7 +37,7 @@ def render(day: Day, view: View, site_from_camera: Pose, from_middle_s: float) -
     return image
 
 
-def render_ground(ground: GroundRaster, view: View) -> ImageRGB:
+def render_ground(ground: GroundRaster, view: DrawnView) -> ImageRGB:
     """The bare ground through the view's own lens."""
     site_from_ray = np.linalg.inv(
         view.ray_from_plane(np.zeros(3), np.array([1.0, 0, 0]), np.array([0.0, 1, 0]))
@@ -59,7 +58,7 @@ def render_ground(ground: GroundRaster, view: View) -> ImageRGB:
     return remapped(ground.rgb[y0:y1, x0:x1], where.reshape(height, width, 2), cv2.BORDER_REPLICATE)
 
 
-def render_hills(ground: GroundRaster, relief: Relief, view: View) -> ImageRGB:
+def render_hills(ground: GroundRaster, relief: Relief, view: DrawnView) -> ImageRGB:
     """The bare ground laid over hills, through the view's own lens."""
     matrix = ground.raster_from_site_matrix
     per_m, first_px = matrix.diagonal()[:2].astype(np.float32), matrix[:2, 2].astype(np.float32)
@@ -78,7 +77,7 @@ def render_hills(ground: GroundRaster, relief: Relief, view: View) -> ImageRGB:
 def render_labels(
     things: Sequence[Thing],
     bodies: Mapping[int, Body],
-    view: View,
+    view: DrawnView,
     site_from_camera: Pose,
     from_middle_s: float,
 ) -> tuple[Labels, dict[int, int]]:
@@ -104,7 +103,7 @@ def render_labels(
 
 
 def _in_sight(
-    things: Sequence[Thing], view: View, site_from_camera: Pose, from_middle_s: float
+    things: Sequence[Thing], view: DrawnView, site_from_camera: Pose, from_middle_s: float
 ) -> list[Thing]:
     """The things that may be in the picture, in painting order.
 

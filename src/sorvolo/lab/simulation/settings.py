@@ -19,8 +19,62 @@ DEFAULT_ORIGIN = Geodetic(41.8923127, 12.6035418, 83.3)
 """A field east of Rome; the height is the ground's, above the ellipsoid."""
 
 
+_RANGES: dict[str, tuple[float, float]] = {
+    "people": (0, 10000),
+    "cars": (0, 10000),
+    "small_objects": (0, 10000),
+    "removed": (0, 10000),
+    "moved": (0, 10000),
+    "moving_share": (0, 1),
+    "relief_m": (0, 200),
+    "height_m": (2, 500),
+    "speed_m_s": (0.1, 40),
+    "length_m": (1, 20000),
+    "strips": (1, 200),
+    "strip_spacing_m": (0.5, 500),
+    "tilt_rms_deg": (0, 15),
+    "roll_rms_deg": (0, 15),
+    "height_rms_m": (0, 50),
+    "drift_rms_m": (0, 50),
+    "camera_pitch_deg": (-90, -45),
+    "wind_m_s": (0, 20),
+    "width_px": (64, 8192),
+    "height_px": (64, 8192),
+    "angle_of_view_deg": (10, 120),
+    "fps": (0.2, 120),
+    "exposure_s": (0, 0.1),
+    "noise": (0, 60),
+    "noise_m": (0, 1000),
+    "clock_offset_s": (-3, 3),
+    "gaps": (0, 100000),
+    "jumps": (0, 100000),
+    "zero_fixes": (0, 100000),
+    "bad_checksums": (0, 100000),
+    "wind_m": (0, 2),
+    "brightness": (0, 3),
+    "snow": (0, 1),
+    "height_factor": (0.3, 3),
+    "heading_change_deg": (-360, 360),
+    "photo_overlap": (0, 0.98),
+    "truth_step": (1, 1000000),
+    "seed": (0, 2**63),
+    "flights": (1, 20),
+}
+"""The least and the greatest value of each setting."""
+
+
+class _Checked:
+    """Checks its settings at birth. Raises SettingsError for one out of its range."""
+
+    def __post_init__(self) -> None:
+        for name, (low, high) in _RANGES.items():
+            value = getattr(self, name, None)
+            if value is not None and not low <= np.min(value) <= np.max(value) <= high:
+                raise SettingsError(f"{name} must lie in [{low}, {high}], got {value}")
+
+
 @dataclass(frozen=True)
-class SceneSettings:
+class SceneSettings(_Checked):
     """The site: its ground and what stands on it during the first flight.
 
     `ground` is a GroundKind's name, or "orthophoto" for a given picture. Counts are objects inside the
@@ -37,17 +91,15 @@ class SceneSettings:
     origin: Geodetic = DEFAULT_ORIGIN
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.ground not in (*GroundKind, "orthophoto"):
             raise SettingsError(
                 f"unknown ground {self.ground!r}; choose {', '.join(GroundKind)}, or an orthophoto's file"
             )
-        _demand("object counts", min(self.people, self.cars, self.small_objects), 0, 10000)
-        _demand("moving_share", self.moving_share, 0, 1)
-        _demand("relief_m", self.relief_m, 0, 200)
 
 
 @dataclass(frozen=True)
-class PathSettings:
+class PathSettings(_Checked):
     """The planned path: parallel strips through the site's origin; one strip is a straight line."""
 
     height_m: float = 20.0  # above the ground, of the camera
@@ -58,16 +110,9 @@ class PathSettings:
     heading_deg: float = 90.0  # of the first strip, clockwise from north
     turns_nose: bool = True  # the nose follows the path; else it keeps the first heading
 
-    def __post_init__(self) -> None:
-        _demand("height_m", self.height_m, 2, 500)
-        _demand("speed_m_s", self.speed_m_s, 0.1, 40)
-        _demand("length_m", self.length_m, 1, 20000)
-        _demand("strips", self.strips, 1, 200)
-        _demand("strip_spacing_m", self.strip_spacing_m, 0.5, 500)
-
 
 @dataclass(frozen=True)
-class MotionSettings:
+class MotionSettings(_Checked):
     """How far the flight departs from its plan; root mean squares of smooth random series."""
 
     tilt_rms_deg: float = 1.5  # roll and pitch each, over about a second
@@ -83,20 +128,15 @@ class MotionSettings:
     wind_from_deg: float = 0.0  # clockwise from north
 
     def __post_init__(self) -> None:
-        _demand("roll_rms_deg", self.roll_rms_deg or 0.0, 0, 15)
-        _demand("wind_m_s", self.wind_m_s, 0, 20)
+        super().__post_init__()
         if self.wind_m_s and not self.is_fixed_wing:
             raise SettingsError(
                 "wind_m_s carries fixed wings only; a rotor drone's drift is drift_rms_m"
             )
-        _demand("tilt_rms_deg", self.tilt_rms_deg, 0, 15)
-        _demand("height_rms_m", self.height_rms_m, 0, 50)
-        _demand("drift_rms_m", self.drift_rms_m, 0, 50)
-        _demand("camera_pitch_deg", self.camera_pitch_deg, -90, -45)
 
 
 @dataclass(frozen=True)
-class ImagingSettings:
+class ImagingSettings(_Checked):
     """The camera and what it does to the picture."""
 
     width_px: int = 960
@@ -116,16 +156,11 @@ class ImagingSettings:
     noise: float = 2.0  # rms, grey levels
 
     def __post_init__(self) -> None:
-        _demand("width_px", self.width_px, 64, 8192)
-        _demand("height_px", self.height_px, 64, 8192)
+        super().__post_init__()
         if self.width_px % 2 or self.height_px % 2:
             raise SettingsError(
                 f"H.264 needs an even picture size, got {self.width_px}x{self.height_px}"
             )
-        _demand("angle_of_view_deg", self.angle_of_view_deg, 10, 120)
-        _demand("fps", self.fps, 0.2, 120)
-        _demand("exposure_s", self.exposure_s, 0, 0.1)
-        _demand("noise", self.noise, 0, 60)
 
     @property
     def camera(self) -> Camera:
@@ -144,10 +179,9 @@ class ImagingSettings:
 
 
 @dataclass(frozen=True)
-class SensorSettings:
-    """The telemetry and its faults. Errors are in site axes; `rate_hz` None takes each format's own rate."""
+class SensorSettings(_Checked):
+    """The telemetry and its faults. Errors are in site axes."""
 
-    rate_hz: float | None = None
     noise_m: tuple[float, float, float] = (1.0, 1.0, 1.0)  # white, rms: east, north, up
     wander_m: float = 0.0  # rms of an error that forgets itself over a minute, each axis
     bias_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -158,18 +192,9 @@ class SensorSettings:
     zero_fixes: int = 0  # fixes at latitude 0, longitude 0
     bad_checksums: int = 0  # NMEA only
 
-    def __post_init__(self) -> None:
-        if self.rate_hz is not None:
-            _demand("rate_hz", self.rate_hz, 0.1, 200)
-        _demand("noise_m", min(self.noise_m), 0, 1000)
-        _demand("clock_offset_s", self.clock_offset_s, -3, 3)
-        _demand(
-            "faults", min(self.gaps, self.jumps, self.zero_fixes, self.bad_checksums), 0, 100000
-        )
-
 
 @dataclass(frozen=True)
-class WeatherSettings:
+class WeatherSettings(_Checked):
     """The day of a later flight: its light and what the weather did to the ground."""
 
     has_other_light: bool = True  # another sun, another colour and strength of the light
@@ -178,27 +203,18 @@ class WeatherSettings:
     brightness: float = 1.0  # of all light; a night under street lamps has about 0.06
     snow: float = 0.0  # share of the ground that lies under snow
 
-    def __post_init__(self) -> None:
-        _demand("wind_m", self.wind_m, 0, 2)
-        _demand("brightness", self.brightness, 0, 3)
-        _demand("snow", self.snow, 0, 1)
-
 
 @dataclass(frozen=True)
-class RevisitSettings:
+class RevisitSettings(_Checked):
     """How a later flight is flown other than the first: higher, in another direction, by another camera."""
 
     height_factor: float = 1.0
     heading_change_deg: float = 0.0
     imaging: ImagingSettings | None = None  # None: the first flight's own camera
 
-    def __post_init__(self) -> None:
-        _demand("height_factor", self.height_factor, 0.3, 3)
-        _demand("heading_change_deg", self.heading_change_deg, -360, 360)
-
 
 @dataclass(frozen=True)
-class LaterSettings:
+class LaterSettings(_Checked):
     """How a later flight differs from the first: what came, how many of the first flight's targets left or moved."""
 
     people: int = 1
@@ -209,33 +225,22 @@ class LaterSettings:
     weather: WeatherSettings = field(default_factory=WeatherSettings)
     revisit: RevisitSettings = field(default_factory=RevisitSettings)
 
-    def __post_init__(self) -> None:
-        _demand(
-            "changes",
-            min(self.people, self.cars, self.small_objects, self.removed, self.moved),
-            0,
-            10000,
-        )
-
 
 @dataclass(frozen=True)
-class OutputSettings:
-    """What is written to the folder; `crf` is x264's quality (lower is better), `truth_step` samples the truth."""
+class OutputSettings(_Checked):
+    """What is written to the folder; `truth_step` samples the truth."""
 
     telemetry: str = "csv"  # a format, "all" or "none"
     photos: bool = False  # JPEG photos instead of a video
     photo_overlap: float = 0.7
-    crf: int = 20
     truth_step: int = 25  # boxes and change masks at every so many frames
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.telemetry not in (*TELEMETRY_FORMATS, "all", "none"):
             raise SettingsError(
                 f"unknown telemetry {self.telemetry!r}; choose {', '.join(TELEMETRY_FORMATS)}, all or none"
             )
-        _demand("photo_overlap", self.photo_overlap, 0, 0.98)
-        _demand("crf", self.crf, 0, 51)
-        _demand("truth_step", self.truth_step, 1, 1000000)
 
     @property
     def formats(self) -> tuple[str, ...]:
@@ -246,7 +251,7 @@ class OutputSettings:
 
 
 @dataclass(frozen=True)
-class SimulationSettings:
+class SimulationSettings(_Checked):
     """A whole simulation; the same settings and seed give the same pictures, numbers and files."""
 
     preset: str = "custom"
@@ -261,8 +266,7 @@ class SimulationSettings:
     output: OutputSettings = field(default_factory=OutputSettings)
 
     def __post_init__(self) -> None:
-        _demand("seed", self.seed, 0, 2**63)
-        _demand("flights", self.flights, 1, 20)
+        super().__post_init__()
         if self.scene.relief_m > 0.8 * self.path.height_m:
             raise SettingsError(
                 f"hills of {self.scene.relief_m:g} m are too high for a flight at {self.path.height_m:g} m; "
@@ -278,8 +282,3 @@ class SimulationSettings:
         """These settings with the camera of one flight, counted from 1."""
         other = self.later.revisit.imaging
         return self if flight == 1 or other is None else replace(self, imaging=other)
-
-
-def _demand(name: str, value: float, low: float, high: float) -> None:
-    if not low <= value <= high:
-        raise SettingsError(f"{name} must lie in [{low}, {high}], got {value}")

@@ -10,7 +10,10 @@ from sorvolo.geometry.geodesy import utm_epsg
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.lab.simulation.flight import SimulatedFlight, simulate_flights
 from sorvolo.lab.simulation.flight_files import (
+    MARK,
     read_orthophoto,
+    simulation_description,
+    simulation_folder,
     video_writer,
     write_camera,
     write_json,
@@ -18,17 +21,12 @@ from sorvolo.lab.simulation.flight_files import (
     write_photo,
     write_telemetry,
 )
-from sorvolo.lab.simulation.folder import (
-    MARK,
-    simulation_description,
-    simulation_folder,
-)
 from sorvolo.lab.simulation.ground import orthophoto_ground
 from sorvolo.lab.simulation.settings import GEOID_HEIGHT_M, SimulationSettings
-from sorvolo.lab.simulation.true_changes import event_features
 from sorvolo.lab.simulation.truth import (
     change_mask,
     coco_boxes,
+    event_features,
     feature_collection,
     frame_features,
     map_tiles,
@@ -40,6 +38,7 @@ from sorvolo.store.ahead import in_order
 from sorvolo.store.atomic import writing
 from sorvolo.store.rasters.geotiff import write_cog
 
+_CRF = 20  # x264's quality, lower is better; by choice
 _MOST_THREADS = 4  # each holds a frame that is drawn, of tens of megabytes
 _SUFFIXES = {"csv": ".csv", "srt": ".srt", "nmea": ".nmea", "gpx": ".gpx"}
 
@@ -107,27 +106,7 @@ def _write_flight(flight: SimulatedFlight, folder: Path) -> Iterator[int]:
     """Write pictures and telemetry; yields the number of frames written so far."""
     with writing(folder):
         folder.mkdir()
-    _write_telemetry(flight, folder)
-    if flight.settings.output.photos:
-        with writing(folder):
-            (folder / "photos").mkdir()
-        rows = _photo_rows(flight)
-        for frame in in_order(flight.frame, range(len(flight)), most_threads=_MOST_THREADS):
-            write_photo(folder / "photos" / frame.name, frame, flight.camera, rows[frame.index])
-            yield frame.index + 1
-        return
-    size_px = flight.camera.width_px, flight.camera.height_px
-    imaging, crf = flight.settings.imaging, flight.settings.output.crf
-    with video_writer(
-        folder / f"{flight.name}.mp4", size_px, imaging.fps, flight.started_ns, crf
-    ) as write:
-        for frame in in_order(flight.frame, range(len(flight)), most_threads=_MOST_THREADS):
-            write(frame.image)
-            yield frame.index + 1
-
-
-def _write_telemetry(flight: SimulatedFlight, folder: Path) -> None:
-    """The primary format beside the video under its name, every other format in a folder of its own."""
+    # The primary format beside the video under its name, every other format in a folder of its own
     formats = flight.settings.output.formats
     for format_name in formats:
         observation = flight.observation(format_name)
@@ -144,6 +123,21 @@ def _write_telemetry(flight: SimulatedFlight, folder: Path) -> None:
             write_telemetry(
                 place / f"{flight.name}_old_dialect.srt", replace(telemetry, format="srt-gps")
             )
+    if flight.settings.output.photos:
+        with writing(folder):
+            (folder / "photos").mkdir()
+        rows = _photo_rows(flight)
+        for frame in in_order(flight.frame, range(len(flight)), most_threads=_MOST_THREADS):
+            write_photo(folder / "photos" / frame.name, frame, flight.camera, rows[frame.index])
+            yield frame.index + 1
+        return
+    size_px = flight.camera.width_px, flight.camera.height_px
+    with video_writer(
+        folder / f"{flight.name}.mp4", size_px, flight.settings.imaging.fps, flight.started_ns, _CRF
+    ) as write:
+        for frame in in_order(flight.frame, range(len(flight)), most_threads=_MOST_THREADS):
+            write(frame.image)
+            yield frame.index + 1
 
 
 def _photo_rows(flight: SimulatedFlight) -> list[dict[str, float]]:

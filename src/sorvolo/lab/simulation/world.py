@@ -1,5 +1,6 @@
 """The simulated site: its ground, what stands on it on each day, and each day's light."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -7,26 +8,189 @@ import cv2
 import numpy as np
 
 from sorvolo.errors import SettingsError
-from sorvolo.geometry.arrays import Floats
-from sorvolo.lab.simulation.clock import sun_of_flight
-from sorvolo.lab.simulation.ground import GroundKind, Layout, PaintedGround, paint_ground
-from sorvolo.lab.simulation.ground_painting import Area, GroundRaster
-from sorvolo.lab.simulation.relief import LEVEL, Relief
-from sorvolo.lab.simulation.settings import SceneSettings, SimulationSettings, WeatherSettings
+from sorvolo.geometry.arrays import Floats, Floats32, PointsM, Vector3
+from sorvolo.geometry.sun import direction_from_angles, sun_direction
+from sorvolo.geometry.units import DAY_NS
+from sorvolo.lab.simulation.ground import GroundKind, GroundLayout, PaintedGround, paint_ground
+from sorvolo.lab.simulation.ground_painting import GroundArea, GroundRaster
+from sorvolo.lab.simulation.settings import (
+    DEFAULT_ORIGIN,
+    SceneSettings,
+    SimulationSettings,
+    WeatherSettings,
+)
 from sorvolo.search.drawing.bodies import build_body
 from sorvolo.search.drawing.noise import fractal
 from sorvolo.search.drawing.objects import (
+    SHADOW_TINT,
     SMALL_KINDS,
     Body,
-    Label,
     Light,
     Thing,
+    ThingLabel,
+    cast_shadow,
     new_kind,
     new_size,
+    own_shadow,
 )
-from sorvolo.search.drawing.shadows import SHADOW_TINT, cast_shadow, own_shadow
-from sorvolo.search.drawing.view import Patch, blend, map_view, sample_patches
+from sorvolo.search.drawing.view import DrawnPatch, DrawnView, blend, map_view, sample_patches
 
+_FIRST_NS = (
+    1_775_133_840 * 10**9
+)  # 2026-04-02 12:44 UTC at the default origin; elsewhere at the same solar time
+_YEAR_DAYS = 365  # so long after a flight, at the same hour, the sun stands where it stood within 0.1 degrees
+_STEP_NS = 60 * 10**9  # the minute in which a flight begins is drawn
+
+
+# later flights in another light
+_APART_DAYS, _DRAWN_DAYS = 84.0, 70.0  # between them, of which so many are drawn by the seed
+_SUN_DEG = 28.0, 62.0  # the sun's height, least and most, where the day has them
+_LEAST_SUN_DEG = 10.0  # in a polar night: shadows of a lower sun leave the ground that is drawn
+
+
+def start_ns(settings: SimulationSettings, flight: int) -> int:
+    """UTC of the first frame of a flight, counted from 1: later ones in another light begin weeks later at a drawn
+    hour, those in the same light years later at the same hour."""
+    origin = settings.scene.origin
+    first_ns = _FIRST_NS - (
+        round((origin.longitude_deg - DEFAULT_ORIGIN.longitude_deg) / 360 * DAY_NS / _STEP_NS)
+        * _STEP_NS
+    )
+    if flight == 1:
+        return first_ns
+    if not settings.later.weather.has_other_light:
+        return first_ns + (flight - 1) * _YEAR_DAYS * DAY_NS
+    rng = np.random.default_rng([settings.seed, 11, flight])
+    days = math.floor(_APART_DAYS * (flight - 1) - _DRAWN_DAYS * rng.random())
+    times_ns = first_ns + days * DAY_NS + np.arange(-DAY_NS // 2, DAY_NS // 2, _STEP_NS)
+    heights_deg = np.array(
+        [math.degrees(math.asin(_sun(int(each), settings)[2])) for each in times_ns]
+    )
+    low_deg, high_deg = _SUN_DEG
+    (possible,) = np.nonzero((heights_deg >= low_deg) & (heights_deg <= high_deg))
+    return int(times_ns[rng.choice(possible) if len(possible) else heights_deg.argmax()])
+
+
+def sun_of_flight(settings: SimulationSettings, flight: int) -> Vector3:
+    """(3,) the unit vector to the sun, east, north and up, when a flight begins; never lower than 10 degrees."""
+    sun = _sun(start_ns(settings, flight), settings)
+    if sun[2] >= math.sin(math.radians(_LEAST_SUN_DEG)):
+        return sun
+    return direction_from_angles(math.degrees(math.atan2(sun[0], sun[1])), _LEAST_SUN_DEG)
+
+
+def _sun(time_ns: int, settings: SimulationSettings) -> Vector3:
+    origin = settings.scene.origin
+    return sun_direction(time_ns, origin.latitude_deg, origin.longitude_deg)
+
+
+_WAVES = 5  # that are summed to hills
+_SHORTEST, _LONGEST = (
+    2.5,
+    5.0,
+)  # lengths of the waves, in heights of the flight: hills that a survey flies over
+_COARSE_PX = 4  # the hills are smooth: rays are followed on a coarse grid of the picture
+_MOST_STEPS = 200  # of following a ray down
+_NEAR_M = 1e-4  # to the ground: the ray has arrived
+
+
+@dataclass(frozen=True, eq=False)
+class Relief:
+    """The ground's height: `middle_m` and K waves of `turns_m` (K, 2) radians a metre, `phases` and `heights_m` (K,).
+
+    No waves: level ground.
+    """
+
+    turns_m: Floats
+    phases: Floats
+    heights_m: Floats
+    middle_m: float = 0.0
+
+    @classmethod
+    def hills(
+        cls, relief_m: float, flight_m: float, area: GroundArea, rng: np.random.Generator
+    ) -> "Relief":
+        """Hills of `relief_m` from the lowest to the highest ground of an area, half of it above height 0."""
+        if not relief_m:
+            return LEVEL
+        count = _WAVES
+        lengths = flight_m * rng.uniform(_SHORTEST, _LONGEST, count)
+        heading = rng.uniform(0, np.pi, count)
+        turns = 2 * np.pi / lengths[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
+        raw = cls(turns, rng.uniform(0, 2 * np.pi, count), rng.uniform(0.5, 1.0, count))
+        east, north = (
+            np.linspace(area.west_m, area.east_m, 64),
+            np.linspace(area.south_m, area.north_m, 64),
+        )
+        up = raw.up_m(np.dstack(np.meshgrid(east, north)))
+        scale = relief_m / np.ptp(up)
+        return cls(
+            turns, raw.phases, scale * raw.heights_m, -scale * float(up.min() + up.max()) / 2
+        )
+
+    @property
+    def is_level(self) -> bool:
+        """Whether the ground has no hills."""
+        return not len(self.heights_m)
+
+    @property
+    def most_m(self) -> float:
+        """No ground is higher than this."""
+        return float(self.middle_m + self.heights_m.sum())
+
+    @property
+    def most_slope(self) -> float:
+        """No ground is steeper, as height over way."""
+        return float((self.heights_m * np.linalg.norm(self.turns_m, axis=1)).sum())
+
+    def up_m(self, places_m: Floats) -> Floats:
+        """(...,) heights of the ground at places (..., 2), east and north."""
+        up = np.full(places_m.shape[:-1], self.middle_m)
+        for turn, phase, height_m in zip(self.turns_m, self.phases, self.heights_m):
+            up += height_m * np.sin(places_m @ turn + phase)
+        return up
+
+    def met(self, eye_m: Floats, rays_m: Floats) -> PointsM:
+        """(..., 3) where rays from an eye, (3,), in directions (..., 3) first meet the ground; NaN above the horizon.
+
+        Each step is as long as no slope could cross, so that a hill in front hides what lies behind it (Hart 1996).
+        """
+        with np.errstate(divide="ignore", invalid="ignore"):
+            way = (self.most_m - eye_m[2]) / rays_m[..., 2]
+        way[~((rays_m[..., 2] < 0) & (way >= 0))] = np.nan
+        closing = self.most_slope * np.linalg.norm(rays_m[..., :2], axis=-1) - rays_m[..., 2]
+        for _ in range(_MOST_STEPS if not self.is_level else 0):
+            point = eye_m + rays_m * way[..., None]
+            above_m = point[..., 2] - self.up_m(point[..., :2])
+            way += above_m / closing
+            if np.nanmax(np.abs(above_m), initial=0.0) < _NEAR_M:
+                break
+        return eye_m + rays_m * way[..., None]
+
+    def seen(self, view: DrawnView) -> Floats32:
+        """(height, width, 2) east and north of the ground at each pixel of a camera's view, far off at the horizon."""
+        height, width = view.camera.height_px, view.camera.width_px
+        columns, rows = (
+            np.append(np.arange(0, side - 1, _COARSE_PX), side - 1) for side in (width, height)
+        )
+        rays = view.rays_in((0, 0, width, height))[np.ix_(rows, columns)]
+        rays = (
+            np.dstack([rays, np.ones(rays.shape[:2])]) @ np.linalg.inv(view.ray_from_site[:, :3]).T
+        )
+        met_m = np.nan_to_num(self.met(view.eye_m[:3], rays)[..., :2], nan=1e6).astype(np.float32)
+        x, y = (
+            np.interp(np.arange(side), at, np.arange(len(at))).astype(np.float32)
+            for side, at in ((width, columns), (height, rows))
+        )
+        across, down = np.meshgrid(x, y)
+        return cv2.remap(met_m, across, down, cv2.INTER_LINEAR)  # type: ignore[return-value]
+
+
+LEVEL = Relief(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+"""Ground without hills."""
+
+
+_SPARE_M = 4.0  # of ground around what is seen
 _LARGEST_GROUND_PX = 26e6  # pixels of painted ground, which bounds the memory
 
 
@@ -37,15 +201,6 @@ class World:
     ground: GroundRaster
     days: tuple[tuple[Thing, ...], ...]
     relief: Relief = LEVEL
-
-    @property
-    def things(self) -> dict[int, list[int]]:
-        """Object id -> the flights, counted from 1, in which it is present."""
-        present: dict[int, list[int]] = {}
-        for flight, day in enumerate(self.days, start=1):
-            for thing in day:
-                present.setdefault(thing.id, []).append(flight)
-        return present
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,19 +214,19 @@ class Day:
     ground: GroundRaster
     things: tuple[Thing, ...]
     bodies: dict[int, Body]
-    shadows: dict[int, Patch]
+    shadows: dict[int, DrawnPatch]
     light: Light
     gains: Floats
     cloud_shade: float
     relief: Relief = LEVEL
 
 
-def needed_area(settings: SimulationSettings, waypoints_m: Floats, margin_m: float = 4.0) -> Area:
+def needed_area(settings: SimulationSettings, waypoints_m: Floats) -> GroundArea:
     """The ground that can come into sight from these waypoints, (N, 2), all flights' height and tilt included."""
     farthest_m = max(_reach_m(settings.of_flight(flight), flight) for flight in (1, 2))
-    reach_m = margin_m + 4 * settings.motion.drift_rms_m + farthest_m
+    reach_m = _SPARE_M + 4 * settings.motion.drift_rms_m + farthest_m
     low, high = waypoints_m.min(axis=0) - reach_m, waypoints_m.max(axis=0) + reach_m
-    return Area(float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+    return GroundArea(float(low[0]), float(low[1]), float(high[0]), float(high[1]))
 
 
 def _reach_m(settings: SimulationSettings, flight: int) -> float:
@@ -106,7 +261,19 @@ def build_world(
         if orthophoto is None:
             raise SettingsError("the ground is an orthophoto, but none was given")
         painted = orthophoto
-        _demand_cover(painted.raster.area, area)
+        given = painted.raster.area
+        if (
+            given.west_m > area.west_m
+            or given.south_m > area.south_m
+            or given.east_m < area.east_m
+            or given.north_m < area.north_m
+        ):
+            have, need = given.size_m, area.size_m
+            raise SettingsError(
+                f"the orthophoto covers {have[0]:.0f} x {have[1]:.0f} m, but the flight sees up to"
+                f" {need[0]:.0f} x {need[1]:.0f} m;"
+                " fly lower or a shorter path, or give a larger orthophoto"
+            )
     else:
         width_m, height_m = area.size_m
         m_per_px = max(
@@ -156,7 +323,16 @@ def build_day(world: World, settings: SimulationSettings, flight: int, m_per_px:
         ground = _snowed_in(ground, weather.snow, np.random.default_rng([settings.seed, 9, flight]))
     if weather.wind_m:
         ground = _blown(ground, weather.wind_m, rng)
-        things = _swayed(things, weather.wind_m, rng)
+        # The things, trees moved by the wind
+        things = tuple(
+            replace(
+                thing,
+                sway_m=(rng.normal(0, 2.0 * weather.wind_m), rng.normal(0, 2.0 * weather.wind_m)),
+            )
+            if thing.label is ThingLabel.TREE
+            else thing
+            for thing in things
+        )
     bodies = {thing.id: build_body(thing, light, m_per_px) for thing in things}
     standing = [thing for thing in things if not thing.is_moving]
     ground = _with_shadows(ground, standing, bodies, light)
@@ -177,26 +353,14 @@ def _gains(weather: WeatherSettings, rng: np.random.Generator) -> Floats:
     return np.asarray(gains * weather.brightness)
 
 
-def _swayed(
-    things: tuple[Thing, ...], wind_m: float, rng: np.random.Generator
-) -> tuple[Thing, ...]:
-    """The things, trees moved by the wind."""
-    return tuple(
-        replace(thing, sway_m=(rng.normal(0, 2.0 * wind_m), rng.normal(0, 2.0 * wind_m)))
-        if thing.label is Label.TREE
-        else thing
-        for thing in things
-    )
-
-
-def scenery(ground: str, layout: Layout, rng: np.random.Generator) -> tuple[Thing, ...]:
+def scenery(ground: str, layout: GroundLayout, rng: np.random.Generator) -> tuple[Thing, ...]:
     """The houses, trees and bushes of a layout, ids from 1; towns have flat roofs."""
     roof = "flat roof" if ground == GroundKind.URBAN else "gable roof"
     things: list[Thing] = []
     for kind, label, places in (
-        (roof, Label.HOUSE, layout.houses),
-        ("tree", Label.TREE, layout.trees),
-        ("bush", Label.TREE, layout.bushes),
+        (roof, ThingLabel.HOUSE, layout.houses),
+        ("tree", ThingLabel.TREE, layout.trees),
+        ("bush", ThingLabel.TREE, layout.bushes),
     ):
         for east, north, yaw in places:
             size = new_size(label, kind, rng)
@@ -214,7 +378,7 @@ def is_free(thing: Thing, others: Sequence[Thing]) -> bool:
     return all(
         np.hypot(thing.east_m - other.east_m, thing.north_m - other.north_m)
         > thing.reach_m * 0.8
-        + other.reach_m * (0.9 if other.label is not Label.HOUSE else 1.05)
+        + other.reach_m * (0.9 if other.label is not ThingLabel.HOUSE else 1.05)
         + 0.6
         for other in others
     )
@@ -222,7 +386,7 @@ def is_free(thing: Thing, others: Sequence[Thing]) -> bool:
 
 def _furnish(
     scene: SceneSettings,
-    layout: Layout,
+    layout: GroundLayout,
     waypoints_m: Floats,
     settings: SimulationSettings,
     rng: np.random.Generator,
@@ -230,9 +394,9 @@ def _furnish(
     """The things of the first flight: scenery first, then targets."""
     things = list(scenery(scene.ground, layout, rng)) if scene.has_scenery else []
     wanted = (
-        [Label.PERSON] * scene.people
-        + [Label.CAR] * scene.cars
-        + [Label.SMALL] * scene.small_objects
+        [ThingLabel.PERSON] * scene.people
+        + [ThingLabel.CAR] * scene.cars
+        + [ThingLabel.SMALL] * scene.small_objects
     )
     for label in wanted:
         things.append(_place(label, len(things) + 1, things, layout, waypoints_m, settings, rng))
@@ -241,7 +405,7 @@ def _furnish(
 
 def _next_day(
     first: tuple[Thing, ...],
-    layout: Layout,
+    layout: GroundLayout,
     waypoints_m: Floats,
     settings: SimulationSettings,
     flight: int,
@@ -252,15 +416,16 @@ def _next_day(
     next_id = 1000 * flight
     later = settings.later
     came = (
-        [Label.PERSON] * later.people
-        + [Label.CAR] * later.cars
-        + [Label.SMALL] * later.small_objects
+        [ThingLabel.PERSON] * later.people
+        + [ThingLabel.CAR] * later.cars
+        + [ThingLabel.SMALL] * later.small_objects
     )
     for i, label in enumerate(came):
         today.append(_place(label, next_id + i, today, layout, waypoints_m, settings, rng))
     return tuple(
         _set_off(thing, today, rng)
-        if thing.label in (Label.PERSON, Label.CAR) and rng.uniform() < settings.scene.moving_share
+        if thing.label in (ThingLabel.PERSON, ThingLabel.CAR)
+        and rng.uniform() < settings.scene.moving_share
         else thing
         for thing in today
     )
@@ -268,7 +433,7 @@ def _next_day(
 
 def _left_and_moved(
     first: tuple[Thing, ...],
-    layout: Layout,
+    layout: GroundLayout,
     waypoints_m: Floats,
     settings: SimulationSettings,
     rng: np.random.Generator,
@@ -290,10 +455,10 @@ def _left_and_moved(
 
 
 def _place(
-    label: Label,
+    label: ThingLabel,
     thing_id: int,
     others: list[Thing],
-    layout: Layout,
+    layout: GroundLayout,
     waypoints_m: Floats,
     settings: SimulationSettings,
     rng: np.random.Generator,
@@ -301,7 +466,7 @@ def _place(
     """A new target near the flown path, free of what stands there already."""
     kind = (
         SMALL_KINDS[int(rng.integers(len(SMALL_KINDS)))]
-        if label is Label.SMALL
+        if label is ThingLabel.SMALL
         else new_kind(label, rng)
     )
     size = new_size(label, kind, rng)
@@ -315,7 +480,7 @@ def _place(
         else layout.parkings
     )
     for attempt in range(400):
-        if label is Label.CAR and len(near_path) and attempt < 100:
+        if label is ThingLabel.CAR and len(near_path) and attempt < 100:
             east, north, yaw = near_path[int(rng.integers(len(near_path)))]
             yaw = yaw + 180 * rng.integers(2) + rng.normal(0, 1.5)
         else:
@@ -333,7 +498,7 @@ def _place(
 
 def _set_off(thing: Thing, others: list[Thing], rng: np.random.Generator) -> Thing:
     """The thing on its way: a person walks anywhere, a car drives straight on, where no scenery is in the way."""
-    is_car = thing.label is Label.CAR
+    is_car = thing.label is ThingLabel.CAR
     speed = rng.uniform(2.0, 4.0) if is_car else rng.uniform(0.7, 1.5)
     for _ in range(30):
         yaw = thing.yaw_deg if is_car else rng.uniform(0, 360)
@@ -443,18 +608,3 @@ def orthophoto(day: Day) -> GroundRaster:
             for window, sample in sample_patches(view, patches):
                 blend(rgb, window, sample)
     return replace(day.ground, rgb=rgb)
-
-
-def _demand_cover(given: Area, needed: Area) -> None:
-    if (
-        given.west_m > needed.west_m
-        or given.south_m > needed.south_m
-        or given.east_m < needed.east_m
-        or given.north_m < needed.north_m
-    ):
-        have, need = given.size_m, needed.size_m
-        raise SettingsError(
-            f"the orthophoto covers {have[0]:.0f} x {have[1]:.0f} m, but the flight sees up to"
-            f" {need[0]:.0f} x {need[1]:.0f} m;"
-            " fly lower or a shorter path, or give a larger orthophoto"
-        )

@@ -12,14 +12,14 @@ from typing import Any
 from sorvolo.capture.source import open_sources
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, ImageRGB
-from sorvolo.lab.datasets.mask_pictures import read_mask
 from sorvolo.lab.evaluation.change_metrics import Counts
-from sorvolo.lab.evaluation.frame_deviation import MapDeviation
 from sorvolo.lab.evaluation.frame_rows import map_frames
+from sorvolo.lab.evaluation.map_quality import MapDeviation
 from sorvolo.lab.evaluation.mask_folders import (
     ComparedMask,
     compared_masks,
     frames_against_times,
+    read_mask,
 )
 from sorvolo.lab.thesis.changes import compare_thesis
 from sorvolo.lab.thesis.published import APPEARANCES

@@ -16,13 +16,18 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from sorvolo.errors import SettingsError
-from sorvolo.lab.training.boxes import offsets_from_boxes
-from sorvolo.lab.training.drawn_regions import draw_regions
-from sorvolo.lab.training.faster_rcnn import FasterRCNN
-from sorvolo.lab.training.joint import Progress, collate
-from sorvolo.lab.training.losses import Answer, Match, match_boxes, sample
-from sorvolo.lab.training.proposals import Proposed
-from sorvolo.lab.training.samples import Sample
+from sorvolo.lab.training.faster_rcnn import FasterRCNN, Proposed
+from sorvolo.lab.training.joint import (
+    Answer,
+    Match,
+    Progress,
+    collate,
+    draw_regions,
+    match_boxes,
+    sample,
+)
+from sorvolo.lab.training.regions import offsets_from_boxes
+from sorvolo.lab.training.samples import TrainingSample
 
 STEP_NAMES = ("1/4 proposals", "2/4 classifier", "3/4 proposals refined", "4/4 classifier refined")
 
@@ -79,7 +84,7 @@ class FourStepTraining:
         """Whether the parts fit together: in the last step alone."""
         return self._stage == 3
 
-    def learn(self, batch: Sequence[Sample]) -> Progress:
+    def learn(self, batch: Sequence[TrainingSample]) -> Progress:
         """One batch of samples of one size; a loss that its step does not minimise is zero."""
         stage = min(3, self.step * 4 // self.settings.steps)
         if stage != self._stage:

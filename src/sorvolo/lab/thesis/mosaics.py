@@ -14,9 +14,8 @@ from sorvolo.capture.photos import read_picture
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats
 from sorvolo.geometry.polygons import signed_area
-from sorvolo.lab.evaluation.frame_deviation import MapDeviation
 from sorvolo.lab.evaluation.frame_rows import map_frames
-from sorvolo.lab.evaluation.map_quality import correlation
+from sorvolo.lab.evaluation.map_quality import MapDeviation, correlation
 from sorvolo.lab.evaluation.mosaic import evaluate_mosaic
 from sorvolo.lab.thesis.mapping import ThesisMapping
 from sorvolo.lab.thesis.settings import FIGURE_PX

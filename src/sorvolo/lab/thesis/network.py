@@ -9,11 +9,16 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from sorvolo.lab.training.faster_rcnn import FasterRCNN, Reach
-from sorvolo.lab.training.feature_pyramid import convolution
-from sorvolo.lab.training.heads import StageHead
-from sorvolo.lab.training.proposals import RATIOS, AnchorSettings, ProposalNetwork, Stem
-from sorvolo.lab.training.resnet import ResNet50, resnet_stage
+from sorvolo.lab.training.backbones import ResNet50, convolution, resnet_stage
+from sorvolo.lab.training.faster_rcnn import (
+    RATIOS,
+    AnchorSettings,
+    FasterRCNN,
+    ProposalNetwork,
+    Reach,
+    Stem,
+)
+from sorvolo.lab.training.regions import StageHead
 
 _REGIONS = 75  # for six frames a second on two cores; crowds need more (docs/train.md)
 _ANCHORS = (

@@ -18,7 +18,7 @@ import numpy as np
 from sorvolo.errors import InputError
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
-from sorvolo.lab.datasets.text_files import read_text
+from sorvolo.lab.datasets.parsed import read_text
 from sorvolo.lab.simulation.flight_files import write_camera
 from sorvolo.lab.thesis.umcd_folder import PICTURE_ENDINGS, UmcdVideo, videos_in
 from sorvolo.store.atomic import atomic_write_bytes, writing

@@ -4,10 +4,18 @@ import re
 from pathlib import Path
 
 from sorvolo.errors import InputError
-from sorvolo.lab.datasets.pairing import frames_by_video, no_frames, pictures_around
-from sorvolo.lab.datasets.parsed import Finding, ParsedBox, ParsedPicture, ParsedSet, findings_in
-from sorvolo.lab.datasets.picture_files import files_below
-from sorvolo.lab.datasets.text_files import read_text
+from sorvolo.lab.datasets.parsed import (
+    LabelFinding,
+    ParsedBox,
+    ParsedPicture,
+    ParsedSet,
+    files_below,
+    findings_in,
+    frames_by_video,
+    no_frames,
+    pictures_around,
+    read_text,
+)
 
 FORM = "Okutama-Action"
 _LINE = re.compile(
@@ -47,7 +55,7 @@ def read_okutama(place: Path) -> ParsedSet:
     for video, by_frame in labelled.items():
         lonely = set(by_frame) - set(frames[video])
         findings.append(
-            Finding(
+            LabelFinding(
                 "labels_without_picture", f"{video}, frame {min(lonely, default=0)}", len(lonely)
             )
         )
@@ -71,7 +79,7 @@ def is_okutama_file(path: Path) -> bool:
     )
 
 
-def _boxes(path: Path) -> tuple[dict[int, list[ParsedBox]], list[Finding]]:
+def _boxes(path: Path) -> tuple[dict[int, list[ParsedBox]], list[LabelFinding]]:
     """The file's boxes by frame; frames where all are lost have none. And its lines that are no labels."""
     found: dict[int, list[ParsedBox]] = {}
     findings = []
@@ -79,7 +87,7 @@ def _boxes(path: Path) -> tuple[dict[int, list[ParsedBox]], list[Finding]]:
         match = _LINE.fullmatch(line) if len(line) < 1000 else None
         if match is None:
             if line.strip():
-                findings.append(Finding("malformed_labels", f"{path.name}, line {number}"))
+                findings.append(LabelFinding("malformed_labels", f"{path.name}, line {number}"))
             continue
         of_frame = found.setdefault(int(match["frame"]), [])
         if match["lost"] == "0":

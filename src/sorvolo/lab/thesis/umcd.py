@@ -7,10 +7,17 @@ from math import inf, isfinite
 from pathlib import Path
 
 from sorvolo.errors import InputError
-from sorvolo.lab.datasets.pairing import frames_by_video, no_frames, pictures_around
-from sorvolo.lab.datasets.parsed import Finding, ParsedBox, ParsedPicture, ParsedSet
-from sorvolo.lab.datasets.picture_files import files_below
-from sorvolo.lab.datasets.text_files import read_text
+from sorvolo.lab.datasets.parsed import (
+    LabelFinding,
+    ParsedBox,
+    ParsedPicture,
+    ParsedSet,
+    files_below,
+    frames_by_video,
+    no_frames,
+    pictures_around,
+    read_text,
+)
 
 FORM = "UMCD"
 _OBJECT = re.compile(r"object\b\s*#?\s*\d*\s*[:.=]?\s*", re.IGNORECASE)
@@ -46,7 +53,7 @@ class _Object:
 class _Video:
     fps: float = 0.0
     objects: list[_Object] = field(default_factory=list)
-    malformed: list[Finding] = field(default_factory=list)
+    malformed: list[LabelFinding] = field(default_factory=list)
 
 
 def read_umcd(place: Path) -> ParsedSet:
@@ -137,13 +144,15 @@ def _videos(place: Path) -> dict[Path, _Video]:
     return videos
 
 
-def _findings(videos: Iterable[_Video], pictures: Iterable[ParsedPicture]) -> Iterator[Finding]:
+def _findings(
+    videos: Iterable[_Video], pictures: Iterable[ParsedPicture]
+) -> Iterator[LabelFinding]:
     """What was wrong in the metadata files, and the frames that show objects at unknown places."""
     for video in videos:
         yield from video.malformed
     for each in pictures:
         if each.is_ignored:
-            yield Finding("no_boxes_for_frame", each.path.name)
+            yield LabelFinding("no_boxes_for_frame", each.path.name)
 
 
 def _labelled_frames(
@@ -183,7 +192,7 @@ def _parsed(path: Path) -> _Video:
         elif key in ("fps", "frequency"):
             video.fps = next(iter(numbers), 0.0)
         elif line.strip() and not (key and _add_field(video, key, value, numbers)):
-            video.malformed.append(Finding("malformed_labels", f"{path.name}, line {number}"))
+            video.malformed.append(LabelFinding("malformed_labels", f"{path.name}, line {number}"))
     video.objects = [each for each in video.objects if each.name]
     return video
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sorvolo.errors import InputError
-from sorvolo.lab.datasets.mask_pictures import MASK_ENDINGS
+from sorvolo.lab.evaluation.mask_folders import MASK_ENDINGS
 from sorvolo.lab.thesis.umcd import looks_like_umcd
 
 WITH, WITHOUT = "Videos With Telemetry", "Videos Without Telemetry"

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 from math import ceil, floor
 from typing import Any
 
-from sorvolo.lab.datasets.naming import DEFAULT_CLASSES, plain
+from sorvolo.lab.datasets.checking import DEFAULT_CLASSES, plain
 
 _FIRST_AS_BEFORE = 1  # a simulation counts flights from 1
 

@@ -3,7 +3,7 @@
 import math
 import os
 import time
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
@@ -13,28 +13,34 @@ from typing import Any
 
 from sorvolo import __version__
 from sorvolo.capture.photos import read_picture
-from sorvolo.detection.calibration import scaled_thresholds
-from sorvolo.detection.contract import FORMAT, Calibration
+from sorvolo.detection.contract import FORMAT
+from sorvolo.detection.fusing import scaled_thresholds
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import ImageRGB
-from sorvolo.lab.training.checkpoint import (
+from sorvolo.lab.training.faster_rcnn import FasterRCNN
+from sorvolo.lab.training.held_out import (
+    Checked,
+    best_sizes_px,
+    check_model,
+    check_of,
+    found_sizes_px,
+    padded_to,
+)
+from sorvolo.lab.training.joint import Progress
+from sorvolo.lab.training.onnx_export import ExportCheck, ExportedModel, check_export, export_onnx
+from sorvolo.lab.training.page import training_page
+from sorvolo.lab.training.progress import (
+    Check,
+    History,
+    Learner,
     checkpoint_bytes,
     load_weights_bytes,
     read_checkpoint,
     restore,
+    seconds_left,
     weights_bytes,
 )
-from sorvolo.lab.training.checks import check_model, check_of
-from sorvolo.lab.training.drawing import batches_from
-from sorvolo.lab.training.exported import ExportedModel
-from sorvolo.lab.training.faster_rcnn import FasterRCNN
-from sorvolo.lab.training.held_out import Checked, best_sizes_px, found_sizes_px
-from sorvolo.lab.training.joint import Progress
-from sorvolo.lab.training.onnx_export import ExportCheck, check_export, export_onnx
-from sorvolo.lab.training.page import training_page
-from sorvolo.lab.training.progress import Check, History, Learner, seconds_left
-from sorvolo.lab.training.samples import Augmentation, Sample
-from sorvolo.lab.training.seeing import padded_to
+from sorvolo.lab.training.samples import Augmentation, TrainingSample, batches_from
 from sorvolo.lab.training.sets import (
     DataOptions,
     TrainingSets,
@@ -44,16 +50,15 @@ from sorvolo.lab.training.sets import (
 )
 from sorvolo.lab.training.settings import TrainSettings
 from sorvolo.lab.training.start import (
-    class_notices,
+    begin_notices,
+    device_of,
+    kept_notices,
     kept_on_request,
     kept_thermal_by,
     load_start,
-    part_notices,
-    request_notices,
-    size_notices,
-    threshold_notices,
+    start_learner,
+    without_denormals,
 )
-from sorvolo.lab.training.starting import device_of, start_learner, without_denormals
 from sorvolo.lab.training.weights import ImageNetWeights
 from sorvolo.paths import AnyPath, Inputs, listed
 from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, writing
@@ -167,7 +172,7 @@ def _train(
     sets = training_sets(labels, synthetic=settings.synthetic, simulated=out / SIMULATED)
     notices = sets.notices
     if isinstance(start, ExportedModel):
-        notices += (*part_notices(start), *class_notices(start, sets.classes))
+        notices += tuple(begin_notices(start, sets.classes))
     yield TrainingUpdate(0, steps, f"preparing the network ({settings.preset})", notices=notices)
     reader = _Reader(sets)
     with without_denormals():
@@ -247,7 +252,7 @@ class _Reader:
 
 def _batches(
     sets: TrainingSets, reader: _Reader, settings: TrainSettings, start: int = 0
-) -> Generator[list[Sample], None, None]:
+) -> Generator[list[TrainingSample], None, None]:
     """What is learnt from, batch by batch, from number `start` on."""
     return batches_from(
         sets.shares,
@@ -332,37 +337,85 @@ def _look(run: _Run, model: FasterRCNN, most: int) -> Checked:
 def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
     """The best weights as a model file, checked against torch, with the report; its last check, and notices that
     are new."""
-    model, classes, best = run.learner.average, run.sets.classes, run.history.best
+    model, classes, history = run.learner.average, run.sets.classes, run.history
+    best, held_out = history.best, run.sets.held_out
+    before = run.start if isinstance(run.start, ExportedModel) else None
     if best is not None:
         load_weights_bytes(model, (run.out / BEST).read_bytes(), str(run.out / BEST))
-    checked = _look(run, model, _MOST_CHECKED_LAST) if run.sets.held_out else Checked({}, {})
-    before = run.start.thresholds if isinstance(run.start, ExportedModel) else {}
-    thresholds = checked.thresholds(classes, before)
+    checked = _look(run, model, _MOST_CHECKED_LAST) if held_out else Checked({}, {})
+    thresholds = checked.thresholds(classes, before.thresholds if before else {})
     scores = {name: each.score for name, each in thresholds.items()}
-    known = run.start.calibration if isinstance(run.start, ExportedModel) else {}
-    calibration = checked.calibration(
-        classes, {name: Calibration(**each) for name, each in known.items()}
-    )
+    calibration = checked.calibration(classes, before.calibration if before else {})
     scaled = scaled_thresholds(scores, calibration)
-    info = _info(run, checked, scores) | {
+    # what the model file states of itself; of a tuned one also what the model before was
+    learnt = [share.labelled for share in run.sets.shares]
+    thermal, by_day = run.sets.lights
+    licence, trained_on = (
+        "as the data that it was trained on",
+        ", ".join(each.name for each in learnt),
+    )
+    kept: dict[str, Any] = {}
+    if before:
+        was = before.info
+        licence += f"; {before.origin} before: {was.licence or 'not stated'}"
+        trained_on += f"; {before.origin} before: {was.trained_on or 'not stated'}"
+        kept = {
+            "on_request": list(kept_on_request(before, classes, checked.too_few(classes))),
+            "thermal_by": kept_thermal_by(before, classes, thermal=thermal),
+        }
+    info = {
         "format": FORMAT if calibration else 1,
+        "name": run.out.resolve().name or "model",
+        "preset": run.settings.preset,
+        "version": __version__,
+        "classes": list(classes),
         "thresholds": scaled,
         "calibration": {name: asdict(each) for name, each in calibration.items()},
+        "best_px": best_sizes_px(
+            checked, scores, learnt, classes, before.info.best_px if before else {}
+        ),
+        "licence": licence,
+        "trained_on": trained_on,
+        "thermal": thermal,
+        "daylight": by_day,
+        **kept,
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     exported = export_onnx(model, info)
-    agreement = check_export(model.cpu(), exported, _some_pictures(run))
+    # compared on a few that can be read, held-out ones first, padded where a side is shorter than the network's stride
+    shown: list[ImageRGB] = []
+    for picture in (each for labelled in (*held_out, *learnt) for each in labelled.pictures):
+        if len(shown) < _EXPORT_PICTURES:
+            with suppress(InputError):
+                part = run.reader(picture.path)[:_EXPORT_PX, :_EXPORT_PX]
+                shown.append(padded_to(part, run.learner.model.stride))
+    agreement = check_export(model.cpu(), exported, shown)
     atomic_write_bytes(run.out / MODEL, exported)
-    check = (
-        check_of(checked, run.learner.step if best is None else best.step)
-        if run.sets.held_out
-        else None
-    )
+    at_step = run.learner.step if best is None else best.step
+    check = check_of(checked, at_step) if held_out else None
     notices = _closing_notices(run, agreement, check)
-    if isinstance(run.start, ExportedModel):
-        notices += tuple(threshold_notices(run.start, checked.too_few(classes)))
-        notices += tuple(size_notices(run.start, checked.too_few(classes)))
-        notices += tuple(request_notices(run.start, info["on_request"]))
-    report = _report(run, info, agreement, len(exported), check, notices) | {
+    if before:
+        notices += tuple(kept_notices(before, checked.too_few(classes), info["on_request"]))
+    step, steps = run.learner.step, run.settings.steps
+    report = {
+        "made_by": "sorvolo train",
+        "format": 1,
+        "model": info,
+        "settings": asdict(run.settings),
+        "device": run.device,
+        "weights": "none" if run.start is None else run.start.origin,
+        "not_carried_on": list(before.left) if before else [],
+        "sets": run.sets.described(),
+        "notices": [*run.notices, *notices],
+        "step": step,
+        "steps": steps,
+        "stopped_early": step < steps,
+        "seconds": history.seconds,
+        "losses": [asdict(row) for row in history.rows],
+        "checks": [asdict(each) for each in history.checks],
+        "best_step": None if best is None else best.step,
+        "held_out": None if check is None else asdict(check),
+        "export": {**asdict(agreement), "good": agreement.is_good, "bytes": len(exported)},
         "reported": {
             name: asdict(replace(each, score=scaled[name])) for name, each in thresholds.items()
         },
@@ -371,67 +424,6 @@ def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
     atomic_write_bytes(run.out / REPORT, json_bytes(report))
     atomic_write_bytes(run.out / PAGE, training_page(plain_json(report)).encode())
     return check, notices
-
-
-def _info(run: _Run, checked: Checked, thresholds: dict[str, float]) -> dict[str, Any]:
-    """What the model file states of itself."""
-    learnt = [share.labelled for share in run.sets.shares]
-    classes, (thermal, by_day) = run.sets.classes, run.sets.lights
-    before = run.start.best_px if isinstance(run.start, ExportedModel) else {}
-    return {
-        "name": run.out.resolve().name or "model",
-        "preset": run.settings.preset,
-        "version": __version__,
-        "classes": list(classes),
-        "thresholds": thresholds,
-        "best_px": best_sizes_px(checked, thresholds, learnt, classes, before),
-        **_descent(run, ", ".join(each.name for each in learnt)),
-        "thermal": thermal,
-        "daylight": by_day,
-        **_kept(run, checked, thermal=thermal),
-        "created": datetime.now(UTC).isoformat(timespec="seconds"),
-    }
-
-
-def _kept(run: _Run, checked: Checked, *, thermal: bool) -> dict[str, Any]:
-    """What a tuned model keeps of how the one before is used; nothing of one that begins otherwise."""
-    if not isinstance(run.start, ExportedModel):
-        return {}
-    classes = run.sets.classes
-    return {
-        "on_request": list(kept_on_request(run.start, classes, checked.too_few(classes))),
-        "thermal_by": kept_thermal_by(run.start, classes, thermal=thermal),
-    }
-
-
-def _descent(run: _Run, learnt: str) -> dict[str, str]:
-    """The model file's licence and what it was trained on: of a tuned one also those of the model before."""
-    licence = "as the data that it was trained on"
-    if not isinstance(run.start, ExportedModel):
-        return {"licence": licence, "trained_on": learnt}
-    before = run.start.trained_on or "not stated"
-    return {
-        "licence": f"{licence}; {run.start.origin} before: {run.start.licence or 'not stated'}",
-        "trained_on": f"{learnt}; {run.start.origin} before: {before}",
-    }
-
-
-def _some_pictures(run: _Run) -> list[ImageRGB]:
-    """A few that can be read, held-out ones first, padded where a side is shorter than the network's stride."""
-    sets = (*run.sets.held_out, *(share.labelled for share in run.sets.shares))
-    found: list[ImageRGB] = []
-    for picture in (each for labelled in sets for each in labelled.pictures):
-        if len(found) == _EXPORT_PICTURES:
-            break
-        try:
-            found.append(
-                padded_to(
-                    run.reader(picture.path)[:_EXPORT_PX, :_EXPORT_PX], run.learner.model.stride
-                )
-            )
-        except InputError:
-            continue
-    return found
 
 
 def _closing_notices(run: _Run, agreement: ExportCheck, check: Check | None) -> tuple[str, ...]:
@@ -457,35 +449,3 @@ def _closing_notices(run: _Run, agreement: ExportCheck, check: Check | None) -> 
             f"{agreement.unmatched} of {agreement.detections} detections unmatched"
         )
     return tuple(notices)
-
-
-def _report(
-    run: _Run,
-    info: Mapping[str, Any],
-    agreement: ExportCheck,
-    size_bytes: int,
-    check: Check | None,
-    closing_notices: Sequence[str],
-) -> dict[str, Any]:
-    """The content of training.json."""
-    step, steps, history = run.learner.step, run.settings.steps, run.history
-    return {
-        "made_by": "sorvolo train",
-        "format": 1,
-        "model": dict(info),
-        "settings": asdict(run.settings),
-        "device": run.device,
-        "weights": "none" if run.start is None else run.start.origin,
-        "not_carried_on": list(run.start.left) if isinstance(run.start, ExportedModel) else [],
-        "sets": run.sets.described(),
-        "notices": [*run.notices, *closing_notices],
-        "step": step,
-        "steps": steps,
-        "stopped_early": step < steps,
-        "seconds": history.seconds,
-        "losses": [asdict(row) for row in history.rows],
-        "checks": [asdict(each) for each in history.checks],
-        "best_step": None if history.best is None else history.best.step,
-        "held_out": None if check is None else asdict(check),
-        "export": {**asdict(agreement), "good": agreement.is_good, "bytes": size_bytes},
-    }

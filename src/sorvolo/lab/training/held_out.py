@@ -1,22 +1,31 @@
 """How well a detector does on pictures that were held out while it learnt: per class, over several sets."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
+import cv2
 import numpy as np
+import torch
 
-from sorvolo.detection.calibration import platt_fit
-from sorvolo.detection.contract import Calibration
-from sorvolo.geometry.arrays import Floats
+from sorvolo.detection.contract import ScoreCalibration
+from sorvolo.detection.fusing import platt_fit
+from sorvolo.errors import InputError
+from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.lab.evaluation.detection_metrics import (
     ClassMatch,
     CocoNumbers,
     Threshold,
     at_score,
+    judged_classes,
+    match_pictures,
     reporting_threshold,
 )
+from sorvolo.lab.training.faster_rcnn import FasterRCNN
+from sorvolo.lab.training.progress import Check
+from sorvolo.mosaic.selection import evenly
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
+from sorvolo.survey.objects import Detections
 
 _FALLBACK_THRESHOLD = 0.5  # where nothing was held out to choose one
 _FEW_LABELS = 50  # held-out labels of a class: with fewer, the best score on them may lie anywhere
@@ -65,8 +74,8 @@ class Checked:
         }
 
     def calibration(
-        self, classes: Sequence[str], before: Mapping[str, Calibration] = MappingProxyType({})
-    ) -> dict[str, Calibration]:
+        self, classes: Sequence[str], before: Mapping[str, ScoreCalibration] = MappingProxyType({})
+    ) -> dict[str, ScoreCalibration]:
         """The scale by which scores of each class become the share that is right among the held-out pictures' reports.
 
         `before` is that of the model that was learnt on from: kept for `too_few` classes. Nothing of a class of which
@@ -182,3 +191,74 @@ def mean_known(values: Iterable[float]) -> float:
     """The plain mean of those that are known; NaN where none is."""
     known = [value for value in values if np.isfinite(value)]
     return float(np.mean(known)) if known else float("nan")
+
+
+def check_of(checked: Checked, step: int) -> Check:
+    """The figures of a check: AP50 and AP over all classes, the plain mean, and AP50 of each class."""
+    return Check(
+        step, mean_known(checked.ap50.values()), mean_known(checked.ap.values()), checked.ap50
+    )
+
+
+def check_model(
+    model: FasterRCNN,
+    classes: Sequence[str],
+    held_out: Sequence[LabelledSet],
+    read: Callable[[str], ImageRGB],
+    *,
+    device: str,
+    most: int,
+) -> Checked:
+    """Run the network over at most `most` held-out pictures, spread evenly over each set; damaged ones are left out."""
+    total = sum(len(each) for each in held_out)
+    matches: dict[str, tuple[ClassMatch, ...]] = {}
+    numbers: dict[str, tuple[CocoNumbers, ...]] = {}
+    for whole in held_out:
+        count = min(len(whole), max(1, round(most * len(whole) / total)))
+        seen: list[LabelledPicture] = []
+        found = []
+        for picture in (whole.pictures[row] for row in evenly(len(whole), count)):
+            try:
+                image = read(picture.path)
+            except InputError:
+                continue
+            seen.append(picture)
+            found.append(see(model, classes, image, device))
+        labelled = whole.only(seen)
+        own, _, by_class = match_pictures(labelled, found, judged_classes(labelled, classes))
+        for match in own:
+            matches[match.label] = (*matches.get(match.label, ()), match)
+            numbers[match.label] = (*numbers.get(match.label, ()), by_class[match.label])
+    return Checked(matches, numbers)
+
+
+_LONGEST_PX = 1280  # larger pictures are made smaller: they are looked at whole, without tiles
+_FILL = 114  # grey, as around samples
+
+
+@torch.no_grad()
+def see(
+    model: FasterRCNN, classes: Sequence[str], picture: ImageRGB, device: str = "cpu"
+) -> Detections:
+    """What the network finds in one picture (H, W, 3), padded to its stride; above 1280 px in a smaller copy."""
+    model.eval()
+    height, width = picture.shape[:2]
+    scale = min(1.0, _LONGEST_PX / max(height, width))
+    seen = picture
+    if scale < 1:
+        seen = np.asarray(
+            cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8
+        )
+    down, right = (-side % model.stride for side in seen.shape[:2])
+    padded = np.pad(seen, ((0, down), (0, right), (0, 0)), constant_values=_FILL)
+    planes = torch.from_numpy(np.ascontiguousarray(padded.transpose(2, 0, 1))[None]).to(device)
+    boxes, scores, labels = (each.cpu().numpy() for each in model(planes))
+    boxes = np.clip(boxes / scale, 0, [width, height, width, height])
+    kept = (boxes[:, 2:] > boxes[:, :2]).all(1)
+    return Detections(boxes[kept], scores[kept], labels[kept], tuple(classes))
+
+
+def padded_to(picture: ImageRGB, side_px: int) -> ImageRGB:
+    """The picture, padded with gray where a side is shorter than `side_px`."""
+    down, right = (max(0, side_px - side) for side in picture.shape[:2])
+    return np.pad(picture, ((0, down), (0, right), (0, 0)), constant_values=114)

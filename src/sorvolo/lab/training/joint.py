@@ -10,12 +10,220 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
-from sorvolo.lab.training.drawn_regions import draw_regions
-from sorvolo.lab.training.faster_rcnn import FasterRCNN
-from sorvolo.lab.training.losses import Answer, LossRow, joint_proposal_loss
-from sorvolo.lab.training.proposals import Proposed
-from sorvolo.lab.training.samples import Sample
+from sorvolo.lab.training.faster_rcnn import FasterRCNN, Proposed, propose
+from sorvolo.lab.training.regions import (
+    boxes_from_offsets,
+    cover_matrix,
+    giou_loss,
+    iou_matrix,
+    offsets_from_boxes,
+)
+from sorvolo.lab.training.samples import TrainingSample
+
+_DECAY = 0.02  # of AdamW's weights
+_IGNORED_SHARE = (
+    0.5  # an anchor or region that lies by this much in an ignored region teaches nothing
+)
+_FOCAL_ALPHA, _FOCAL_GAMMA = 0.25, 2.0
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The truth of one picture, in its pixels: `boxes` (N, 4), `labels` (N,), `ignored` regions (M, 4), and which of
+    the C classes the picture has labels for, `known` (C,) bool: of the others nothing is learnt there."""
+
+    boxes: Tensor
+    labels: Tensor
+    ignored: Tensor
+    known: Tensor
+
+
+@dataclass(frozen=True)
+class LossRow:
+    """The losses of `step`, or their means over the steps since the row before; the seconds of learning until then."""
+
+    step: int
+    proposal_score: float
+    proposal_box: float
+    region_score: float
+    region_box: float
+    seconds: float
+
+    @property
+    def loss(self) -> float:
+        """Their sum, which is minimised."""
+        return self.proposal_score + self.proposal_box + self.region_score + self.region_box
+
+
+@dataclass(frozen=True)
+class Match:
+    """What boxes stand for, (K,): `target` the row of the answer, -1 background, -2 neither."""
+
+    target: Tensor
+
+    @property
+    def positive(self) -> Tensor:
+        """(K,) bool."""
+        return self.target >= 0
+
+
+def match_boxes(
+    boxes: Tensor, answer: Answer, *, over: float, under: float, best_too: bool
+) -> Match:
+    """Boxes (K, 4) that overlap a true one by more than `over` are positives, by less than `under` background.
+
+    `best_too`: every true box has at least its best-overlapping ones (Ren et al. 2015, 3.1.2).
+    """
+    target = torch.full((len(boxes),), -1, dtype=torch.int64, device=boxes.device)
+    if len(answer.boxes):
+        overlap = iou_matrix(boxes, answer.boxes)
+        best, row = overlap.max(1)
+        target[best >= under] = -2
+        target = torch.where(best >= over, row, target)
+        if best_too:
+            most = overlap.max(0).values.clamp(min=0.05)
+            again = (overlap >= 0.98 * most[None]) & (overlap > 0.05)
+            chosen, which = (overlap * again).max(1)
+            target = torch.where((chosen > 0) & (target < 0), which, target)
+    if len(answer.ignored):
+        inside = cover_matrix(boxes, answer.ignored).max(1).values > _IGNORED_SHARE
+        target = torch.where(inside & (target == -1), -2, target)
+    return Match(target)
+
+
+def joint_proposal_loss(proposed: Proposed, answers: Sequence[Answer]) -> tuple[Tensor, Tensor]:
+    """Focal loss of the scores and overlap loss of the boxes, each a mean over the positives of the batch.
+
+    Where a class goes unlabelled, background teaches nothing: what is there may be of that class.
+    """
+    matches = [
+        match_boxes(proposed.anchors, each, over=0.5, under=0.4, best_too=True) for each in answers
+    ]
+    target = torch.stack([each.target for each in matches])
+    wanted = (target >= 0).to(proposed.scores.dtype)
+    trust = torch.tensor(
+        [1.0 if bool(each.known.all()) else 0.1 for each in answers], device=target.device
+    )
+    weight = torch.where(target >= 0, _FOCAL_ALPHA, (1 - _FOCAL_ALPHA) * trust[:, None]) * (
+        target != -2
+    )
+    wrong = torch.sigmoid(proposed.scores.detach()).sub_(wanted).abs_()
+    each = functional.binary_cross_entropy_with_logits(proposed.scores, wanted, reduction="none")
+    score_loss = (weight * wrong**_FOCAL_GAMMA * each).sum()
+    picture, anchor = (target >= 0).nonzero(as_tuple=True)
+    if not len(picture):
+        return score_loss, proposed.offsets.sum() * 0
+    goals = torch.cat(
+        [own.boxes[match.target[match.positive]] for own, match in zip(answers, matches)]
+    )
+    offsets = proposed.offsets.flatten(0, 1).index_select(0, picture * target.shape[1] + anchor)
+    box_loss = giou_loss(boxes_from_offsets(offsets, proposed.anchors[anchor]), goals).sum()
+    return score_loss / len(picture), box_loss / len(picture)
+
+
+def region_loss(
+    scores: Tensor, offsets: Tensor, regions: Tensor, match: Match, answer: Answer, *, overlap: bool
+) -> tuple[Tensor, Tensor]:
+    """Log loss over classes and background of one picture's regions, and of the positives' boxes: by overlap, or
+    smooth L1 (eq. 4.2). Scores (R, C + 1), offsets (R, 4), regions (R, 4); `match` is of these very regions.
+
+    A class without labels in this picture is left out of its softmax.
+    """
+    background = scores.shape[1] - 1
+    wanted = torch.where(match.positive, 0, background)
+    if len(answer.boxes):
+        wanted = torch.where(match.positive, answer.labels[match.target.clamp(min=0)], background)
+    allowed = torch.cat([answer.known, answer.known.new_ones(1)])
+    masked = scores.masked_fill(~allowed[None], -1e4)
+    score_loss = functional.cross_entropy(masked, wanted, reduction="sum")
+    positive = match.positive
+    if not bool(positive.any()):
+        return score_loss, offsets.sum() * 0
+    if overlap:
+        shifted = boxes_from_offsets(offsets[positive], regions[positive])
+        return score_loss, giou_loss(shifted, answer.boxes[match.target[positive]]).sum()
+    goal = offsets_from_boxes(answer.boxes[match.target[positive]], regions[positive])
+    return score_loss, functional.smooth_l1_loss(offsets[positive], goal, reduction="sum", beta=1.0)
+
+
+def sample(match: Match, count: int, most_positive: float, generator: torch.Generator) -> Tensor:
+    """(S,) indices of at most `count` boxes, positives among them up to their share, the rest background."""
+    positive = match.positive.nonzero()[:, 0]
+    negative = (match.target == -1).nonzero()[:, 0]
+    positive = positive[
+        torch.randperm(len(positive), generator=generator)[: int(count * most_positive)]
+    ]
+    negative = negative[torch.randperm(len(negative), generator=generator)[: count - len(positive)]]
+    return torch.cat([positive, negative])
+
+
+@dataclass(frozen=True)
+class DrawnRegions:
+    """Regions (R, 4) px of each picture of a batch, and which true box each stands for."""
+
+    regions: tuple[Tensor, ...]
+    matches: tuple[Match, ...]
+
+    @property
+    def count(self) -> int:
+        """All of them."""
+        return sum(len(each) for each in self.regions)
+
+    @property
+    def positives(self) -> int:
+        """Those that stand for a true box."""
+        return sum(int(each.positive.sum()) for each in self.matches)
+
+    def losses(
+        self, model: FasterRCNN, levels: list[Tensor], answers: Sequence[Answer], *, overlap: bool
+    ) -> tuple[Tensor, Tensor]:
+        """The head's loss of the classes and of the boxes, each summed over all regions (`losses.region_loss`)."""
+        counts = [len(each) for each in self.regions]
+        batch = torch.repeat_interleave(torch.tensor(counts)).to(levels[0].device)
+        scores, offsets = model.classify(levels, torch.cat(self.regions), batch)
+        score_sum, box_sum = scores.new_zeros(()), scores.new_zeros(())
+        parts = zip(
+            torch.split(scores, counts),
+            torch.split(offsets, counts),
+            self.regions,
+            self.matches,
+            answers,
+        )
+        for each in parts:
+            score, box = region_loss(*each, overlap=overlap)
+            score_sum, box_sum = score_sum + score, box_sum + box
+        return score_sum, box_sum
+
+
+@torch.no_grad()
+def draw_regions(
+    model: FasterRCNN,
+    levels: Sequence[Tensor],
+    proposed: Proposed,
+    answers: Sequence[Answer],
+    generator: torch.Generator,
+    *,
+    before: int,
+    after: int,
+    count: int,
+    most_positive: float,
+) -> DrawnRegions:
+    """Of each picture `count` regions, positives among them up to their share; the true boxes may be drawn, too.
+
+    `before` and `after` as `proposals.propose` has them. Positives overlap a true box by half (Ren et al. 2015).
+    """
+    height, width = (levels[0].shape[axis] * model.proposals.strides[0] for axis in (2, 3))
+    regions, matches = [], []
+    for index, answer in enumerate(answers):
+        found, _ = propose(proposed, index, (height, width), before=before, after=after)
+        found = torch.cat([found, answer.boxes])
+        match = match_boxes(found, answer, over=0.5, under=0.5, best_too=False)
+        chosen = sample(match, count, most_positive, generator)
+        regions.append(found[chosen])
+        matches.append(Match(match.target[chosen]))
+    return DrawnRegions(tuple(regions), tuple(matches))
 
 
 @dataclass(frozen=True)
@@ -26,7 +234,6 @@ class JointSettings:
     batch: int = 4
     rate: float = 1e-3  # of AdamW for the new parts, at its height
     backbone_rate: float = 2e-4  # a fifth for what is trained already
-    decay: float = 0.02  # of AdamW's weights
     warm_steps: int = 200  # over which the rate rises
     regions: int = 96  # per picture for the head, a third of them positives at most
     averaging: float = 0.998  # of the weights that are kept in the end (an exponential mean)
@@ -59,14 +266,14 @@ class JointTraining:
                 {"params": backbone, "rate": settings.backbone_rate},
             ],
             lr=settings.rate,
-            weight_decay=settings.decay,
+            weight_decay=_DECAY,
             fused=True,
         )
         self._started_s = time.monotonic()
 
     phase, is_whole = "learning", True
 
-    def learn(self, batch: Sequence[Sample]) -> Progress:
+    def learn(self, batch: Sequence[TrainingSample]) -> Progress:
         """One step on a batch of samples of one size."""
         self.model.train()
         share = self._share_of_rate()
@@ -88,16 +295,9 @@ class JointTraining:
         self.optimiser.step()
         self.step += 1
         self._average()
-        values = [float(part.detach()) for part in parts]
-        return Progress(
-            self.step,
-            values[0],
-            values[1],
-            values[2],
-            values[3],
-            time.monotonic() - self._started_s,
-            self.settings.steps,
-        )
+        losses = (float(part.detach()) for part in parts)
+        seconds = time.monotonic() - self._started_s
+        return Progress(self.step, *losses, seconds, self.settings.steps)  # type: ignore[arg-type]
 
     def state(self) -> dict[str, object]:
         """All that is needed to go on: tensors, numbers and text only."""
@@ -159,7 +359,7 @@ class JointTraining:
                 mean.copy_(value)
 
 
-def collate(batch: Sequence[Sample], device: str) -> tuple[Tensor, list[Answer]]:
+def collate(batch: Sequence[TrainingSample], device: str) -> tuple[Tensor, list[Answer]]:
     """Samples as the picture tensor (N, 3, H, W) and their answers."""
     images = (
         torch.from_numpy(np.stack([each.image for each in batch])).permute(0, 3, 1, 2).to(device)

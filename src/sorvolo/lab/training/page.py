@@ -114,7 +114,9 @@ def _settings(report: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def _plot(title: str, lines: _Lines, high: float | None = None) -> dict[str, Any] | None:
     """Lines over steps and their key; None unless two points of one are known."""
-    certain = _certain(lines)
+    # The known points of each line; lines of fewer than two are left out
+    known = {name: [point for point in line if _is_known(point[1])] for name, line in lines.items()}
+    certain = {name: line for name, line in known.items() if len(line) > 1}
     if not certain:
         return None
     last = max(line[-1][0] for line in certain.values())
@@ -126,23 +128,14 @@ def _plot(title: str, lines: _Lines, high: float | None = None) -> dict[str, Any
         for place, line in enumerate(certain.values())
     ]
     keys = [(colour_class(place), name) for place, name in enumerate(certain)]
-    return {"drawing": line_plot(title, drawn, _axes(x, y), _WIDE_PX, _LOW_PX), "legend": keys}
-
-
-def _certain(lines: _Lines) -> dict[str, list[tuple[float, float]]]:
-    """The known points of each line; lines of fewer than two are left out."""
-    known = {name: [point for point in line if _is_known(point[1])] for name, line in lines.items()}
-    return {name: line for name, line in known.items() if len(line) > 1}
-
-
-def _axes(x: Scale, y: Scale) -> Axes:
     labels = [PlotLabel(_MARGIN_PX - 6, y(tick) + 4, f"{tick:g}", "end") for tick in y.ticks(5)]
     labels += [
         PlotLabel(x(tick), _LOW_PX - 16, f"{tick:g}") for tick in x.ticks(8) if tick == round(tick)
     ]
     labels.append(PlotLabel(_WIDE_PX - 8, _LOW_PX - 2, "step", "end"))
     across = tuple(("grid", y(tick)) for tick in y.ticks(5))
-    return Axes(_MARGIN_PX, _WIDE_PX - 8, 14, _LOW_PX - 34, across, (), tuple(labels))
+    axes = Axes(_MARGIN_PX, _WIDE_PX - 8, 14, _LOW_PX - 34, across, (), tuple(labels))
+    return {"drawing": line_plot(title, drawn, axes, _WIDE_PX, _LOW_PX), "legend": keys}
 
 
 def _typical_top(line: Sequence[tuple[float, float]]) -> float:

@@ -83,9 +83,30 @@ def quantise(
     if session.info.precision == "int8":
         raise InputError(f"{path} is in eight bits already; give the model that it was made from")
     model = onnx.load_model(path)
-    _fold_half_weights(model.graph)
-    _fold_identities(model.graph)
-    _name_nodes(model.graph)
+    # Weights stored in float16 become float32 where they stand, without a Cast: the quantiser wants them direct
+    from onnx import numpy_helper
+
+    halves = {each.name: each for each in model.graph.initializer if each.data_type == _HALF}
+    for node in [
+        each for each in model.graph.node if each.op_type == "Cast" and each.input[0] in halves
+    ]:
+        values = numpy_helper.to_array(halves[node.input[0]]).astype(np.float32)
+        model.graph.initializer.remove(halves[node.input[0]])
+        model.graph.initializer.append(numpy_helper.from_array(values, node.output[0]))
+        model.graph.node.remove(node)
+    # Weights that come through Identity nodes are read directly, and those nodes go
+    weights = {each.name for each in model.graph.initializer}
+    given: dict[str, str] = {}
+    for node in list(model.graph.node):
+        if node.op_type == "Identity" and given.get(node.input[0], node.input[0]) in weights:
+            given[node.output[0]] = given.get(node.input[0], node.input[0])
+            model.graph.node.remove(node)
+    for node in model.graph.node:
+        for place, name in enumerate(node.input):
+            node.input[place] = given.get(name, name)
+    # Give each node without a name one of its own: the quantiser knows nodes by name
+    for index, node in enumerate(model.graph.node):
+        node.name = node.name or f"{node.op_type}_{index}"
     chosen = _chosen(model.graph, path, float_parts)
     samples = _Samples(session, pictures)
     with tempfile.TemporaryDirectory() as folder, _quiet():
@@ -125,7 +146,11 @@ def _chosen(graph: Any, path: Path, float_parts: Sequence[str]) -> list[str]:
         raise SettingsError(
             f"{path} has no part {', '.join(unknown)}; it has {', '.join(_parts_of(names))}"
         )
-    chosen = [name for name in _quantisable(graph) if not _lies_in_any(name, float_parts)]
+    chosen = [
+        name
+        for name in _quantisable(graph)
+        if not any(_lies_in(name, part) for part in float_parts)
+    ]
     if not chosen:
         raise InputError(
             f"{path} has no convolutions that lead to others: eight bits would gain nothing"
@@ -145,10 +170,6 @@ def _parts_of(nodes: Sequence[str]) -> list[str]:
 
 def _has_part(nodes: Sequence[str], part: str) -> bool:
     return any(_lies_in(node, part) for node in nodes)
-
-
-def _lies_in_any(node: str, parts: Sequence[str]) -> bool:
-    return any(_lies_in(node, part) for part in parts)
 
 
 def _lies_in(node: str, part: str) -> bool:
@@ -219,37 +240,6 @@ class _Samples:
 
     def set_range(self, start_index: int, end_index: int) -> None:
         """Not for inputs of different sizes; the quantiser asks only where it may go in strides."""
-
-
-def _fold_half_weights(graph: Any) -> None:
-    """Weights stored in float16 become float32 where they stand, without a Cast: the quantiser wants them direct."""
-    from onnx import numpy_helper
-
-    halves = {each.name: each for each in graph.initializer if each.data_type == _HALF}
-    for node in [each for each in graph.node if each.op_type == "Cast" and each.input[0] in halves]:
-        values = numpy_helper.to_array(halves[node.input[0]]).astype(np.float32)
-        graph.initializer.remove(halves[node.input[0]])
-        graph.initializer.append(numpy_helper.from_array(values, node.output[0]))
-        graph.node.remove(node)
-
-
-def _fold_identities(graph: Any) -> None:
-    """Weights that come through Identity nodes are read directly, and those nodes go."""
-    weights = {each.name for each in graph.initializer}
-    given: dict[str, str] = {}
-    for node in list(graph.node):
-        if node.op_type == "Identity" and given.get(node.input[0], node.input[0]) in weights:
-            given[node.output[0]] = given.get(node.input[0], node.input[0])
-            graph.node.remove(node)
-    for node in graph.node:
-        for place, name in enumerate(node.input):
-            node.input[place] = given.get(name, name)
-
-
-def _name_nodes(graph: Any) -> None:
-    """Give each node without a name one of its own: the quantiser knows nodes by name."""
-    for index, node in enumerate(graph.node):
-        node.name = node.name or f"{node.op_type}_{index}"
 
 
 def _quantisable(graph: Any) -> list[str]:

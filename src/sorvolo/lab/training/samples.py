@@ -1,14 +1,17 @@
 """What the network learns from: crops of labelled pictures, turned, scaled, lit and blurred as the air does it."""
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import Floats, ImageRGB, Labels, Matrix3
-from sorvolo.lab.training.sprites import paste_small_objects
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 
 _LEAST_SEEN = 0.4  # of an object cut by the crop's edge; less of one teaches nothing
@@ -18,15 +21,13 @@ _LEAST_PX = 3.0  # longer side of an object; smaller ones are ignored
 @dataclass(frozen=True)
 class Share:
     """A labelled set, and how often it is drawn from; `scale` the range of magnifications; `pastes` the class name
-    under which small objects are composed onto its ground, "" for none; `thermal`: its polarity may turn; `aslant`: its
-    pictures were not taken straight down, what is up in them stays up."""
+    under which small objects are composed onto its ground, "" for none; `thermal`: its polarity may turn."""
 
     labelled: LabelledSet
     weight: float
     scale: tuple[float, float] = (0.6, 1.6)
     pastes: str = ""
     thermal: bool = False
-    aslant: bool = False
 
 
 @dataclass(frozen=True)
@@ -39,11 +40,10 @@ class Augmentation:
     haze: float = 0.1
     grey: float = 0.15  # how often colours are taken away
     noise: float = 0.2
-    tone: float = 0.0  # how often: another tone curve and uneven warmth, as thermal cameras' gain control makes them
 
 
 @dataclass(frozen=True, eq=False)
-class Sample:
+class TrainingSample:
     """A training picture (side, side, 3) with boxes (N, 4) px, labels (N,), ignored regions (M, 4), known (C,) bool."""
 
     image: ImageRGB
@@ -60,7 +60,7 @@ def cut_sample(
     classes: Sequence[str],
     augmentation: Augmentation,
     rng: np.random.Generator,
-) -> Sample:
+) -> TrainingSample:
     """One random crop of a picture (H, W, 3) with what is labelled in it."""
     side = augmentation.side_px
     own = share.labelled.classes
@@ -68,8 +68,31 @@ def cut_sample(
     labels = rename[picture.labels] if len(picture.labels) else np.zeros(0, np.int64)
     boxes = np.asarray(picture.boxes_px, float)[labels >= 0]
     labels = labels[labels >= 0]
-    turns = augmentation.turns and not share.aslant
-    crop_from_picture = _placement(image.shape[:2], boxes, share.scale, side, turns, rng)
+    # (3, 3) crop_from_picture: where the crop lies, around an object three times of four
+    size = image.shape[:2]
+    height, width = size
+    scale = float(np.exp(rng.uniform(*np.log(share.scale))))
+    scale = max(scale, 0.5 * side / max(height, width))
+    if len(boxes) and rng.random() < 0.75:
+        box = boxes[rng.integers(len(boxes))]
+        scale = min(scale, 0.8 * side / max(float(np.max(box[2:] - box[:2])), 1.0))
+        centre = (box[:2] + box[2:]) / 2 + rng.uniform(-0.4, 0.4, 2) * side / scale
+    else:
+        centre = rng.uniform(0, 1, 2) * (width, height)
+    reach = side / scale / 2
+    for axis, length in enumerate((width, height)):
+        centre[axis] = np.clip(
+            centre[axis], min(reach, length / 2), max(length - reach, length / 2)
+        )
+    angle = 0.0
+    if augmentation.turns:
+        angle = rng.uniform(0, 2 * np.pi) if rng.random() < 0.35 else rng.integers(4) * np.pi / 2
+    mirror = 1.0 if rng.random() < 0.5 else -1.0
+    c, s = scale * np.cos(angle), scale * np.sin(angle)
+    turn = np.array([[c * mirror, -s], [s * mirror, c]])
+    matrix = np.eye(3)
+    matrix[:2, :2], matrix[:2, 2] = turn, side / 2 - turn @ centre
+    crop_from_picture = matrix
     out, crop_from_picture = _warped(image, crop_from_picture, side)
     boxes, seen = boxes_in_crop(boxes, crop_from_picture, side)
     ignored, in_sight = boxes_in_crop(
@@ -88,41 +111,7 @@ def cut_sample(
         labels = np.append(labels, np.full(len(pasted), label, np.int64))
         known = known | (np.arange(len(classes)) == label)
     out = _weathered(out, augmentation, rng, thermal=share.thermal)
-    return Sample(out, boxes, labels, ignored, known)
-
-
-def _placement(
-    size: tuple[int, int],
-    boxes: Floats,
-    scales: tuple[float, float],
-    side: int,
-    turns: bool,
-    rng: np.random.Generator,
-) -> Matrix3:
-    """(3, 3) crop_from_picture: where the crop lies, around an object three times of four."""
-    height, width = size
-    scale = float(np.exp(rng.uniform(*np.log(scales))))
-    scale = max(scale, 0.5 * side / max(height, width))
-    if len(boxes) and rng.random() < 0.75:
-        box = boxes[rng.integers(len(boxes))]
-        scale = min(scale, 0.8 * side / max(float(np.max(box[2:] - box[:2])), 1.0))
-        centre = (box[:2] + box[2:]) / 2 + rng.uniform(-0.4, 0.4, 2) * side / scale
-    else:
-        centre = rng.uniform(0, 1, 2) * (width, height)
-    reach = side / scale / 2
-    for axis, length in enumerate((width, height)):
-        centre[axis] = np.clip(
-            centre[axis], min(reach, length / 2), max(length - reach, length / 2)
-        )
-    angle = 0.0
-    if turns:
-        angle = rng.uniform(0, 2 * np.pi) if rng.random() < 0.35 else rng.integers(4) * np.pi / 2
-    mirror = 1.0 if rng.random() < 0.5 else -1.0
-    c, s = scale * np.cos(angle), scale * np.sin(angle)
-    turn = np.array([[c * mirror, -s], [s * mirror, c]])
-    matrix = np.eye(3)
-    matrix[:2, :2], matrix[:2, 2] = turn, side / 2 - turn @ centre
-    return matrix
+    return TrainingSample(out, boxes, labels, ignored, known)
 
 
 def _warped(image: ImageRGB, crop_from_picture: Matrix3, side: int) -> tuple[ImageRGB, Matrix3]:
@@ -175,8 +164,6 @@ def _weathered(
         x *= rng.uniform(0.85, 1.18, 3).astype(np.float32) ** (rng.random() < 0.5)
         if rng.random() < how.grey:
             x[:] = x.mean(2, keepdims=True)
-    if how.tone and rng.random() < how.tone:
-        x = _toned(x, rng)
     x = (x - x.mean()) * rng.uniform(0.6, 1.35) + x.mean() + rng.uniform(-35, 35)
     if rng.random() < how.haze:
         share = rng.uniform(0.1, 0.5)
@@ -198,9 +185,197 @@ def _weathered(
     return np.clip(x, 0, 255).astype(np.uint8)
 
 
-def _toned(x: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
-    """(H, W, 3) 0 to 255 through a power of the grey values, brighter here and darker there by up to a quarter."""
-    curved = 255 * (np.clip(x, 0, 255) / 255) ** np.exp(rng.uniform(-0.7, 0.7))
-    coarse = rng.normal(0, rng.uniform(0, 25), (3, 3)).astype(np.float32)
-    uneven = cv2.resize(coarse, x.shape[1::-1], interpolation=cv2.INTER_CUBIC)
-    return np.asarray(curved + uneven[:, :, None], np.float32)
+@dataclass(frozen=True)
+class Draw:
+    """Sample `number` (from 0) is cut from picture `picture` of share `share`."""
+
+    number: int
+    share: int
+    picture: int
+
+
+def draws(shares: Sequence[Share], seed: int, start: int = 0) -> Iterator[Draw]:
+    """Endless draws from number `start` on: shares by their weights, of each all pictures in turn, shuffled anew.
+
+    The draws do not depend on where they start. Raises SettingsError where no share has pictures and weight.
+    """
+    weights = np.array([share.weight if len(share.labelled) else 0.0 for share in shares], float)
+    if not weights.sum() > 0:
+        raise SettingsError("there is no picture to learn from: every set is empty or has weight 0")
+    bounds = np.cumsum(weights / weights.sum())
+    rng = np.random.default_rng((seed, 0))
+    left: list[list[int]] = [[] for _ in shares]
+    number = 0
+    while True:
+        share = min(int(np.searchsorted(bounds, rng.random(), side="right")), len(shares) - 1)
+        if not left[share]:
+            left[share] = [int(each) for each in rng.permutation(len(shares[share].labelled))]
+        picture = left[share].pop()
+        if number >= start:
+            yield Draw(number, share, picture)
+        number += 1
+
+
+def batches_from(
+    shares: Sequence[Share],
+    classes: Sequence[str],
+    read: Callable[[str], ImageRGB],
+    augmentation: Augmentation,
+    *,
+    seed: int,
+    batch: int,
+    start: int = 0,
+    threads: int = 1,
+) -> Generator[list[TrainingSample], None, None]:
+    """Endless batches from number `start` on, the next ones cut on other threads meanwhile.
+
+    Batch k is the same whatever `start` and `threads` are. `read` gives a picture by its path; where it raises
+    InputError the set's next picture is taken instead, and where none can be read, that comes through.
+    """
+    numbered = draws(shares, seed, start * batch)
+
+    def cut(draw: Draw) -> TrainingSample:
+        share = shares[draw.share]
+        picture, image = _readable(share, draw.picture, read)
+        rng = np.random.default_rng((seed, 1, draw.number))
+        return cut_sample(image, picture, share, classes, augmentation, rng)
+
+    executor = ThreadPoolExecutor(threads)
+    waiting: deque[Future[TrainingSample]] = deque()
+    try:
+        while True:
+            while len(waiting) < batch * 2 + threads:
+                waiting.append(executor.submit(cut, next(numbered)))
+            yield [waiting.popleft().result() for _ in range(batch)]
+    finally:
+        executor.shutdown(cancel_futures=True)
+
+
+def _readable(
+    share: Share, first: int, read: Callable[[str], ImageRGB]
+) -> tuple[LabelledPicture, ImageRGB]:
+    """The first picture from `first` on, round and round, that is not damaged."""
+    pictures = share.labelled.pictures
+    for picture in (*pictures[first:], *pictures[:first]):
+        try:
+            return picture, read(picture.path)
+        except InputError as error:
+            reason = error
+    raise reason
+
+
+Pixels: TypeAlias = NDArray[np.floating[Any]]
+"""(height, width, 3) or (height, width) of float32 while a picture is worked on."""
+
+_MOST = 5  # objects of a picture; by choice
+_FINE = 4  # sub-pixels a side while drawing
+
+
+def paste_small_objects(
+    image: ImageRGB, taken: Floats, rng: np.random.Generator
+) -> tuple[ImageRGB, Floats]:
+    """The picture (H, W, 3) with a few boxes, cases, bags and tyres drawn on it, and their boxes (N, 4) px.
+
+    `taken` (M, 4) is where others stand; nothing is drawn there. Shadows of one picture fall the same way.
+    """
+    height, width = image.shape[:2]
+    out = image.astype(np.float32)
+    sun = rng.uniform(0, 2 * np.pi)
+    long = rng.uniform(0.0, 1.2)  # of a shadow, in heights
+    typical = float(np.exp(rng.uniform(np.log(9), np.log(48))))
+    placed: list[Floats] = []
+    for _ in range(int(rng.integers(1, _MOST + 1))):
+        size = typical * rng.uniform(0.6, 1.5)
+        ratio = rng.uniform(0.45, 1.0)
+        size = min(size, 0.3 * min(width, height))
+        centre = rng.uniform(size, np.array([width, height]) - size)
+        near = np.array([*(centre - size), *(centre + size)])
+        others = np.vstack([taken.reshape(-1, 4), *placed]) if placed else taken.reshape(-1, 4)
+        if (
+            len(others)
+            and (
+                (others[:, 0] < near[2])
+                & (others[:, 2] > near[0])
+                & (others[:, 1] < near[3])
+                & (others[:, 3] > near[1])
+            ).any()
+        ):
+            continue
+        placed.append(_draw(out, centre, size, ratio, sun, long, rng)[None])
+    boxes = np.vstack(placed) if placed else np.zeros((0, 4))
+    return np.clip(out, 0, 255).astype(np.uint8), boxes
+
+
+def _draw(
+    out: Pixels,
+    centre: Floats,
+    size: float,
+    ratio: float,
+    sun: float,
+    long: float,
+    rng: np.random.Generator,
+) -> Floats:
+    """Draw one object and its shadow into `out`; its box (4,)."""
+    reach = int(np.ceil(size * 1.6)) + 2
+    x0, y0 = (int(v) - reach for v in centre)
+    side = 2 * reach
+    shape = _outline(size, ratio, rng)
+    local = (centre - (x0, y0))[None] + shape
+    shadow = local + size * 0.45 * long * np.array([np.cos(sun), np.sin(sun)])
+    dark = _filled([local, shadow], side)
+    mask = _filled([local], side)
+    ground = _window(out, x0, y0, side)
+    tone = rng.uniform(15, 235) + rng.uniform(-45, 45, 3) * (rng.random() < 0.7)
+    surface = np.ones((side, side, 3), np.float32) * np.clip(tone, 5, 250).astype(np.float32)
+    grain = cv2.GaussianBlur(rng.normal(0, 1, (side, side)).astype(np.float32), (0, 0), 1.0)
+    surface += (rng.uniform(2, 14) * grain)[..., None]
+    lid = _filled([(local - local.mean(0)) * rng.uniform(0.25, 0.75) + local.mean(0)], side)
+    surface += (rng.uniform(-45, 45) * lid)[..., None]
+    depth = rng.uniform(0.3, 0.7) * (long > 0.1)
+    drawn = ground * (1 - depth * dark[..., None])
+    drawn = drawn * (1 - mask[..., None]) + surface * mask[..., None]
+    soft = rng.uniform(0.3, 0.9)
+    drawn = cv2.GaussianBlur(drawn, (0, 0), soft) if size > 10 else drawn
+    blend = cv2.GaussianBlur(np.maximum(mask, dark), (0, 0), 1.0)[..., None]
+    _put(out, x0, y0, ground * (1 - blend) + drawn * blend)
+    corner = np.array([x0, y0])
+    low, high = local.min(0) + corner, local.max(0) + corner
+    height, width = out.shape[:2]
+    return np.clip(np.array([*low, *high]), 0, [width, height, width, height])
+
+
+def _outline(size: float, ratio: float, rng: np.random.Generator) -> Floats:
+    """(N, 2) around zero: a turned rectangle, a rounded one, or an ellipse."""
+    turn = rng.uniform(0, np.pi)
+    if rng.random() < 0.7:
+        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1.0]])
+    else:
+        angles = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+        corners = np.stack([np.cos(angles), np.sin(angles)], 1)
+        if rng.random() < 0.5:
+            corners = np.sign(corners) * np.abs(corners) ** 0.6
+    scaled = corners * (size / 2, size * ratio / 2)
+    return scaled @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+
+
+def _filled(shapes: list[Floats], side: int) -> Pixels:
+    """(side, side) 0 to 1: how much of each pixel the hull of the shapes covers."""
+    fine = np.zeros((side * _FINE, side * _FINE), np.uint8)
+    hull = cv2.convexHull((np.vstack(shapes) * _FINE).astype(np.float32))
+    cv2.fillConvexPoly(fine, hull.astype(np.int32), 255)
+    return (
+        np.asarray(cv2.resize(fine, (side, side), interpolation=cv2.INTER_AREA), np.float32) / 255
+    )
+
+
+def _window(out: Pixels, x0: int, y0: int, side: int) -> Pixels:
+    rows = np.clip(np.arange(y0, y0 + side), 0, out.shape[0] - 1)
+    columns = np.clip(np.arange(x0, x0 + side), 0, out.shape[1] - 1)
+    return out[rows[:, None], columns[None]]
+
+
+def _put(out: Pixels, x0: int, y0: int, patch: Pixels) -> None:
+    height, width = out.shape[:2]
+    left, top = max(0, -x0), max(0, -y0)
+    right, bottom = min(patch.shape[1], width - x0), min(patch.shape[0], height - y0)
+    out[y0 + top : y0 + bottom, x0 + left : x0 + right] = patch[top:bottom, left:right]

@@ -10,11 +10,9 @@ from sorvolo.capture.photos import read_picture
 from sorvolo.detection.light import is_thermal
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.lab.datasets import read_dataset, read_datasets
-from sorvolo.lab.datasets.splits import shared_groups, shuffled
-from sorvolo.lab.simulation.folder import PICTURES_MARK
-from sorvolo.lab.simulation.picture_sets import simulate_pictures
-from sorvolo.lab.simulation.pictures import PictureSettings
-from sorvolo.lab.training.holding_out import hold_out
+from sorvolo.lab.datasets.splits import hold_out, shared_groups, shuffled
+from sorvolo.lab.simulation.flight_files import PICTURES_MARK
+from sorvolo.lab.simulation.pictures import PictureSettings, simulate_pictures
 from sorvolo.lab.training.samples import Share
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES
@@ -116,25 +114,20 @@ def read_labels(
             "no data to learn from; give folders of labelled pictures, or --synthetic 1"
         )
     checked = [Path(options.val)] if share is None else []
-    read = _read([*places, *checked], options)
+    labels: Any = {name: value for name, value in vars(options).items() if name != "val"}
+    read = read_datasets([*places, *checked], **labels)
     whole, apart = list(read[: len(places)]), list(read[len(places) :])
     notices = [f"{each.name}: {notice.text}" for each in read for notice in each.notices]
     if share is not None:
-        return _divided(whole, share, seed, notices)
+        # The sets with a share of each held out; `notices` and what is to be known of that
+        parts = [hold_out(each, share, seed) for each in whole]
+        return ReadLabels(
+            tuple(learnt for learnt, _, _ in parts),
+            tuple(held_out for _, held_out, _ in parts if len(held_out)),
+            (*notices, *(text for _, _, texts in parts for text in texts)),
+        )
     notices += [notice.text for each in whole for notice in shared_groups(each, apart[0])]
     return ReadLabels(tuple(whole), tuple(apart), tuple(notices))
-
-
-def _divided(
-    whole: Sequence[LabelledSet], share: float, seed: int, notices: Sequence[str]
-) -> ReadLabels:
-    """The sets with a share of each held out; `notices` and what is to be known of that."""
-    parts = [hold_out(each, share, seed) for each in whole]
-    return ReadLabels(
-        tuple(learnt for learnt, _, _ in parts),
-        tuple(held_out for _, held_out, _ in parts if len(held_out)),
-        (*notices, *(text for _, _, texts in parts for text in texts)),
-    )
 
 
 def training_sets(read: ReadLabels, *, synthetic: float, simulated: Path) -> TrainingSets:
@@ -151,30 +144,34 @@ def training_sets(read: ReadLabels, *, synthetic: float, simulated: Path) -> Tra
     classes = _in_order(name for each in shares for name in each.labelled.classes)
     shares = [replace(each, labelled=_honest(each.labelled, classes)) for each in shares]
     if synthetic > 0:
-        shares = [_with_small_objects(each) for each in shares]
-    _demand_objects(shares, notices)
-    notices += _short_classes(shares, classes)
-    return TrainingSets(
-        tuple(shares),
-        tuple(_honest(each, classes) for each in read.held_out),
-        classes,
-        tuple(notices),
-    )
-
-
-def _with_small_objects(share: Share) -> Share:
-    """The share with small objects composed onto its ground, where it labels none."""
-    return replace(share, pastes=_SMALL) if _SMALL in share.labelled.unlabelled else share
-
-
-def _demand_objects(shares: Sequence[Share], notices: Sequence[str]) -> None:
-    """Raise InputError where no picture has an object to learn, with what was remarked of the sets."""
+        # The share with small objects composed onto its ground, where it labels none
+        shares = [
+            replace(each, pastes=_SMALL) if _SMALL in each.labelled.unlabelled else each
+            for each in shares
+        ]
+    # Raise InputError where no picture has an object to learn, with what was remarked of the sets
     if not any(len(picture.labels) for each in shares for picture in each.labelled.pictures):
         remarks = "; ".join(notices) or "all their label files are empty"
         raise InputError(
             f"none of the pictures to learn from has a labelled object that can be used ({remarks}); "
             "check the labels, their class names and what is held out with --val"
         )
+    counts = dict.fromkeys(classes, 0)
+    for share in shares:
+        for picture in share.labelled.pictures:
+            for label in picture.labels:
+                counts[share.labelled.classes[label]] += 1
+    notices += [
+        f"only {count} boxes of class {name} to learn from"
+        for name, count in counts.items()
+        if count < 50
+    ]
+    return TrainingSets(
+        tuple(shares),
+        tuple(_honest(each, classes) for each in read.held_out),
+        classes,
+        tuple(notices),
+    )
 
 
 def simulate_samples(folder: Path, samples: int, seed: int) -> Iterator[str]:
@@ -186,17 +183,6 @@ def simulate_samples(folder: Path, samples: int, seed: int) -> Iterator[str]:
         )
         for done in simulate_pictures(folder, settings):
             yield f"simulating pictures: {done.pictures_done} of {done.pictures_total}"
-
-
-def _read(places: Sequence[Path], options: DataOptions) -> tuple[LabelledSet, ...]:
-    return read_datasets(
-        places,
-        form=options.form,
-        classes=options.classes,
-        ignore=options.ignore,
-        unlabelled=options.unlabelled,
-        group_pattern=options.group_pattern,
-    )
 
 
 def _share_of(val: str) -> float | None:
@@ -267,16 +253,3 @@ def _in_order(names: Iterable[str]) -> tuple[str, ...]:
     """Each name once: Sorvolo's own first, in their order."""
     found = set(names)
     return (*(each for each in CLASSES if each in found), *sorted(found - set(CLASSES)))
-
-
-def _short_classes(shares: Sequence[Share], classes: Sequence[str]) -> list[str]:
-    counts = dict.fromkeys(classes, 0)
-    for share in shares:
-        for picture in share.labelled.pictures:
-            for label in picture.labels:
-                counts[share.labelled.classes[label]] += 1
-    return [
-        f"only {count} boxes of class {name} to learn from"
-        for name, count in counts.items()
-        if count < 50
-    ]

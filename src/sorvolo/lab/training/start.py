@@ -2,13 +2,15 @@
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from contextlib import contextmanager
 from hashlib import sha256
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from sorvolo.detection.calibration import in_own_scale
-from sorvolo.detection.contract import ModelInfo
+import torch
+
+from sorvolo.detection.fusing import in_own_scale
 from sorvolo.detection.models import (
     HASH_KEY,
     InstalledModel,
@@ -20,10 +22,13 @@ from sorvolo.detection.models import (
     thermal_model,
 )
 from sorvolo.detection.session import read_info, read_model
-from sorvolo.errors import InputError
-from sorvolo.lab.training.exported import ExportedModel, other_networks
-from sorvolo.lab.training.presets import NETS, Preset
-from sorvolo.lab.training.weights import SOURCES, WAYS, ImageNetWeights, Net, read_weights
+from sorvolo.errors import InputError, SettingsError
+from sorvolo.lab.training.faster_rcnn import NETS, FasterRCNN, Preset, Stem, build, fast
+from sorvolo.lab.training.joint import JointSettings, JointTraining, collate
+from sorvolo.lab.training.onnx_export import ExportedModel, load_exported, other_networks
+from sorvolo.lab.training.progress import Learner
+from sorvolo.lab.training.samples import TrainingSample
+from sorvolo.lab.training.weights import SOURCES, ImageNetWeights, Net, read_weights
 from sorvolo.missions.fetched_files import copy_by_hash
 from sorvolo.store.atomic import atomic_path, writing
 
@@ -41,22 +46,8 @@ def load_start(choice: str, preset: Preset) -> ImageNetWeights | ExportedModel |
     is_installed = choice != "auto" and any(each.name == choice for each in installed_models())
     if is_installed or choice.lower().endswith(".onnx"):
         return _model(choice, preset)
-    return load_weights(choice, NETS[preset])
-
-
-def load_weights(choice: str, net: Net) -> ImageNetWeights:
-    """ImageNet weights of `net`: fetched or from the cache for "auto", else read from that file.
-
-    Raises InputError when the file holds no such weights or nothing can be fetched.
-    """
-    weights = read_weights(fetch_weights(net) if choice == "auto" else Path(choice))
-    if choice == "auto":
-        weights = replace(weights, origin=f"{SOURCES[net].name} ({SOURCES[net].licence})")
-    if weights.net != net:
-        raise InputError(
-            f"{choice} holds weights of {weights.net}, but this preset is built on {net}; {WAYS}"
-        )
-    return weights
+    net = NETS[preset]
+    return read_weights(fetch_weights(net) if choice == "auto" else Path(choice), net)
 
 
 def fetch_weights(net: Net) -> Path:
@@ -79,45 +70,54 @@ def fetch_weights(net: Net) -> Path:
     return place
 
 
-def part_notices(start: ExportedModel) -> list[str]:
-    """What of the model a training does not carry on, and what that costs by its card."""
-    if not start.left:
-        return []
-    text = (
-        f"only the aerial network of {start.origin} is learnt on from. Not carried on: {', '.join(start.left)}; the "
-        "new model begins with less than that model knows"
-    )
-    if start.cost:
-        text += f" (by its card, AP50 in %: {'; '.join(start.cost)})"
-    return [text]
-
-
-def threshold_notices(start: ExportedModel, too_few: Sequence[str]) -> list[str]:
-    """From which scores the new model reports the classes of which too few objects were held out to choose one."""
-    why = "too few objects were held out to choose the score to report from"
-    own = "those of the model's aerial network by itself" if start.left else "the model's own"
-    kept = [name for name in too_few if name in start.thresholds]
-    unknown = [name for name in too_few if name in start.classes and name not in start.thresholds]
+def begin_notices(start: ExportedModel, classes: Sequence[str]) -> list[str]:
+    """What of the model a training of `classes` does not carry on, and what that costs by its card."""
     notices = []
-    if kept:
-        notices.append(f"{why}: {', '.join(kept)} kept {own}")
-    if unknown:
+    if start.left:
+        text = (
+            f"only the aerial network of {start.origin} is learnt on from. Not carried on: {', '.join(start.left)}; the "
+            "new model begins with less than that model knows"
+        )
+        if start.cost:
+            text += f" (by its card, AP50 in %: {'; '.join(start.cost)})"
+        notices.append(text)
+    known = start.info.classes
+    if new := [name for name in classes if name not in known]:
+        notices.append(f"{start.origin} does not know {', '.join(new)}: learnt from the beginning")
+    if left := [name for name in known if name not in classes]:
         notices.append(
-            f"{why}, and nothing states those of the model's aerial network by itself: the scores from which "
-            f"{', '.join(unknown)} are reported are not calibrated; hold more out (--val)"
+            f"{start.origin} knows {', '.join(left)}, which nothing here labels: the new model will not"
         )
     return notices
 
 
-def size_notices(start: ExportedModel, too_few: Sequence[str]) -> list[str]:
-    """Of which classes the new model keeps the sizes at which they are found well (`best_px`)."""
-    kept = [name for name in too_few if name in start.best_px]
-    if not kept:
-        return []
-    return [
-        "too few objects were held out to measure at which sizes they are found well: "
-        f"{', '.join(kept)} kept those of {start.origin}"
-    ]
+def kept_notices(
+    start: ExportedModel, too_few: Sequence[str], on_request: Sequence[str]
+) -> list[str]:
+    """What the new model keeps of the one before: for classes of which `too_few` objects were held out the scores to
+    report from and the sizes that are found well (`best_px`), and the classes that are reported `on_request` alone."""
+    why = "too few objects were held out to choose the score to report from"
+    own = "those of the model's aerial network by itself" if start.left else "the model's own"
+    known = start.info.classes
+    notices = []
+    if kept := [name for name in too_few if name in start.thresholds]:
+        notices.append(f"{why}: {', '.join(kept)} kept {own}")
+    if unknown := [name for name in too_few if name in known and name not in start.thresholds]:
+        notices.append(
+            f"{why}, and nothing states those of the model's aerial network by itself: the scores from which "
+            f"{', '.join(unknown)} are reported are not calibrated; hold more out (--val)"
+        )
+    if kept := [name for name in too_few if name in start.info.best_px]:
+        notices.append(
+            "too few objects were held out to measure at which sizes they are found well: "
+            f"{', '.join(kept)} kept those of {start.origin}"
+        )
+    if on_request:
+        notices.append(
+            f"{', '.join(on_request)}: reported only where asked for (--classes), as by {start.origin}; too few objects "
+            "were held out to show that the new model finds them more surely"
+        )
+    return notices
 
 
 def kept_on_request(
@@ -125,41 +125,15 @@ def kept_on_request(
 ) -> tuple[str, ...]:
     """Which of the new model's classes are reported on request alone: those of the model before that are `too_few`
     among the held-out objects, since nothing shows that they became surer. None where no other class would be left."""
-    kept = tuple(name for name in classes if name in start.on_request and name in too_few)
+    kept = tuple(name for name in classes if name in start.info.on_request and name in too_few)
     return kept if len(kept) < len(classes) else ()
-
-
-def request_notices(start: ExportedModel, kept: Sequence[str]) -> list[str]:
-    """Which classes `kept_on_request` leaves unreported unless a person asks for them."""
-    if not kept:
-        return []
-    names = ", ".join(kept)
-    return [
-        f"{names}: reported only where asked for (--classes), as by {start.origin}; too few objects were held out to "
-        "show that the new model finds them more surely"
-    ]
 
 
 def kept_thermal_by(start: ExportedModel, classes: Sequence[str], *, thermal: bool) -> str:
     """The installed model that goes on looking at thermal frames in the new one's place: that of the model before,
     unless the new one learnt from thermal frames itself or they share no class; "" for none."""
-    if thermal or not start.thermal_by or thermal_model(classes, start.thermal_by) is None:
-        return ""
-    return start.thermal_by
-
-
-def class_notices(start: ExportedModel, classes: Sequence[str]) -> list[str]:
-    """What becomes of the model's classes in a training of `classes`, where they are not the same."""
-    new = [name for name in classes if name not in start.classes]
-    left = [name for name in start.classes if name not in classes]
-    notices = []
-    if new:
-        notices.append(f"{start.origin} does not know {', '.join(new)}: learnt from the beginning")
-    if left:
-        notices.append(
-            f"{start.origin} knows {', '.join(left)}, which nothing here labels: the new model will not"
-        )
-    return notices
+    by = start.info.thermal_by
+    return "" if thermal or not by or thermal_model(classes, by) is None else by
 
 
 def _model(choice: str, preset: Preset) -> ExportedModel:
@@ -179,36 +153,20 @@ def _model(choice: str, preset: Preset) -> ExportedModel:
             f"{path} is of the preset {info.preset}, not {preset}: train with --preset {info.preset}"
         )
     sha256 = file_sha256(path)
-    start = ExportedModel(
-        content,
-        info.classes,
-        f"the model {info.name}",
-        sha256,
-        info.licence,
-        info.trained_on,
-        in_own_scale(info),
-        {name: asdict(each) for name, each in info.calibration.items()},
-        on_request=info.on_request,
-        thermal_by=info.thermal_by,
-        best_px=info.best_px,
-    )
-    return _aerial(start, info, path) if other_networks(content) else start
-
-
-def _aerial(start: ExportedModel, info: ModelInfo, path: Path) -> ExportedModel:
-    """Of a file of several networks the aerial one: its own thresholds, by the card, and what the others gave."""
+    own, means = in_own_scale(info), info.calibration
+    if not (others := other_networks(content)):
+        return ExportedModel(content, info, sha256, own, means)
+    # of a file of several networks the aerial one: its own thresholds, by the card, and what the others gave
     card = read_card(InstalledModel(path.stem, path, is_packaged=False))
-    is_of_file = str(card.get(HASH_KEY, "")).lower() == start.sha256
+    is_of_file = str(card.get(HASH_KEY, "")).lower() == sha256
     alone = card.get("aerial_alone", {}) if is_of_file else {}
-    left = [*other_networks(start.content)]
-    left += (
-        [f"the second look at reports ({', '.join(info.second_look)})"] if info.second_look else []
-    )
-    left += ["the search in several sizes"] if info.pyramid else []
+    left = [*others]
+    if info.second_look:
+        left.append(f"the second look at reports ({', '.join(info.second_look)})")
+    if info.pyramid:
+        left.append("the search in several sizes")
     cost = tuple(_lost(alone.get("measured") or {}, card.get("measured") or {})) if alone else ()
-    return replace(
-        start, thresholds=alone.get("thresholds", {}), calibration={}, left=tuple(left), cost=cost
-    )
+    return ExportedModel(content, info, sha256, alone.get("thresholds", {}), {}, tuple(left), cost)
 
 
 def _lost(alone: Mapping[str, Any], whole: Mapping[str, Any]) -> Iterator[str]:
@@ -220,3 +178,104 @@ def _lost(alone: Mapping[str, Any], whole: Mapping[str, Any]) -> Iterator[str]:
             before, after = (each["AP50"]["value"] for each in (figures, alone[name][label]))
             if before - after > _CLEARLY:
                 yield f"{label} on {name} {100 * after:.1f} alone, {100 * before:.1f} as a whole"
+
+
+_RATES = {
+    "fast": 1e-3,
+    "accurate": 2e-4,
+    "thesis": 2e-4,
+}  # of AdamW at its height; large networks need less
+_BACKBONE_SHARE = 0.2  # of that rate, for layers that ImageNet taught
+_TUNED_SHARE = 0.5  # of that rate, for a model that has learnt already
+_SETTLING_PX = 6_000_000  # of pictures by which the norms of such a model are settled: a gigabyte or two of memory
+
+
+def device_of(wanted: str) -> str:
+    """ "cpu" or "cuda"; "auto" takes a GPU where there is one. Raises SettingsError for a device that is not there."""
+    if wanted == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    kind, _, number = wanted.partition(":")
+    if wanted != "cpu" and not (kind == "cuda" and (number.isdecimal() or wanted == "cuda")):
+        raise SettingsError(f"device must be auto, cpu or cuda, got {wanted!r}")
+    if kind == "cuda" and not torch.cuda.is_available():
+        raise SettingsError(
+            f"device {wanted} asked for, but this torch sees no GPU; use the device cpu"
+        )
+    return wanted
+
+
+@contextmanager
+def without_denormals() -> Iterator[None]:
+    """What is almost nothing counts as nothing meanwhile: weights that decay so far cost a hundred times as much.
+
+    This sets the processor, hence the whole thread, whatever it calculates.
+    """
+    torch.set_flush_denormal(True)
+    try:
+        yield
+    finally:
+        torch.set_flush_denormal(False)
+
+
+def start_learner(
+    preset: Preset,
+    classes: Sequence[str],
+    rpn: Stem,
+    schedule: Literal["joint", "four-steps"],
+    start: ImageNetWeights | ExportedModel | None,
+    first: Iterator[Sequence[TrainingSample]],
+    *,
+    steps: int,
+    batch: int,
+    seed: int,
+    device: str,
+) -> Learner:
+    """The preset's network before its first step; what is not from `start` follows from the seed.
+
+    `first` are batches of what is to be learnt: they settle the norms of an exported model, and are else not drawn.
+    Raises InputError where an exported model does not fit.
+    """
+    torch.manual_seed(seed)
+    rate = _RATES[preset]
+    if isinstance(start, ExportedModel):
+        model = _learnt_on(preset, classes, rpn, start, first)
+        rate *= _TUNED_SHARE
+    else:
+        model = build(preset, classes, rpn, start)
+    model = model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    if schedule == "four-steps":
+        from sorvolo.lab.thesis.four_steps import FourStepSettings, FourStepTraining
+
+        return FourStepTraining(model, FourStepSettings(steps=steps), seed, device)
+    settings = JointSettings(
+        steps=steps,
+        batch=batch,
+        rate=rate,
+        backbone_rate=rate if start is None else _BACKBONE_SHARE * rate,
+        warm_steps=min(200, max(1, steps // 10)),
+        mixed_precision=device != "cpu" or bool(torch.ops.mkldnn._is_mkldnn_bf16_supported()),
+    )
+    return JointTraining(model, settings, seed, device)
+
+
+def _learnt_on(
+    preset: Preset,
+    classes: Sequence[str],
+    rpn: Stem,
+    start: ExportedModel,
+    first: Iterator[Sequence[TrainingSample]],
+) -> FasterRCNN:
+    """The network with an exported model's weights, its norms settled by the first pictures."""
+    if preset != "fast":
+        raise InputError(
+            f"{start.origin} cannot be learnt on from: a model file of the preset {preset} lacks what its batch norms "
+            "took from ImageNet; start with --weights auto, or take the preset fast"
+        )
+    model = fast(classes, rpn)
+    samples = [*next(first)]
+    size_px = samples[0].image.shape[0] * samples[0].image.shape[1]
+    samples += islice(
+        (each for batch in first for each in batch), max(0, _SETTLING_PX // size_px - len(samples))
+    )
+    load_exported(model, start.content, collate(samples, "cpu")[0], classes)
+    return model

@@ -15,9 +15,8 @@ from sorvolo.missions.flight.setup import sun_over
 from sorvolo.missions.search.settings import SearchSettings
 from sorvolo.search.cells import Cells, cells_of
 from sorvolo.search.conditions import AboveGround, Conditions, FrameLook, gather, look_at
-from sorvolo.search.drawing.frame_light import FrameLight, frame_light
 from sorvolo.search.drawing.objects import Thing
-from sorvolo.search.drawing.planted import new_plant, plant
+from sorvolo.search.drawing.planted import FrameLight, frame_light, new_plant, plant
 from sorvolo.search.outcomes import Outcomes, any_of, every_label, found_rows, near_any, rows_of
 from sorvolo.search.plant_places import PlantField, PlantPlace, plant_places, seeded
 from sorvolo.search.recall import Chances, Recall, fit_recall, map_chances

@@ -5,9 +5,18 @@ import numpy as np
 
 from sorvolo.geometry.arrays import Floats, ImageRGBA
 from sorvolo.search.drawing.noise import fractal
-from sorvolo.search.drawing.objects import LYING, POSES, Body, Label, Light, Part, Standing, Thing
+from sorvolo.search.drawing.objects import (
+    LYING,
+    POSES,
+    Body,
+    Light,
+    Part,
+    StandingPart,
+    Thing,
+    ThingLabel,
+)
 from sorvolo.search.drawing.people import build_person
-from sorvolo.search.drawing.view import Patch, cut_out, opaque
+from sorvolo.search.drawing.view import DrawnPatch, cut_out, opaque
 
 _BOTH_SIDES = np.zeros(3)
 _UP = np.array([0.0, 0.0, 1.0])
@@ -44,11 +53,11 @@ def build_body(thing: Thing, light: Light, m_per_px: float) -> Body:
     rng = np.random.default_rng([thing.seed, 7])
     to_object = Light(thing.turn.T @ light.sun, light.ambient)
     builders = {
-        Label.PERSON: _person,
-        Label.CAR: _car,
-        Label.SMALL: _small,
-        Label.TREE: _tree,
-        Label.HOUSE: _house,
+        ThingLabel.PERSON: _person,
+        ThingLabel.CAR: _car,
+        ThingLabel.SMALL: _small,
+        ThingLabel.TREE: _tree,
+        ThingLabel.HOUSE: _house,
     }
     return Body(tuple(builders[thing.label](thing, to_object, texel_m, rng)))
 
@@ -74,20 +83,28 @@ def _as_texture(rgb: Floats, shade: float) -> ImageRGBA:
     return opaque(np.clip(rgb * shade, 0, 255).astype(np.uint8))
 
 
-def _quad(a: Floats, b: Floats, c: Floats, d: Floats, texture: ImageRGBA, normal: Floats) -> Patch:
-    return Patch.spanned(
+def _quad(
+    a: Floats, b: Floats, c: Floats, d: Floats, texture: ImageRGBA, normal: Floats
+) -> DrawnPatch:
+    return DrawnPatch.spanned(
         np.array([a, b, c, d], np.float64), texture, np.asarray(normal, np.float64)
     )
 
 
+def _lid(corners_m: Floats, rgb: Floats, light: Light) -> DrawnPatch:
+    """A level face over corners (4, 3), counter-clockwise seen from above."""
+    a, b, c, d = corners_m
+    return _quad(d, c, b, a, _as_texture(rgb, light.shade(_UP)), _UP)
+
+
 def _level(
     centre_m: tuple[float, float, float], size_m: tuple[float, float], texture: ImageRGBA
-) -> Patch:
+) -> DrawnPatch:
     """A level leaf, its texture's top to the left (+y) and its right forward (+x)."""
     x, y, z = centre_m
     a, b = size_m[0] / 2, size_m[1] / 2
     corners = np.array([[x - a, y + b, z], [x + a, y + b, z], [x + a, y - b, z], [x - a, y - b, z]])
-    return Patch.spanned(corners, texture, _BOTH_SIDES)
+    return DrawnPatch.spanned(corners, texture, _BOTH_SIDES)
 
 
 def _disc(size_m: tuple[float, float], texel_m: float, colour: Floats, shade: float) -> ImageRGBA:
@@ -99,7 +116,7 @@ def _disc(size_m: tuple[float, float], texel_m: float, colour: Floats, shade: fl
     return cut_out(lit.astype(np.uint8), alpha)
 
 
-def _prism(base_m: Floats, top_m: Floats, walls: list[Floats], light: Light) -> list[Patch]:
+def _prism(base_m: Floats, top_m: Floats, walls: list[Floats], light: Light) -> list[DrawnPatch]:
     """The side faces of a prism or its frustum: base and top corners (4, 3), counter-clockwise seen from above."""
     faces = []
     for i in range(4):
@@ -170,7 +187,7 @@ def _person(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator
     feet = _disc((0.3, 0.3), texel_m, trousers, 0.8)
     return [
         _level((0.05, 0, 0.08), (0.3, 0.3), feet),
-        Standing(0.0, (0.5, height), cut_out(body, silhouette)),
+        StandingPart(0.0, (0.5, height), cut_out(body, silhouette)),
         _level((0.0, 0, 0.80 * height), (0.26, 0.52), arms),
         _level((0.03, 0, 0.97 * height), (0.2, 0.17), head),
     ]
@@ -187,13 +204,8 @@ def _car(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator) -
         for at in (0.2, 0.79):  # wheels
             half = int(0.34 / length * columns)
             wall[rows // 3 :, max(0, int(at * columns) - half) : int(at * columns) + half] = 26
-    parts: list[Part] = []
-    parts += _prism(
-        _rectangle(length, width, 0.18),
-        _rectangle(length * 0.98, width * 0.96, waist),
-        walls,
-        light,
-    )
+    side = _rectangle(length * 0.98, width * 0.96, waist)
+    parts: list[Part] = [*_prism(_rectangle(length, width, 0.18), side, walls, light)]
     deck = _plain((length * 0.98, width * 0.96), (texel_m, texel_m), paint, 0.015, rng)
     rows, columns = deck.shape[:2]
     hood = int(0.3 * columns) if thing.kind != "van" else int(0.15 * columns)
@@ -215,9 +227,7 @@ def _car(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator) -
         30,
         26,
     )
-    texture = _as_texture(deck, light.shade(_UP))
-    a = _rectangle(length * 0.98, width * 0.96, waist)
-    parts.append(_quad(a[3], a[2], a[1], a[0], texture, _UP))
+    parts.append(_lid(side, deck, light))
     back, front = {"hatchback": (-0.49, 0.2), "saloon": (-0.36, 0.2), "van": (-0.49, 0.36)}[
         thing.kind
     ]
@@ -228,7 +238,7 @@ def _car(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator) -
     windows = _box_walls(cabin, width * 0.9, height - waist, texel_m, glass, 0.12, rng)
     parts += _prism(base, top, windows, light)
     shine = _plain((roof, width * 0.72), (texel_m, texel_m), paint * 1.03, 0.015, rng)
-    parts.append(_quad(top[3], top[2], top[1], top[0], _as_texture(shine, light.shade(_UP)), _UP))
+    parts.append(_lid(top, shine, light))
     return parts
 
 
@@ -247,7 +257,7 @@ def _small(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator)
             (max(2, _texels(height, 2 * texel_m)), max(2, _texels(width, texel_m)), 3), colour * 0.8
         )
         return [
-            Standing(0.0, (width, 0.92 * height), opaque(side.astype(np.uint8))),
+            StandingPart(0.0, (width, 0.92 * height), opaque(side.astype(np.uint8))),
             _level(
                 (0, 0, 0.9 * height),
                 (length, width),
@@ -282,10 +292,7 @@ def _small(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator)
             32,
         )
     top = _rectangle(length * taper, width * taper, height)
-    parts: list[Part] = []
-    parts += _prism(_rectangle(length, width, 0.0), top, walls, light)
-    parts.append(_quad(top[3], top[2], top[1], top[0], _as_texture(lid, light.shade(_UP)), _UP))
-    return parts
+    return [*_prism(_rectangle(length, width, 0.0), top, walls, light), _lid(top, lid, light)]
 
 
 def _tree(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator) -> list[Part]:
@@ -303,7 +310,7 @@ def _tree(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator) 
             (84, 66, 50),
             np.uint8,
         )
-        parts.append(Standing(0.0, (0.3, low * 1.3), opaque(bark)))
+        parts.append(StandingPart(0.0, (0.3, low * 1.3), opaque(bark)))
     side = max(6, _texels(width, texel_m))
     y, x = np.mgrid[0:side, 0:side].astype(np.float32)
     x, y = (x + 0.5) / side * 2 - 1, 1 - (y + 0.5) / side * 2
@@ -431,22 +438,17 @@ def _flat_roof(
             1,
             cv2.LINE_AA,
         )
-    roof = _rectangle(length, width, height)
-    parts: list[Part] = [
-        _quad(roof[3], roof[2], roof[1], roof[0], _as_texture(felt, light.shade(_UP)), _UP)
-    ]
+    parts: list[Part] = [_lid(_rectangle(length, width, height), felt, light)]
     for _ in range(int(rng.integers(1, 4))):
         a, b, c = rng.uniform(0.8, 1.6), rng.uniform(0.8, 1.3), rng.uniform(0.6, 1.1)
         x = rng.uniform(-0.35, 0.35) * length
         y = rng.uniform(-0.32, 0.32) * width
-        shift = np.array([x, y, 0.0])
+        foot = _rectangle(a, b, height) + np.array([x, y, 0.0])
+        top = foot + np.array([0.0, 0.0, c])
         metal = np.array([190.0, 192, 194])
         walls = _box_walls(a, b, c, texel_m, metal * 0.85, 0.04, rng)
-        parts += _prism(
-            _rectangle(a, b, height) + shift, _rectangle(a, b, height + c) + shift, walls, light
-        )
+        parts += _prism(foot, top, walls, light)
         lid = _plain((a, b), (texel_m, texel_m), metal, 0.03, rng)
-        top = _rectangle(a, b, height + c) + shift
         fan = min(lid.shape[:2])
         cv2.circle(
             lid,
@@ -456,7 +458,7 @@ def _flat_roof(
             -1,
             cv2.LINE_AA,
         )
-        parts.append(_quad(top[3], top[2], top[1], top[0], _as_texture(lid, light.shade(_UP)), _UP))
+        parts.append(_lid(top, lid, light))
     return parts
 
 

@@ -37,7 +37,7 @@ def ray_grid(camera: Camera) -> RaysF32:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class DrawnView:
     """How the site is seen: `ray_from_site` (3, 4) is projective; `eye_m` (4,) is homogeneous (0 = at
     infinity).
 
@@ -79,11 +79,11 @@ class View:
         return bool(normal_m @ (self.eye_m[:3] - self.eye_m[3] * corner_m) > 0)
 
 
-def camera_view(camera: Camera, site_from_camera: Pose, rays: RaysF32 | None) -> View:
+def camera_view(camera: Camera, site_from_camera: Pose, rays: RaysF32 | None) -> DrawnView:
     """What a camera sees from this pose; `rays` is its `ray_grid`, or None without distortion."""
     camera_from_site = site_from_camera.inverse()
     matrix = np.column_stack([camera_from_site.rotation, camera_from_site.translation_m])
-    return View(camera, matrix, np.append(site_from_camera.translation_m, 1.0), rays)
+    return DrawnView(camera, matrix, np.append(site_from_camera.translation_m, 1.0), rays)
 
 
 def map_view(
@@ -92,7 +92,7 @@ def map_view(
     m_per_px: tuple[float, float],
     size_px: tuple[int, int],
     sun: Vector3 | None = None,
-) -> View:
+) -> DrawnView:
     """The site seen straight from above on a raster whose outer top-left corner is (west_m, north_m).
 
     With `sun`, the unit vector towards it, points slide along its light onto the ground: what is seen is
@@ -109,11 +109,11 @@ def map_view(
     fx, fy = 1 / m_per_px[0], 1 / m_per_px[1]
     camera = Camera(size_px[0], size_px[1], fx, fy, -0.5, -0.5)
     direction = np.array([0.0, 0.0, 1.0]) if sun is None else sun
-    return View(camera, matrix, np.append(direction, 0.0), None)
+    return DrawnView(camera, matrix, np.append(direction, 0.0), None)
 
 
 @dataclass(frozen=True, eq=False)
-class Patch:
+class DrawnPatch:
     """A textured piece of a plane: `corners_m` (4, 3) are where the texture's outer corners lie, in its order
     top-left, top-right, bottom-right, bottom-left; `texture` is RGBA with the colours multiplied by alpha.
 
@@ -128,7 +128,7 @@ class Patch:
     texture_from_plane: Matrix3
 
     @classmethod
-    def spanned(cls, corners_m: PointsM, texture: ImageRGBA, normal: Vector3) -> "Patch":
+    def spanned(cls, corners_m: PointsM, texture: ImageRGBA, normal: Vector3) -> "DrawnPatch":
         """The patch of a texture between four corners in one plane; keystoned if no parallelogram."""
         height, width = texture.shape[:2]
         u, v = corners_m[1] - corners_m[0], corners_m[3] - corners_m[0]
@@ -147,12 +147,14 @@ class Patch:
             )
         return cls(corners_m, texture, normal, np.asarray(matrix, np.float64))
 
-    def moved(self, turn: Matrix3, shift_m: Vector3) -> "Patch":
+    def moved(self, turn: Matrix3, shift_m: Vector3) -> "DrawnPatch":
         """The same patch turned about the origin and then shifted."""
         return replace(self, corners_m=self.corners_m @ turn.T + shift_m, normal=turn @ self.normal)
 
 
-def sample_patches(view: View, patches: Sequence[Patch]) -> Iterator[tuple[Window, ImageRGBA]]:
+def sample_patches(
+    view: DrawnView, patches: Sequence[DrawnPatch]
+) -> Iterator[tuple[Window, ImageRGBA]]:
     """The patches in sight as this view sees them, in order: a window of the image and its RGBA there."""
     facing = [
         patch
@@ -180,7 +182,7 @@ def sample_patches(view: View, patches: Sequence[Patch]) -> Iterator[tuple[Windo
             yield (x0, y0, x1, y1), sample
 
 
-def _sample(view: View, patch: Patch, window: Window) -> ImageRGBA | None:
+def _sample(view: DrawnView, patch: DrawnPatch, window: Window) -> ImageRGBA | None:
     """The patch within a window; None when it is seen edge-on."""
     corners = patch.corners_m
     ray_from_plane = view.ray_from_plane(
