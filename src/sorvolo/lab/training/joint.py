@@ -295,9 +295,11 @@ class JointTraining:
         self.optimiser.step()
         self.step += 1
         self._average()
-        losses = (float(part.detach()) for part in parts)
+        proposal_score, proposal_box, score, box = (float(part.detach()) for part in parts)
         seconds = time.monotonic() - self._started_s
-        return Progress(self.step, *losses, seconds, self.settings.steps)  # type: ignore[arg-type]
+        return Progress(
+            self.step, proposal_score, proposal_box, score, box, seconds, self.settings.steps
+        )
 
     def state(self) -> dict[str, object]:
         """All that is needed to go on: tensors, numbers and text only."""
