@@ -9,7 +9,7 @@ import onnx
 import pytest
 from toy_models import draw, rectangle_model
 
-from sorvolo.detection.contract import FORMAT, METADATA_KEY, ScoreCalibration
+from sorvolo.detection.contract import CALIBRATED, METADATA_KEY, ScoreCalibration
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.fusing import in_own_scale, platt_fit, platt_scaled, scaled_thresholds
 from sorvolo.detection.models import installed_models
@@ -109,4 +109,4 @@ def test_packaged_models_name_the_contract_that_brought_it(model: Any) -> None:
         for each in onnx.load(model.path, load_external_data=False).metadata_props
     }
     fields = json.loads(metadata[METADATA_KEY])
-    assert fields["format"] == (FORMAT if "calibration" in fields else 1)
+    assert fields["format"] == (CALIBRATED if "calibration" in fields else 1)

@@ -48,7 +48,7 @@ CheckedOn = Annotated[
 StartingWeights = Annotated[
     str,
     typer.Option(
-        help="Start from ImageNet (auto, or a file), nothing (none), or a model: name or .onnx."
+        help="Start from ImageNet (auto, or the file of its weights), nothing (none), or a model: name or .onnx."
     ),
 ]
 

@@ -12,9 +12,8 @@ from sorvolo.errors import InputError
 METADATA_KEY = "sorvolo"
 """The key among an ONNX file's `metadata_props` under which the JSON lies."""
 
-FORMAT = 3
-"""The newest contract that this version reads; docs/model-file.md lists its fields. 2 brought `calibration`, 3 brought
-`layout`."""
+CALIBRATED, FORMAT = 2, 3
+"""The contract that brought `calibration`, and the newest, which brought `layout`; docs/model-file.md lists the fields."""
 
 # px: what a picture's sides are multiples of, in a model whose file does not state it
 _FALLBACK_STRIDE = 32

@@ -261,7 +261,7 @@ class RoiStitcher:
             matrix, inliers = cv2.findHomography(frame_px, mosaic_px, cv2.RANSAC, reach, **limits)
         if matrix is None or inliers is None:
             return None, np.zeros(len(frame_px), dtype=bool)
-        return matrix, inliers.ravel().astype(bool)
+        return np.asarray(matrix, np.float64), inliers.ravel().astype(bool)
 
 
 def _misplaced(outline: PointsPx, frame_px: int) -> str:

@@ -13,7 +13,7 @@ from typing import Any
 
 from sorvolo import __version__
 from sorvolo.capture.photos import read_picture
-from sorvolo.detection.contract import FORMAT
+from sorvolo.detection.contract import CALIBRATED
 from sorvolo.detection.fusing import scaled_thresholds
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import ImageRGB
@@ -364,7 +364,7 @@ def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
             "thermal_by": kept_thermal_by(before, classes, thermal=thermal),
         }
     info = {
-        "format": FORMAT if calibration else 1,
+        "format": CALIBRATED if calibration else 1,
         "name": run.out.resolve().name or "model",
         "preset": run.settings.preset,
         "version": __version__,
