@@ -25,5 +25,5 @@ def _codes() -> set[str]:
 def test_every_code_is_documented() -> None:
     codes = _codes()
     assert {"truncated", "ground_unknown", "telemetry_outage", "alert_url_failed"} <= codes
-    docs = "".join((_DOCS / name).read_text() for name in ("formats.md", "formats-in.md"))
+    docs = (_DOCS / "notices.md").read_text()
     assert not {code for code in codes if f"`{code}`" not in docs}
