@@ -443,7 +443,7 @@ def test_a_camera_at_the_horizon(
     )
     assert sum(status == "vision" for status, _ in ended.values()) == 10
     _pitched(photos, names, "-10.0")
-    assert "horizon" in refused(capsys, photos, "--site", tmp_path / "all")
+    assert "80 deg away from straight down" in refused(capsys, photos, "--site", tmp_path / "all")
 
 
 # ---- the site folder --------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ import av
 import numpy as np
 import pytest
 
-from sealing import seal_again
+from sealing import seal_again, write_again
 from small_flights import simulate_into, small_flight
 from sorvolo.capture.correction import corrected_poses, fitted, path_fit, telemetry_faults
 from sorvolo.capture.live.klv_telemetry import read_klv_file
@@ -428,7 +428,7 @@ def test_a_doubt_about_the_map_is_passed_on(
         "headline": {"quality": quality, "text": "too large by half"},
         "warnings": ["by half", "is it the telemetry of this flight?"],
     }
-    path.write_text(json.dumps(mapped))
+    write_again(site, "flights/flight1/report.json", json.dumps(mapped))
     report = correct_telemetry(site, tmp_path / "out")
     assert ("too large by half" in report["warnings"]) == (quality != "map")
     assert "of the map: is it the telemetry of this flight?" in report["warnings"]
@@ -443,11 +443,8 @@ def test_a_map_that_control_points_hold_is_not_bent_to_the_fixes(
     site = tmp_path / "site"
     shutil.copytree(corrected[1] / "site", site)
     path = site / "flights" / "flight1" / "report.json"
-    path.write_text(
-        json.dumps(
-            {**json.loads(path.read_text()), "control": {"points": [{"role": "control"}] * 3}}
-        )
-    )
+    mapped = {**json.loads(path.read_text()), "control": {"points": [{"role": "control"}] * 3}}
+    write_again(site, "flights/flight1/report.json", json.dumps(mapped))
     report = correct_telemetry(
         site,
         tmp_path / "out",

@@ -31,6 +31,7 @@ from watch_runs import watch_run
 from websockets.sync.client import ClientConnection, connect
 
 from faulty_link import FaultyLink
+from sealing import write_again
 from sorvolo.geometry.coordinates import Coordinates, place_text
 from sorvolo.station.events import NewEvent
 from sorvolo.station.messages import Hello, Kind, Message, MessageSample
@@ -66,9 +67,8 @@ def served(made_site: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterato
     crops.mkdir(exist_ok=True)
     for number in range(4):
         for name in crop_names(f"b-{number}"):
-            (crops / name).write_bytes(
-                png_from_rgba(np.full((32, 32, 4), 90 + 20 * number, np.uint8))
-            )
+            picture = png_from_rgba(np.full((32, 32, 4), 90 + 20 * number, np.uint8))
+            write_again(root / "field", f"flights/b/changes/{name}", picture)
     with Served(root) as station:
         yield station
 

@@ -203,7 +203,8 @@ def test_section_of_the_report() -> None:
         "views": 3,
     }
     placed = {**row, "id": "a-o2", "sigma_m": 0.534}
-    reported = {"model": "fast", "classes": {"<i>": 1}, "list": [row, placed]}
+    headline = {"text": "1 <i>; 3 of 3 pictures looked at"}
+    reported = {"model": "fast", "headline": headline, "list": [row, placed]}
     page = objects_section({"objects": reported}, {"a-o1": CROP})
     assert "<i>" not in page
     assert "1 &lt;i&gt;" in page
