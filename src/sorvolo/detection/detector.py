@@ -186,7 +186,7 @@ class Detector:
     ) -> "Detector":
         """Open another maker's ONNX file: YOLO, RT-DETR, NanoDet and others (`layouts.LAYOUTS`).
 
-        `layout` "auto" is told by the network's outputs. `classes` names its classes in its order, where its file does
+        `layout` "auto" goes by the network's outputs. `classes` names its classes in its order, where its file does
         not: COCO's are known. `sorvolo models import` keeps it under a name instead. Raises InputError for what cannot
         be recognised or run.
         """

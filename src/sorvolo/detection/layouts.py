@@ -252,7 +252,7 @@ def resolved(
     """The metadata of a foreign network, by what is wished (`layout`, `classes`, `name`), what its own metadata state,
     and what it answers to a grey picture.
 
-    Raises InputError where its layout cannot be told or its classes have no names.
+    Raises InputError for a layout that it does not recognise and for classes without names.
     """
     port, fixed = picture_input(inputs, where)
     if METADATA_KEY in metadata:

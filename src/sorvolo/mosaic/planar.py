@@ -321,15 +321,6 @@ class PlanarMapper:
             tie.dear,
         )
 
-    def can_place(self, new: Registered) -> bool:
-        """Whether all that a registered picture was tied to is there: else it is of another flight."""
-        others = {each.old_id for each in new.links}
-        return (
-            new.keyframe.id not in self._graph
-            and self._known.keys() >= set(new.met)
-            and all(each in self._graph or each in new.met for each in others)
-        )
-
     def place(self, new: Registered) -> Outcome:
         """Add a registered picture to the map."""
         for known in new.met:

@@ -13,7 +13,7 @@ CLASSES = ("person", "car", "small object")
 """The classes of Sorvolo's own models, in the order of their labels; other models bring their own names."""
 
 PERSON = CLASSES[0]
-"""The class whose finding is told at once, by every mission."""
+"""The class whose finding every mission reports at once."""
 
 TYPICAL_SIZE_M = {
     "person": (0.6, 0.5, 1.7),

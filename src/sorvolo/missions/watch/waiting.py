@@ -5,7 +5,7 @@ import shutil
 import threading
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sorvolo.capture.source import LiveSource
@@ -164,7 +164,7 @@ class WaitingFrames:
         height, width = self._source.size_px[::-1]
         unseen = Frame.unseen(kept.index, kept.name, kept.time_ns, (height, width))
         outline_m = ground(unseen)
-        kept = _Kept(kept.index, kept.name, kept.time_ns, kept.arrived_s, outline_m)
+        kept = replace(kept, outline_m=outline_m)
         self._kept.append(kept)
         if outline_m is not None:
             heapq.heappush(self._heap, (-_LEVELS, -kept.index, kept))
