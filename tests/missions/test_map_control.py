@@ -229,6 +229,7 @@ def test_two_points_whose_places_are_exchanged_are_named_and_left_out(
     assert "G0" in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_heights_of_points_in_feet_are_named(surveyed: Surveyed, tmp_path: Path) -> None:
     """Points on roofs and poles: heights in metres fit, in feet they do not, and the report states which was meant."""
     with Image.open(next(surveyed.photos.iterdir())) as first:

@@ -153,7 +153,7 @@ def test_new_ground_comes_first_and_all_of_it_in_the_end(tmp_path: Path) -> None
         klv=True,
         image=detector.film,
         klv_of=lambda k: packet_of(k, _north_m(k)),
-        count=20 * RATE,
+        count=23 * RATE,
         speed=10.0,
         options={"flush_packets": "1"},
     ) as detector.sender:
@@ -175,10 +175,10 @@ def test_new_ground_comes_first_and_all_of_it_in_the_end(tmp_path: Path) -> None
     # what was seen once is looked at again: both are announced while it flies
     assert len({track.id for update in live for track in update.new}) == 2
 
-    assert frames["skipped"] == 0 and frames["detected"] == 200
+    assert frames["skipped"] == 0 and frames["detected"] == 230
     assert detector.asked == frames["detected"]  # nothing twice
     assert report["headline"] == {
-        "text": "2 boats; 200 of 200 pictures, 100 % of the ground looked at",
+        "text": "2 boats; 230 of 230 pictures, 100 % of the ground looked at",
         "complete": True,
     }
     (classes,) = report["looked_at"]["classes"].values()

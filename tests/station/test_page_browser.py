@@ -753,6 +753,7 @@ def test_a_browser_that_slept_notices_its_dead_connection(browser: Any, served: 
     context.close()
 
 
+@pytest.mark.long
 def test_a_frozen_tab_catches_up_when_it_is_looked_at_again(browser: Any, served: Served) -> None:
     """As browsers freeze tabs in the background: its connection is gone; what happened meanwhile comes once each, and
     in order."""
@@ -1062,6 +1063,7 @@ SLOW_DECODER = """window.VideoDecoder = class {  // five pictures a second, as a
 };"""
 
 
+@pytest.mark.long
 def test_a_slow_device_stays_near_live(browser: Any, served: Served, tmp_path: Path) -> None:
     """It goes on at the next key frame; it fell further and further behind."""
     watched = Watched(browser.new_context(), served.url)

@@ -119,6 +119,7 @@ def test_features_are_plain_json_and_repeat_exactly(later):
         )
 
 
+@pytest.mark.long
 def test_a_later_flight_may_have_its_own_camera_height_and_heading(tmp_path):
     other = ImagingSettings(480, 270, 75.0, fps=5)
     revisit = RevisitSettings(1.5, 90.0, other)
@@ -145,6 +146,7 @@ def test_a_later_flight_may_have_its_own_camera_height_and_heading(tmp_path):
     assert not (tmp_path / "site/truth/flight1/events.geojson").exists()
 
 
+@pytest.mark.long
 def test_night_and_snow_change_the_picture_but_no_event():
     def second(weather: WeatherSettings):
         return list(
@@ -165,6 +167,7 @@ def test_night_and_snow_change_the_picture_but_no_event():
     assert 0.3 < (half.min(axis=2) > 190).mean() < 0.7
 
 
+@pytest.mark.long
 def test_a_comparing_preset_has_changes_of_every_kind():
     settings = preset("compare")
     small = replace(

@@ -71,6 +71,7 @@ def test_each_pixel_shows_the_ground_that_projects_there(flight: SimulatedFlight
     assert np.abs(pixels - np.column_stack([columns.ravel(), rows.ravel()])).max() < 0.05
 
 
+@pytest.mark.long
 def test_pictures_differ_from_those_of_level_ground_and_things_stand_on_the_hills(
     flight: SimulatedFlight,
 ) -> None:

@@ -37,6 +37,7 @@ def orthophoto(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_a_flight_over_an_orthophoto_is_mapped_back_onto_it(
     orthophoto: Path, tmp_path: Path
 ) -> None:

@@ -54,6 +54,7 @@ def test_heights_and_ground_sampling_distances_keep_their_bounds():
         assert 15 <= picture.site_from_camera.translation_m[2] <= 60
 
 
+@pytest.mark.long
 def test_people_stand_out_in_thermal_pictures_which_are_grey():
     settings = replace(SETTINGS, thermal_share=1.0)
     found = 0

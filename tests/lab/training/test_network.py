@@ -153,6 +153,7 @@ def trained():
     return training, losses
 
 
+@pytest.mark.long
 def test_a_small_network_learns_what_it_has_not_seen(trained):
     training, losses = trained
     assert np.mean(losses[-10:]) < 0.5 * np.mean(losses[:10])
