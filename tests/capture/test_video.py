@@ -10,6 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.source import open_sources
 from sorvolo.capture.video import VideoSource, read_video_info
 from sorvolo.capture.video_spans import SparseReading
@@ -290,6 +291,18 @@ def test_what_is_no_video_is_refused_by_name(tmp_path: Path) -> None:
         container.mux(stream.encode(audio))
     with pytest.raises(InputError, match="no video in it, only audio"):
         open_sources([sound])
+
+
+def test_a_list_of_files_named_as_a_video_opens_none_of_them(tmp_path: Path) -> None:
+    write_video(tmp_path / "other.mp4")
+    named = tmp_path / "flight.mp4"
+    named.write_text("ffconcat version 1.0\nfile other.mp4\n")
+    with av.open(str(named)) as container:
+        assert container.format.name == "concat"  # what FFmpeg by itself does with it
+    with pytest.raises(InputError, match="list of other files"):
+        open_sources([named])
+    with pytest.raises(InputError, match="no picture"):
+        open_sources([f"follow:{named}"], live=LiveSettings(first_s=0.5))
 
 
 def test_sample_frames_are_spread_over_the_video(tmp_path: Path) -> None:

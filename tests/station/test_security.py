@@ -3,12 +3,15 @@
 import os
 import signal
 import socket
+import threading
+import urllib.request
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
+import uvicorn
 from starlette.testclient import TestClient, WebSocketDenialResponse
 from starlette.websockets import WebSocketDisconnect
 from typer.testing import CliRunner
@@ -24,6 +27,7 @@ from sorvolo.station.security import address_group
 from sorvolo.station.settings import StationLimits, StationSettings, check_exposure
 from sorvolo.station.state import StationState
 from sorvolo.station.tokens import Guesses, Role, holder_of, list_tokens, make_token, revoke_token
+from waiting import wait_for
 
 HOST = "http://127.0.0.1:8750"
 SOCKET = "ws://127.0.0.1:8750/api/events"
@@ -193,6 +197,31 @@ def test_the_server_takes_so_many_connections(root: Path) -> None:
     app = station_app(settings)
     assert server_config(app, settings).limit_concurrency == 7
     app.state.station.close()
+
+
+def test_connections_that_ask_nothing_keep_nobody_out(root: Path) -> None:
+    """Two hundred idle ones, half of them with a head that never ends; 150 connections are taken."""
+    settings = StationSettings(root, limits=StationLimits(most_connections=150))
+    app = station_app(settings)
+    server = uvicorn.Server(server_config(app, settings))
+    listening = socket.create_server(("127.0.0.1", 0))
+    thread = threading.Thread(target=server.run, args=([listening],))
+    thread.start()
+    idle = []
+    try:
+        wait_for(lambda: server.started)
+        for number in range(200):
+            idle.append(socket.create_connection(listening.getsockname()))
+            idle[-1].sendall(b"GET / HT" if number % 2 else b"")
+        port = listening.getsockname()[1]
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/api/sites", timeout=5) as answer:
+            assert answer.status == 200
+    finally:
+        server.should_exit = True
+        for each in idle:
+            each.close()
+        thread.join()
+        app.state.station.close()
 
 
 @pytest.mark.parametrize(

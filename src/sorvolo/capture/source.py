@@ -41,6 +41,7 @@ from sorvolo.capture.telemetry import (
 from sorvolo.capture.telemetry.cleaning import notice
 from sorvolo.capture.telemetry.gpmf import read_gpmf_file
 from sorvolo.capture.video import VIDEO_SUFFIXES, VideoInfo, VideoSource, read_video_info
+from sorvolo.capture.video_stream import ONE_FILE
 from sorvolo.errors import InputError
 from sorvolo.geometry.camera import Camera
 from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry, no_telemetry
@@ -410,7 +411,7 @@ def _open_live(
         if link is not None:
             raise InputError(f"--telemetry {link}: photos carry their own fixes; leave it out")
         return open_growing_folder(address.path, chosen, _guess, settings, until)
-    followed = StreamAddress(str(address.path), address.path.name, None, {})
+    followed = StreamAddress(str(address.path), address.path.name, None, ONE_FILE)
     return open_stream(followed, link, chosen, _unknown_camera, settings, until, address.path)
 
 

@@ -206,10 +206,18 @@ def _frames_of(packet: "av.Packet[Any]", damage: DecodingDamage) -> Iterator[av.
             yield frame
 
 
+# FFmpeg's readers of one file each: none that opens what a file names (concat, hls, dash, sdp, numbered pictures)
+ONE_FILE = {
+    "protocol_whitelist": "file",
+    "format_whitelist": "mov,mp4,matroska,webm,avi,mpegts,mpeg,flv,asf,mxf,ogg,nut,ivf,dv,gif,h264,hevc,m4v,"
+    "mjpeg,mpegvideo,yuv4mpegpipe,wav,mp3",
+}
+
+
 def opened_video(path: Path) -> av.container.InputContainer:
     """Open for reading; nothing but this one file is read, whatever a playlist in it may name."""
     try:
-        return av.open(f"file:{path}", options={"protocol_whitelist": "file"})
+        return av.open(f"file:{path}", options=ONE_FILE)
     except av.FFmpegError as error:
         raise InputError(
             f"{path.name} cannot be read as a video: {_why_unreadable(path, error)}"
@@ -228,6 +236,8 @@ def _why_unreadable(path: Path, error: Exception) -> str:
             "moov atom not found: the file was cut before its index, which an MP4 has at its end; "
             "copy it again from the drone, or repair it there; record as MKV or TS, which survive a cut"
         )
+    if isinstance(error, av.error.ArgumentError):
+        return "it is a list of other files, or of a kind that is not read; give a video, MP4 or MKV"
     words = getattr(error, "strerror", None) or str(error)
     return f"{words}; give a video that FFmpeg reads, or a folder of photos"
 

@@ -14,6 +14,7 @@ import uvicorn
 from fastapi import APIRouter, Body, FastAPI, Request, Response
 from fastapi.responses import FileResponse, JSONResponse
 from starlette.staticfiles import StaticFiles
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from sorvolo import __version__
 from sorvolo.errors import SettingsError
@@ -412,6 +413,7 @@ def server_config(app: FastAPI, settings: StationSettings) -> uvicorn.Config:
         access_log=False,
         server_header=False,
         log_config=None,
+        http=_Connection,
         ws="websockets-sansio",
         ws_max_size=_MOST_MESSAGE_BYTES,
         proxy_headers=bool(settings.public_url),
@@ -440,6 +442,42 @@ def _listening(settings: StationSettings) -> socket.socket:
             f"cannot listen at {settings.host}:{settings.port} ({error.strerror}): another program does, or the "
             "address is not this machine's; choose another --port or --host"
         ) from error
+
+
+class _Connection(H11Protocol):
+    """A connection that keeps nobody out: what asks nothing is closed, the longest silent first.
+
+    A head that comes byte by byte is silence, and so is a body of which nothing comes.
+    """
+
+    _SILENT_S = 20.0
+    _MOST_SILENT = 128  # browsers hold six, and close them after five seconds
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self._since_s = self.loop.time()
+        self.loop.call_later(self._SILENT_S, self._look)
+        silent = [each for each in self.connections if isinstance(each, _Connection)]
+        silent = sorted(filter(_Connection._is_silent, silent), key=lambda each: each._since_s)
+        for each in silent[: -self._MOST_SILENT]:
+            each.transport.abort()
+
+    def data_received(self, data: bytes) -> None:
+        super().data_received(data)
+        if self.cycle is not None and not self.cycle.response_complete:
+            self._since_s = self.loop.time()
+
+    def _is_silent(self) -> bool:
+        """Whether a request is waited for, or more of one; not whether its answer is."""
+        return self.cycle is None or self.cycle.response_complete or self.cycle.more_body
+
+    def _look(self) -> None:
+        if self not in self.connections:  # closed, or a WebSocket
+            return
+        left_s = self._since_s + self._SILENT_S - self.loop.time()
+        if left_s <= 0 and self._is_silent():
+            self.transport.abort()
+        self.loop.call_later(max(left_s, 1.0), self._look)
 
 
 class _Announcing(uvicorn.Server):

@@ -8,6 +8,7 @@ import av
 import cv2
 import numpy as np
 
+from sorvolo.capture.video_stream import ONE_FILE
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.store.images import jpeg_from_image
 
@@ -18,7 +19,7 @@ _MOST_FRAMES = 2000  # decoded after the nearest key frame: some pictures apart 
 
 def frame_of(path: str, number: int) -> ImageRGB:
     """(H, W, 3) the frame of a number, counted from 0 by the video's rate. Raises ValueError where there is none."""
-    with av.open(path, options={"protocol_whitelist": "file"}) as video:
+    with av.open(path, options=ONE_FILE) as video:
         stream = video.streams.video[0]
         rate, base = stream.average_rate or stream.guessed_rate, stream.time_base
         if rate is None or base is None:

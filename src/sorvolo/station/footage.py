@@ -26,6 +26,7 @@ from sorvolo.capture.live.reader import REFUSALS
 from sorvolo.capture.live.reconnect import Backoff, LiveSettings, Outages
 from sorvolo.capture.source import Source, open_sources, safe_name
 from sorvolo.capture.telemetry.nmea import Epoch
+from sorvolo.capture.video_stream import ONE_FILE
 from sorvolo.errors import InputError
 from sorvolo.geometry.camera import Camera
 from sorvolo.station.messages import (
@@ -182,7 +183,7 @@ class Recording:
         return [*found, *self._units.notices()]
 
     def _opened(self) -> Any:
-        return av.open(f"file:{self._path}", options={"protocol_whitelist": "file"})
+        return av.open(f"file:{self._path}", options=ONE_FILE)
 
     def _samples(self, first_us: int) -> list[FootagePiece]:
         """The telemetry, or the time alone, on the flight's clock, whose first picture is shown at `first_us`."""

@@ -13,6 +13,7 @@ import av
 
 from sorvolo.capture.live.klv import LocalSet, encode, local_sets
 from sorvolo.capture.telemetry.cleaning import clean, notice
+from sorvolo.capture.video_stream import ONE_FILE
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Matrix3
 from sorvolo.geometry.camera import Camera
@@ -197,7 +198,7 @@ def _sets_in(path: Path, counts: Counter[str]) -> list[tuple[int, LocalSet]]:
     found: list[tuple[int, LocalSet]] = []
     firsts_ns: list[int] = []
     try:
-        with av.open(f"file:{path}", options={"protocol_whitelist": "file"}) as container:
+        with av.open(f"file:{path}", options=ONE_FILE) as container:
             streams = klv_streams(container)
             if not streams or not container.streams.video:
                 return []
@@ -263,7 +264,7 @@ def mux_klv(
         for sample, heading_deg in zip(samples, headings_deg, strict=True)
     ]
     try:
-        with av.open(f"file:{video}", options={"protocol_whitelist": "file"}) as source:
+        with av.open(f"file:{video}", options=ONE_FILE) as source:
             if not source.streams.video:
                 raise InputError(f"{video}: no pictures in it; KLV is written into videos")
             pictures = source.streams.video[0]

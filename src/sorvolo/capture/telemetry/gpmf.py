@@ -24,6 +24,7 @@ from sorvolo.capture.telemetry.cleaning import (
     notice,
     sigma_from_hdop_m,
 )
+from sorvolo.capture.video_stream import ONE_FILE
 from sorvolo.errors import InputError
 from sorvolo.geometry.units import SECOND_NS
 from sorvolo.survey.flight import Telemetry
@@ -89,7 +90,7 @@ def read_gpmf_file(path: Path) -> Telemetry | None:
     """
     payloads: list[Payload] = []
     try:
-        with av.open(f"file:{path}", options={"protocol_whitelist": "file"}) as container:
+        with av.open(f"file:{path}", options=ONE_FILE) as container:
             payloads.extend(_payloads_in(container))
     except (av.FFmpegError, IndexError, ValueError):
         pass  # a damaged place: what came before it is used, and the video's reader counts the damage
