@@ -210,6 +210,28 @@ def test_the_floor_of_free_space_holds(root: Path) -> None:
         assert answer.status_code == 507 and "free" in answer.json()["detail"]
 
 
+def test_what_is_announced_needs_its_room_too(client: TestClient, monkeypatch: Any) -> None:
+    usage = shutil.disk_usage("/")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=20 * GIGA))
+    codes = [begin(client, f"{each}.mp4", 8 * GIGA).status_code for each in "abc"]
+    assert codes == [201, 201, 507]
+
+
+@pytest.mark.parametrize(
+    ("name", "state"), [("x.csv", "refused"), ("x.json.zip", "ready"), ("x.mp4.zip", "ready")]
+)
+def test_a_name_decides_what_an_upload_is(
+    client: TestClient, tmp_path: Path, name: str, state: str
+) -> None:
+    data = packed(tmp_path / "part", {"a.jpg": photo()}).read_bytes()
+    address = begin(client, name, len(data)).headers["location"]
+    assert send(client, address, 0, data).status_code == 204
+    done = checked(client, address)
+    assert done["state"] == state
+    if state == "ready":
+        assert done["facts"]["photos"] == 1
+
+
 def test_the_floor_holds_for_every_piece_and_for_what_is_unpacked(
     client: TestClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

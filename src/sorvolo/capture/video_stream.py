@@ -237,7 +237,9 @@ def _why_unreadable(path: Path, error: Exception) -> str:
             "copy it again from the drone, or repair it there; record as MKV or TS, which survive a cut"
         )
     if isinstance(error, av.error.ArgumentError):
-        return "it is a list of other files, or of a kind that is not read; give a video, MP4 or MKV"
+        return (
+            "it is a list of other files, or of a kind that is not read; give a video, MP4 or MKV"
+        )
     words = getattr(error, "strerror", None) or str(error)
     return f"{words}; give a video that FFmpeg reads, or a folder of photos"
 

@@ -47,16 +47,16 @@ class UploadRefusal(Exception):
 
 
 def look(part: Path, target: Path, most_bytes: int, keep_free_bytes: int = 0) -> dict[str, Any]:
-    """What an upload holds; photos are unpacked into the folder `target`. Raises UploadRefusal."""
+    """What an upload holds; photos are unpacked into the folder `target`, which no dot is in. Raises UploadRefusal."""
     ending = target.suffix.lower()
     if ending in _CONTAINERS:
         return _video(part, _CONTAINERS[ending])
     with part.open("rb") as file:
         head = file.read(4096)
-    if head[:4] == b"PK\x03\x04":
-        return _photos(part, target, most_bytes, keep_free_bytes)
     if not ending:
-        raise UploadRefusal("it is no zip file; pack the photos with zip")
+        if head[:4] != b"PK\x03\x04":
+            raise UploadRefusal("it is no zip file; pack the photos with zip")
+        return _photos(part, target, most_bytes, keep_free_bytes)
     if b"\0" in head:
         raise UploadRefusal("it is no text; telemetry and camera files are")
     return {"kind": "text"}

@@ -130,9 +130,11 @@ class Uploads:
                 413,
                 f"{length} bytes: 1 to {MAX_UPLOAD_BYTES} are taken, of text {_MOST_TEXT_BYTES}",
             )
-        self.demand_room(length)
+        here = self.all()
+        announced = sum(each.bytes - self.offset(each) for each in here)  # and not here yet
+        self.demand_room(length + announced)
         most = self._settings.limits.most_uploads
-        if len(self.all()) >= most:
+        if len(here) >= most:
             raise Problem(
                 409, f"there are {most} uploads already; delete those that you no longer need"
             )
@@ -266,20 +268,23 @@ class Uploads:
         if part.exists():
             shutil.rmtree(target.parent, ignore_errors=True)  # of a check that was cut off
         keep_free_bytes = int(self._settings.free_floor_gb * 1e9)
-        error, facts = checked_apart(
-            part if part.exists() else target,
-            target,
-            MAX_UPLOAD_BYTES,
-            keep_free_bytes,
-            self._child.run,
-        )
-        if self._child.is_ended or not folder.is_dir():  # the station ends; deleted meanwhile
-            return
+        try:
+            error, facts = checked_apart(
+                part if part.exists() else target,
+                target,
+                MAX_UPLOAD_BYTES,
+                keep_free_bytes,
+                self._child.run,
+            )
+            if self._child.is_ended or not folder.is_dir():  # the station ends; deleted meanwhile
+                return
+            if error is None and upload.kind != "photos" and part.exists():
+                target.parent.mkdir(exist_ok=True)
+                part.rename(target)
+        except OSError as fault:
+            error, facts = f"it cannot be looked into here ({fault.strerror})", None
         if error is not None:
             shutil.rmtree(target.parent, ignore_errors=True)
-        elif upload.kind != "photos" and part.exists():
-            target.parent.mkdir(exist_ok=True)
-            part.rename(target)
         done = replace(
             upload, state="ready" if error is None else "refused", why=error, facts=facts
         )
@@ -288,7 +293,8 @@ class Uploads:
         self._events.append(NewEvent("upload.checked", asdict(done)))
 
     def _target(self, upload: Upload) -> Path:
-        name = Path(upload.name).stem if upload.kind == "photos" else upload.name
+        is_folder = upload.kind == "photos"  # whose name has no ending that states another kind
+        name = Path(upload.name).stem.replace(".", "_") if is_folder else upload.name
         return self._folder / upload.id / _FILES / name
 
     def _write(self, upload: Upload) -> None:
