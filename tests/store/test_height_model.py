@@ -158,6 +158,12 @@ def in_fathoms(path: Path) -> Path:
             ),
             "its ground",
         ),
+        (
+            lambda path: written(
+                path, "EPSG:4326", Affine(float("nan"), 0, 12, 0, -0.01, 42), np.zeros((9, 9))
+            ),
+            "places no pixel",
+        ),
     ],
 )
 def test_what_is_no_model_of_this_ground(make: Any, words: str, tmp_path: Path) -> None:

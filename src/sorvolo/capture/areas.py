@@ -113,7 +113,7 @@ def read_segments(path: Path) -> list[tuple[str, Area, float]]:
             _segment(path, number, each, to_wgs84)
             for number, each in enumerate(tree["features"], start=1)
         ]
-    except (ValueError, RecursionError) as error:
+    except (ValueError, RecursionError, OverflowError) as error:
         raise InputError(f"{path}: broken GeoJSON: {error}") from error
     except (KeyError, TypeError, AttributeError) as error:
         raise InputError(

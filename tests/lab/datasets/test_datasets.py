@@ -755,3 +755,11 @@ def test_the_real_sets_have_the_boxes_that_their_files_list(name, options, expec
     found = Counter(labelled.classes[label] for each in labelled.pictures for label in each.labels)
     assert found == expected
     assert all(os.path.isfile(each.path) for each in labelled.pictures)
+
+
+def test_a_line_with_a_control_character_is_no_label(tmp_path):
+    put.put_picture(tmp_path / "images" / "a.jpg")
+    lines = "1,2,9,9,1,1,0,0\n1,2,9,9,1,1\x1f,0,0\n"
+    put.put_text(tmp_path / "annotations" / "a.txt", lines)
+    labelled = read_dataset(tmp_path)
+    assert notices(labelled)["malformed_labels"] == 1 and len(labelled.pictures[0].labels) == 1

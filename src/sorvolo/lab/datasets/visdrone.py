@@ -39,7 +39,7 @@ NAMES = (
 
 _IGNORED = {0, len(NAMES) - 1}
 _DET, _VID = 8, 10  # numbers a line
-_LINE = re.compile(r"\s*-?\d+\s*(,\s*-?\d+\s*){7}(,\s*-?\d+\s*,\s*-?\d+\s*)?,?\s*")
+_LINE = re.compile(r"\s*-?\d+\s*(,\s*-?\d+\s*){7}(,\s*-?\d+\s*,\s*-?\d+\s*)?,?\s*", re.ASCII)
 
 _RowsByFile: TypeAlias = dict[Path, list[list[int]]]
 

@@ -4,6 +4,7 @@ The one place of the half-pixel shift: our pixel (0, 0) has its centre at the gr
 starts at that pixel's outer corner.
 """
 
+import math
 import re
 import shutil
 import warnings
@@ -73,6 +74,8 @@ def open_raster(
             f"{path}: GDAL would take this for one of its virtual files; move it to another folder"
         )
     with quiet_gdal(), _opened(whole, drivers) as source:
+        if not math.isfinite(sum(source.transform)) or source.transform.is_degenerate:
+            raise InputError(f"{path}: its transform places no pixel ({source.transform[:6]})")
         yield source
 
 
