@@ -398,7 +398,13 @@ def test_segments_need_probabilities_that_add_up(tmp_path: Path) -> None:
 
     write({"poa_percent": 40}, {"name": "b", "POA": 0.5})
     assert [(name, poa) for name, _, poa in read_segments(path)] == [("segment 1", 0.4), ("b", 0.5)]
-    for wrong in ([{"name": "x"}], [{"poa": 0.7}, {"poa": 0.7}], [{"poa": 3}], [{"poa": 10**400}], []):
+    for wrong in (
+        [{"name": "x"}],
+        [{"poa": 0.7}, {"poa": 0.7}],
+        [{"poa": 3}],
+        [{"poa": 10**400}],
+        [],
+    ):
         write(*wrong)
-        with pytest.raises(InputError, match="poa|too large"):
+        with pytest.raises(InputError, match=r"poa|too large"):
             read_segments(path)
