@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sorvolo.capture.clock_offset import OffsetEstimate, estimate_offset, shared_motion_m_s
-from sorvolo.capture.sync import Track, shifted, tie_clocks, track_from_telemetry
+from sorvolo.capture.sync import CameraTrack, shifted, tie_clocks, track_from_telemetry
 from sorvolo.errors import InputError
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.geometry.homography import apply_homography, fit_similarity
@@ -82,7 +82,7 @@ def clock_error_s(rng: np.random.Generator, family: str, since_s: float) -> floa
 
 
 def applied_in(
-    track: Track, taken_s: np.ndarray, seen_m: np.ndarray, tie_s: float
+    track: CameraTrack, taken_s: np.ndarray, seen_m: np.ndarray, tie_s: float
 ) -> tuple[OffsetEstimate, float]:
     """What the motion shows, and the offset that is applied, as a map does."""
     found = estimate_offset(track, taken_s, seen_m, reach_s=4 * tie_s, is_free=True)

@@ -20,7 +20,7 @@ from sorvolo.capture.live.addresses import (
 from sorvolo.capture.live.links import SentenceBuffer, is_link
 from sorvolo.capture.live.reader import Backlog
 from sorvolo.capture.live.reconnect import Backoff, LiveSettings, Outages
-from sorvolo.capture.live.stream import Arrived, FrameQueue, StreamClock, Tie
+from sorvolo.capture.live.stream import Arrived, ClockTie, FrameQueue, StreamClock
 from sorvolo.capture.live.telemetry_log import TelemetryLog
 from sorvolo.errors import InputError, SettingsError
 
@@ -37,7 +37,7 @@ def test_arrivals_are_timed_by_the_least_delayed() -> None:
     clock = StreamClock()
     for stamp, delay in ((0, 1.2), (0.5, 0.7), (1.0, 0.2), (1.1, 0.3)):  # a burst, then live
         clock.arrived(int(stamp * S), UTC + int((stamp + delay) * S))
-    assert clock.settle() is Tie.ARRIVAL
+    assert clock.settle() is ClockTie.ARRIVAL
     assert clock.utc_ns(int(1.1 * S)) == UTC + int(1.3 * S)
 
 
@@ -54,10 +54,10 @@ def test_a_camera_clock_that_drifts_is_followed() -> None:
 
 def test_stated_times_win_and_stay_in_force_over_an_outage() -> None:
     clock = StreamClock()
-    clock.stated(Tie.METADATA, 5 * S, UTC - 3600 * S)  # the drone's clock is an hour behind
-    clock.stated(Tie.SENDER_REPORT, 5 * S, UTC - 7 * S)
+    clock.stated(ClockTie.METADATA, 5 * S, UTC - 3600 * S)  # the drone's clock is an hour behind
+    clock.stated(ClockTie.SENDER_REPORT, 5 * S, UTC - 7 * S)
     clock.arrived(5 * S, UTC)
-    assert clock.settle() is Tie.METADATA
+    assert clock.settle() is ClockTie.METADATA
     assert clock.frame_utc_ns(5 * S) == UTC - 3600 * S
     assert clock.host_from_tie_ns() == 3600 * S
     clock.restart()  # from here on the metadata is missing: arrivals go on by the drone's clock

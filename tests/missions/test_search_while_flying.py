@@ -22,7 +22,7 @@ from sorvolo.missions.search.flights import search_site
 from sorvolo.missions.search.measure import GrowingMeasure, MeasuredFlight, measure_flight
 from sorvolo.missions.search.prepare import flights_to_search, prepare_search, search_frames
 from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
-from sorvolo.missions.search.while_flying import Pace, SearchWhileFlying
+from sorvolo.missions.search.while_flying import MeasurePace, SearchWhileFlying
 from sorvolo.search.cells import cells_of
 from sorvolo.search.plant_places import PlantField
 from sorvolo.store.site.archive import Archive
@@ -234,7 +234,7 @@ def test_files_and_waypoints_follow_the_flight(
     refly = tmp_path / "holes.kml"
     outputs = SearchOutputs(tmp_path / "out", area=_area(site, tmp_path), refly=(refly,))
     flying = SearchWhileFlying(
-        _SETTINGS, outputs, Comparing(site), Pace(again_s=0.0, rest=0.0, look_s=0.02)
+        _SETTINGS, outputs, Comparing(site), MeasurePace(again_s=0.0, rest=0.0, look_s=0.02)
     )
     reports = _flown(
         photographed / "flight1" / "photos", photographed / "camera.xml", tmp_path, flying
@@ -301,7 +301,7 @@ def test_a_flight_that_is_stopped_leaves_no_waypoints(
     shutil.copytree(site, tmp_path / "site")
     settings, pace = (
         replace(_SETTINGS, plants=10),
-        Pace(again_s=0.0, rest=0.0, look_s=0.02, earlier=99),
+        MeasurePace(again_s=0.0, rest=0.0, look_s=0.02, earlier=99),
     )
     *_, whole = search_site(tmp_path / "site", settings, outputs, Comparing(site))
     flying = SearchWhileFlying(settings, outputs, Comparing(site), pace)
@@ -362,7 +362,7 @@ def test_a_fault_of_the_measure_does_not_end_the_map(
     monkeypatch.setattr(while_flying, "write_search", full)
     outputs = SearchOutputs(tmp_path / "out")
     flying = SearchWhileFlying(
-        _SETTINGS, outputs, Comparing(site), Pace(again_s=0.0, rest=0.0, look_s=0.02)
+        _SETTINGS, outputs, Comparing(site), MeasurePace(again_s=0.0, rest=0.0, look_s=0.02)
     )
     with pytest.warns(match="not measured whole while the flight goes on: disk full"):
         _flown(

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.capture.sync import Track
+from sorvolo.capture.sync import CameraTrack
 from sorvolo.geometry.arrays import Floats, PointsM
 from sorvolo.geometry.homography import fit_similarity
 
@@ -80,7 +80,7 @@ class OffsetEstimate:
 
 
 def estimate_offset(
-    track: Track,
+    track: CameraTrack,
     times_s: Floats,
     seen_m: PointsM,
     *,

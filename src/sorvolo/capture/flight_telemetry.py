@@ -9,8 +9,8 @@ from sorvolo.capture.clock_offset import OffsetEstimate, estimate_offset
 from sorvolo.capture.photos import PhotoSource
 from sorvolo.capture.source import LiveSource, Source
 from sorvolo.capture.sync import (
+    CameraTrack,
     Clock,
-    Track,
     shifted,
     tie_clocks,
     track_from_telemetry,
@@ -119,7 +119,7 @@ class FlightTelemetry:
         )
 
     def prior(self, seconds: float, smooth_s: float) -> CameraPrior:
-        """What telemetry gives of the camera at this second of the video. See `Track.prior`."""
+        """What telemetry gives of the camera at this second of the video. See `CameraTrack.prior`."""
         track = self.track if seconds >= self.track.sample_s[0] else self._whole()
         return track.prior(seconds, smooth_s=smooth_s)
 
@@ -158,7 +158,7 @@ class FlightTelemetry:
         """Whether the zero of heights is known to be the ground, however well."""
         return bool(np.isfinite(self.track.altitude_offset_sigma_m))
 
-    def _whole(self) -> Track:
+    def _whole(self) -> CameraTrack:
         """The track of all samples so far, its heights counted from the same zero."""
         source = self._source
         if not isinstance(source, LiveSource) or len(samples := source.telemetry) == len(
@@ -168,7 +168,7 @@ class FlightTelemetry:
         found, _ = self._laid(samples, tied_clock(source, samples, self._offset_s))
         return _continued(self.track, found)
 
-    def _laid(self, samples: Telemetry, clock: Clock) -> tuple[Track, tuple[Notice, ...]]:
+    def _laid(self, samples: Telemetry, clock: Clock) -> tuple[CameraTrack, tuple[Notice, ...]]:
         """The samples in the site frame; photos' own fixes where they are by the given delay."""
         track, notices = track_from_telemetry(
             samples, clock, self._frame, ground_elevation_m=self._ground_m
@@ -220,7 +220,7 @@ def tied_clock(source: Source, samples: Telemetry, offset_s: float | None = None
     )
 
 
-def distance_m(track: Track, ground_m: PointsM | None) -> float:
+def distance_m(track: CameraTrack, ground_m: PointsM | None) -> float:
     """How near the flight comes to any of these places, (N, 2) site metres; None: to the site's origin."""
     ground_m = np.zeros((1, 2)) if ground_m is None else ground_m
     known = track.east_north_m[np.isfinite(track.east_north_m[:, 0])]
@@ -248,7 +248,7 @@ def _speed_m_s(path_s: Floats, path_m: PointsM) -> float:
     return max(_SLOWEST_M_S, float(np.percentile(speeds, 75)))
 
 
-def _continued(before: Track, now: Track) -> Track:
+def _continued(before: CameraTrack, now: CameraTrack) -> CameraTrack:
     """The track as it is known now, its heights counted from the same zero as before."""
     same_m = np.interp(before.sample_s, now.sample_s, now.up_m)
     return replace(

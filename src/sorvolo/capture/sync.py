@@ -170,7 +170,7 @@ def _no_time_in_common(fix_s: Floats, frames_s: Floats, given_s: float) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class Track:
+class CameraTrack:
     """One flight's telemetry in the site frame, ready to be asked for any moment.
 
     `up_m` is above the site's ground as telemetry has it; `altitude_offset_sigma_m` is how well the zero of that
@@ -351,7 +351,7 @@ def track_from_telemetry(
     frame: LocalFrame,
     *,
     ground_elevation_m: float | None = None,
-) -> tuple[Track, tuple[Notice, ...]]:
+) -> tuple[CameraTrack, tuple[Notice, ...]]:
     """Telemetry in the site frame. `ground_elevation_m` is the ground's height in telemetry's own height reference."""
     up_m, kind, ground, vertical_sigma_m, offset_sigma_m, notices = _heights(
         telemetry, ground_elevation_m
@@ -382,7 +382,7 @@ def track_from_telemetry(
     gap_s = np.inf if clock.is_per_photo else max(4 * interval_s, 3.0)
     if clock.is_per_photo:
         interval_s = 0.0
-    track = Track(
+    track = CameraTrack(
         clock.sample_s,
         east_north,
         up_m,
@@ -400,7 +400,7 @@ def track_from_telemetry(
     return track, notices
 
 
-def shifted(track: Track, offset_s: float) -> Track:
+def shifted(track: CameraTrack, offset_s: float) -> CameraTrack:
     """The track with telemetry time = frame time + offset_s.
 
     Photos keep their own attitude. Their fixes came late by `offset_s`, about a second at most: each is where the

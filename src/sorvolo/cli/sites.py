@@ -134,7 +134,7 @@ def run_on_site(
         ]
 
 
-class Stop:
+class SignalStop:
     """Ctrl-C and SIGTERM as an event, `until`, that a mission looks at after each frame.
 
     An exception could strike inside a queue's own lock and block its end for ever. The second signal, and one before
@@ -145,7 +145,7 @@ class Stop:
         self.until, self.is_running, self._words = threading.Event(), is_running, words
 
     @contextmanager
-    def on_signals(self) -> Iterator["Stop"]:
+    def on_signals(self) -> Iterator["SignalStop"]:
         """Take the signals for the length of a block; in another thread than the main one there are none."""
         if threading.current_thread() is not threading.main_thread():
             yield self
@@ -171,7 +171,7 @@ def ended_by_signal(inputs: Sequence[Path | str]) -> Iterator[threading.Event]:
     """Yield an event that the first Ctrl-C or SIGTERM sets if an input is live; a second signal stops at once."""
     from sorvolo.capture.live.addresses import is_live_address
 
-    stop = Stop(is_running=True)
+    stop = SignalStop(is_running=True)
     if any(is_live_address(str(each)) for each in inputs):
         with stop.on_signals():
             yield stop.until

@@ -23,7 +23,7 @@ from sorvolo.cli.options import (
     names,
 )
 from sorvolo.cli.progress import ProgressReport
-from sorvolo.cli.sites import Stop
+from sorvolo.cli.sites import SignalStop
 from sorvolo.errors import SettingsError
 
 if TYPE_CHECKING:  # torch is an extra, and slow to import: only this command needs it
@@ -113,7 +113,7 @@ def train(
         val, None, class_names(classes), names(ignore), names(unlabelled), group_pattern
     )
     updates = train_detector(data or [], out, settings, options, resume=resume)
-    stop = Stop(
+    stop = SignalStop(
         is_running=True, words="stopping after this step; press Ctrl-C again to stop at once"
     )
     with stop.on_signals():
@@ -131,7 +131,7 @@ def train(
         )
 
 
-def _print_json(updates: "Iterator[TrainingUpdate]", stop: Stop) -> None:
+def _print_json(updates: "Iterator[TrainingUpdate]", stop: SignalStop) -> None:
     """One JSON object per step."""
     from sorvolo.store.exports.plain import plain_json
 
@@ -141,7 +141,7 @@ def _print_json(updates: "Iterator[TrainingUpdate]", stop: Stop) -> None:
             return
 
 
-def _show(updates: "Iterator[TrainingUpdate]", stop: Stop) -> None:
+def _show(updates: "Iterator[TrainingUpdate]", stop: SignalStop) -> None:
     """Progress, and a line that stays for each check and notice."""
     console = Console()
     with ProgressReport(console, stays=True) as progress:

@@ -46,7 +46,7 @@ from sorvolo.cli.printing import (
     show_path,
 )
 from sorvolo.cli.progress import ProgressReport, Resumed, rate_words
-from sorvolo.cli.sites import Stop
+from sorvolo.cli.sites import SignalStop
 from sorvolo.survey.wording import counted, counted_list
 
 if TYPE_CHECKING:
@@ -131,7 +131,7 @@ def watch_command(
     warn_of_interpreted(alert_command)
     # before the first frame there is nothing to keep
     words = "landed: the frames that wait are searched; press Ctrl-C again to stop at once"
-    stop = Stop(is_running=False, words=words if is_live_address(source) else "")
+    stop = SignalStop(is_running=False, words=words if is_live_address(source) else "")
     watching = watch(
         source,
         settings,

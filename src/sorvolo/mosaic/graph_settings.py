@@ -18,7 +18,7 @@ class FlightPriors:
 
 
 @dataclass(frozen=True)
-class OffsetSettings:
+class SharedOffsetSettings:
     """When an offset that all frames share is real, and how close to zero one is held that is not."""
 
     altitude_m: float = 0.1
@@ -59,7 +59,7 @@ class PoseGraphSettings:
         0.0  # of gimbal or mount against the vertical, the same all flight
     )
     heading_offset_sigma_deg: float = 0.0  # of the compass, the same all flight
-    offsets: OffsetSettings = OffsetSettings()
+    offsets: SharedOffsetSettings = SharedOffsetSettings()
 
     @classmethod
     def of_flight(

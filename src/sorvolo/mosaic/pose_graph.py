@@ -41,8 +41,8 @@ from sorvolo.mosaic.graph_settings import (
     STRAINED,
     UNEVEN,
     WINDOW,
-    OffsetSettings,
     PoseGraphSettings,
+    SharedOffsetSettings,
 )
 from sorvolo.mosaic.ground_ties import GroundTies
 from sorvolo.mosaic.normal_equations import Factors
@@ -72,7 +72,7 @@ def shared_sigma(settings: PoseGraphSettings, as_reported: NDArray[np.bool_]) ->
 
 
 def unconfirmed(
-    shared: Floats, sigma: Floats, factors: Factors, settings: OffsetSettings
+    shared: Floats, sigma: Floats, factors: Factors, settings: SharedOffsetSettings
 ) -> list[int]:
     """The offsets, as indices of SHARED, that a flight does not show: telemetry is taken as it reports them.
 
@@ -100,7 +100,7 @@ def shared_variances(factors: Factors) -> Floats:
     return np.diag(factors.solve(units)[-len(SHARED) :])
 
 
-def _held_sigma(settings: OffsetSettings) -> Floats:
+def _held_sigma(settings: SharedOffsetSettings) -> Floats:
     """(8,) prior sigma of an offset that is taken as telemetry reports it."""
     tilt_rad = settings.tilt_rad
     return np.array(

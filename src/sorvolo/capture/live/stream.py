@@ -51,7 +51,7 @@ BEGUN_LATE = "begun_late"
 """The notice that a growing file was not read from its beginning."""
 
 
-class Tie(IntEnum):
+class ClockTie(IntEnum):
     """The source of a frame's time, the better the higher."""
 
     ARRIVAL = 0
@@ -62,9 +62,9 @@ class Tie(IntEnum):
     def words(self) -> str:
         """Where the times come from, for people."""
         return {
-            Tie.ARRIVAL: "when the first frame arrived, by this computer's clock (the link's delay is in it)",
-            Tie.SENDER_REPORT: "the sender's RTCP reports",
-            Tie.METADATA: "the precision time stamps in the stream's metadata (ST 0601 tag 2)",
+            ClockTie.ARRIVAL: "when the first frame arrived, by this computer's clock (the link's delay is in it)",
+            ClockTie.SENDER_REPORT: "the sender's RTCP reports",
+            ClockTie.METADATA: "the precision time stamps in the stream's metadata (ST 0601 tag 2)",
         }[self]
 
 
@@ -77,9 +77,9 @@ class StreamClock:
     """
 
     def __init__(self) -> None:
-        self.tie: Tie | None = None
+        self.tie: ClockTie | None = None
         self._arrivals: deque[tuple[int, int]] = deque()  # stamp, UTC - stamp; the offsets increase
-        self._stated: dict[Tie, deque[int]] = {}
+        self._stated: dict[ClockTie, deque[int]] = {}
         self._offset_ns: int | None = None
         self._bias_ns = 0  # of the tie's clock against this computer's
         self._began_ns = self._slewed_to_ns = 0
@@ -94,14 +94,14 @@ class StreamClock:
         while stamp_ns - self._arrivals[0][0] > _WINDOW_NS:
             self._arrivals.popleft()
 
-    def stated(self, tie: Tie, stamp_ns: int, utc_ns: int) -> None:
+    def stated(self, tie: ClockTie, stamp_ns: int, utc_ns: int) -> None:
         """The stream states this UTC for this time stamp."""
         self._stated.setdefault(tie, deque(maxlen=_STATED_KEPT)).append(utc_ns - stamp_ns)
 
-    def settle(self) -> Tie:
+    def settle(self) -> ClockTie:
         """Use the best tie that there is by now, for good; it is given back."""
         if self.tie is None:
-            self.tie = max(self._stated, default=Tie.ARRIVAL)
+            self.tie = max(self._stated, default=ClockTie.ARRIVAL)
         return self.tie
 
     def restart(self) -> None:
@@ -465,7 +465,7 @@ class LiveStream:
 
     def continue_from(self, so_far: FlightSoFar) -> None:
         """Go on with a flight that an earlier process read; before `frames` is asked for, and telemetry."""
-        if self._is_whole and self._clock.tie is Tie.ARRIVAL:
+        if self._is_whole and self._clock.tie is ClockTie.ARRIVAL:
             self._later_ns = (
                 so_far.start_ns - self.start_ns
             )  # each process has timed it by when it began to read
@@ -480,8 +480,8 @@ class LiveStream:
 
     def notices(self) -> tuple[Notice, ...]:
         """What was found so far and survived, outages with their lengths among it."""
-        arrival = self._clock.tie is Tie.ARRIVAL and not self._is_file
-        words = f"the stream states no time: frames are timed by {Tie.ARRIVAL.words}"
+        arrival = self._clock.tie is ClockTie.ARRIVAL and not self._is_file
+        words = f"the stream states no time: frames are timed by {ClockTie.ARRIVAL.words}"
         return (
             *self._reader.notices(),
             *segment_notices(self.gaps_s),
@@ -606,12 +606,12 @@ class LiveStream:
     def reported(self, stamp_ns: int, utc_ns: int) -> None:
         """See `reader.StreamListener`."""
         if utc_ns > DATED_NS:
-            self._clock.stated(Tie.SENDER_REPORT, stamp_ns, utc_ns)
+            self._clock.stated(ClockTie.SENDER_REPORT, stamp_ns, utc_ns)
 
     def metadata(self, stated: LocalSet, stamp_ns: int) -> None:
         """See `reader.StreamListener`."""
         if stated.time_ns:
-            self._clock.stated(Tie.METADATA, stamp_ns, stated.time_ns)
+            self._clock.stated(ClockTie.METADATA, stamp_ns, stated.time_ns)
         across_deg = stated["sensor_horizontal_fov_deg"]
         if isfinite(across_deg):
             self._lens = self._lens or stated
@@ -671,7 +671,7 @@ class LiveStream:
                 self.start_ns = self._clock.utc_ns(first.stamp_ns)
                 self.start_origin = (
                     tie.words
-                    if not (self._is_file and tie is Tie.ARRIVAL)
+                    if not (self._is_file and tie is ClockTie.ARRIVAL)
                     else ("when reading began: the file states no time")
                 )
         self._deliver_held()
@@ -720,7 +720,7 @@ class LiveStream:
     def _log_metadata(self, stamp_ns: int, stated: LocalSet) -> None:
         if self._link is not None:
             return
-        states_time = self._clock.tie is Tie.METADATA and stated.time_ns
+        states_time = self._clock.tie is ClockTie.METADATA and stated.time_ns
         self._log.add(
             stated.time_ns if states_time else self._clock.utc_ns(stamp_ns), columns_of(stated)
         )
@@ -739,7 +739,7 @@ class LiveStream:
         least_ns = min(self._delays_ns)
         ahead_ns = self._clock.host_from_tie_ns()
         self._clocks_agree = (
-            self._clock.tie is not Tie.ARRIVAL and abs(least_ns - ahead_ns) < _CLOCKS_AGREE_NS
+            self._clock.tie is not ClockTie.ARRIVAL and abs(least_ns - ahead_ns) < _CLOCKS_AGREE_NS
         )
         self._log.add(
             epoch.time_ns + (0 if self._clocks_agree else least_ns - ahead_ns), epoch.values

@@ -35,7 +35,7 @@ from sorvolo.survey.area import Area
 
 
 @dataclass(frozen=True)
-class Pace:
+class MeasurePace:
     """How often the files are written anew."""
 
     again_s: float = 15.0
@@ -65,7 +65,7 @@ class SearchWhileFlying:
         settings: SearchSettings,
         outputs: SearchOutputs,
         detector: FindsObjects | None = None,
-        pace: Pace = Pace(),
+        pace: MeasurePace = MeasurePace(),
     ) -> None:
         self._prepared: PreparedSearch = prepare_search(settings, outputs, detector, is_live=True)
         self._settings, self._outputs, self._pace = settings, outputs, pace
