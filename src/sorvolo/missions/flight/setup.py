@@ -15,7 +15,7 @@ from sorvolo.capture.flight_telemetry import (
     local_prior,
 )
 from sorvolo.capture.source import LiveSource, Source
-from sorvolo.capture.sync import DATED_NS, Clock, Track, site_origin
+from sorvolo.capture.sync import DATED_NS, CameraTrack, Clock, site_origin
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import PointsM, Vector3
 from sorvolo.geometry.camera import Camera
@@ -58,7 +58,7 @@ class FlightSetup:
         return self.known_ground is not None and self.known_ground.is_datum
 
     @property
-    def track(self) -> Track | None:
+    def track(self) -> CameraTrack | None:
         """The flight's path by telemetry; of a live flight as it is known by now."""
         return None if self.telemetry is None else self.telemetry.track
 
@@ -334,7 +334,7 @@ def sun_over(site: Site, time_ns: int) -> Vector3 | None:
     return sun_direction(time_ns, site.origin.latitude_deg, site.origin.longitude_deg)
 
 
-def check_place(site: Site, track: Track, name: str, ground_m: PointsM | None) -> None:
+def check_place(site: Site, track: CameraTrack, name: str, ground_m: PointsM | None) -> None:
     """Raise InputError for a flight far from all ground that the site shows (None: its origin)."""
     nearest_m = distance_m(track, ground_m)
     if nearest_m > _ANOTHER_PLACE_M:
