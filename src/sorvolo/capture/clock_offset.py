@@ -10,31 +10,27 @@ from sorvolo.capture.sync import CameraTrack
 from sorvolo.geometry.arrays import Floats, PointsM
 from sorvolo.geometry.homography import fit_similarity
 
-
-@dataclass(frozen=True)
-class OffsetSettings:
-    """When an offset is looked for, how fixes become a smooth path, and how their noise is learnt; all by choice.
-
-    A similarity and an offset have five unknowns: fewer than `least_fixes` or `least_frames` show none. The path is a
-    parabola through `reach` fixes to each side, weighted by nearness with one sigma of `width` intervals of the
-    receiver, at which its noise hardly depends on where between two fixes it is; fewer than `around` fixes within two
-    sigmas (of seven) stand at an end or a gap, where a parabola would run away. `shares` are of the noise's variance,
-    that neighbouring frames may have in common.
-    """
-
-    least_fixes: int = 4
-    least_frames: int = 6
-    width: float = 1.5
-    steps: int = 4  # places of the smooth path in each interval
-    reach: int = 6  # four sigmas
-    around: int = 5
-    least_share: float = 0.6  # of the way seen in the pictures that the log must cover at an offset
-    alike: float = 2.0  # times the best misfit, or half a fix's sigma: an offset that fits as well
-    free_step_s: float = 0.5  # between offsets all over the log
-    near_s: float = 2.0  # from the best of these: searched more closely
-    most_frames: int = 400  # that a noise is learnt from
-    shares: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 0.9, 0.97)
-    memories: int = 6  # times in which it is forgotten that are tried, from one frame's step to the whole flight
+# all by choice
+_LEAST_FIXES = 4  # a similarity and an offset have five unknowns
+_LEAST_FRAMES = 6
+_WIDTH = 1.5  # one sigma of the weight by nearness, in intervals of the receiver
+_STEPS = 4  # places of the smooth path in each interval
+_REACH = 6  # four sigmas
+_AROUND = 5  # of seven within two sigmas: with fewer a parabola runs away
+_LEAST_SHARE = 0.6  # of the way seen in the pictures that the log must cover at an offset
+_ALIKE = 2.0  # times the best misfit, or half a fix's sigma: an offset that fits as well
+_FREE_STEP_S = 0.5  # between offsets all over the log
+_NEAR_S = 2.0  # from the best of these: searched more closely
+_MOST_FRAMES = 400  # that a noise is learnt from
+_SHARES = (
+    0.0,
+    0.25,
+    0.5,
+    0.75,
+    0.9,
+    0.97,
+)  # of the noise that neighbouring frames may have in common
+_MEMORIES = 6  # times in which it is forgotten: from one frame to the whole flight
 
 
 @dataclass(frozen=True)
@@ -86,7 +82,6 @@ def estimate_offset(
     *,
     reach_s: float,
     is_free: bool = False,
-    settings: OffsetSettings = OffsetSettings(),
 ) -> OffsetEstimate:
     """The clock offset that makes telemetry's path fit the path seen in the pictures (N, 2), up to a similarity.
 
@@ -99,21 +94,21 @@ def estimate_offset(
     """
     usable = np.isfinite(track.east_north_m[:, 0])
     unknown = OffsetEstimate(0.0, float("inf"), float("nan"), float("nan"))
-    if usable.sum() < settings.least_fixes or len(times_s) < settings.least_frames or reach_s <= 0:
+    if usable.sum() < _LEAST_FIXES or len(times_s) < _LEAST_FRAMES or reach_s <= 0:
         return unknown
     within_s = (-np.inf, np.inf) if is_free else (times_s[0] - reach_s, times_s[-1] + reach_s)
     path_s, path_m = _smooth_path(
-        track.sample_s[usable], track.east_north_m[usable], track.interval_s, within_s, settings
+        track.sample_s[usable], track.east_north_m[usable], track.interval_s, within_s
     )
-    compared = _Compared(path_s, path_m, times_s, seen_m, settings)
+    compared = _Compared(path_s, path_m, times_s, seen_m)
     begin_s = 0.0
     rivals_s: tuple[float, ...] = ()
     if is_free:
         noise_m = float(np.median(track.horizontal_sigma_m[usable])) / 2
-        begin_s, rivals_s = _hypotheses(compared, reach_s, noise_m, settings)
+        begin_s, rivals_s = _hypotheses(compared, reach_s, noise_m)
         if abs(begin_s) > reach_s and rivals_s:
             return replace(unknown, rivals_s=(begin_s, *rivals_s))
-        reach_s = min(reach_s, settings.near_s)
+        reach_s = min(reach_s, _NEAR_S)
     step = max(0.02, reach_s / 100)
     offsets = begin_s + np.arange(-reach_s, reach_s + step / 2, step)
     misfits = np.array([compared.misfit(each)[0] for each in offsets])
@@ -134,7 +129,7 @@ def estimate_offset(
     if abs(best - begin_s) > 0.97 * reach_s or least > compared.most_misfit(best):
         return found
     at, fixes_m, places_m = compared.laid(best)
-    return replace(found, offset_s=best, sigma_s=_offset_sigma_s(at, fixes_m, places_m, settings))
+    return replace(found, offset_s=best, sigma_s=_offset_sigma_s(at, fixes_m, places_m))
 
 
 class _Compared:
@@ -146,10 +141,8 @@ class _Compared:
         path_m: PointsM,
         times_s: Floats,
         seen: PointsM,
-        settings: OffsetSettings,
     ) -> None:
         self.path_s, self._path_m, self.times_s, self._seen = path_s, path_m, times_s, seen
-        self._settings = settings
         legs = np.linalg.norm(np.diff(seen, axis=0), axis=1)
         self._way = np.append(legs, 0.0) + np.append(0.0, legs)  # twice that of each picture
         self._plane = seen @ np.array([1, 1j]), path_m @ np.array([1, 1j])
@@ -166,7 +159,7 @@ class _Compared:
         """
         inside, way = self._inside(offset_s), float(self._way.sum())
         share = float(self._way[inside].sum()) / way if way > 0 else 0.0
-        if inside.sum() < self._settings.least_frames or share < self._settings.least_share:
+        if inside.sum() < _LEAST_FRAMES or share < _LEAST_SHARE:
             return float("inf"), 1.0, share
         seen, path = self._plane
         fixes = np.interp(self.times_s[inside] + offset_s, self.path_s, path)
@@ -198,19 +191,19 @@ class _Compared:
 
 
 def _hypotheses(
-    compared: _Compared, reach_s: float, noise_m: float, settings: OffsetSettings
+    compared: _Compared, reach_s: float, noise_m: float
 ) -> tuple[float, tuple[float, ...]]:
     """The offset near which to look, within `reach_s` where one there fits; and its rivals, see `OffsetEstimate`."""
     first_s = float(compared.path_s[0] - compared.times_s[-1])
     last_s = float(compared.path_s[-1] - compared.times_s[0])
-    offsets = np.arange(first_s, last_s, settings.free_step_s)
+    offsets = np.arange(first_s, last_s, _FREE_STEP_S)
     misfits, scales, shares = np.array([compared.misfit(each) for each in offsets]).T
     best = int(np.argmin(misfits))
     if not np.isfinite(misfits[best]):
         return 0.0, ()
-    is_alike = misfits <= settings.alike * max(misfits[best], noise_m * scales[best])
+    is_alike = misfits <= _ALIKE * max(misfits[best], noise_m * scales[best])
     # of all that fit alike, those that explain the most of the way; of these, those near the clocks' own tie
-    is_near = np.abs(offsets) <= reach_s + settings.free_step_s
+    is_near = np.abs(offsets) <= reach_s + _FREE_STEP_S
     chosen = is_alike & (shares > shares[is_alike].max() - 0.02)
     chosen = chosen & is_near if (chosen & is_near).any() else chosen
     begin = np.flatnonzero(chosen)[int(np.argmin(misfits[chosen]))]
@@ -235,7 +228,6 @@ def _smooth_path(
     fixes_m: PointsM,
     interval_s: float,
     within_s: tuple[float, float],
-    settings: OffsetSettings,
 ) -> tuple[Floats, PointsM]:
     """Fixes as a path, (M,) s and (M, 2), from the one to the other time: by a parabola through the fixes around
     each moment, weighted by nearness; as they are where these are few, and of photos, which carry one each.
@@ -243,31 +235,29 @@ def _smooth_path(
     On straight lines from fix to fix noise is halved midway between two. Where frames and fixes keep step, an offset of
     half an interval then fits better than the true one: by 0.04 s on flights with fixes ten times a second.
     """
-    reach = settings.reach
+    reach = _REACH
     if interval_s <= 0 or len(fix_s) <= 2 * reach:
         return fix_s, fixes_m
-    step_s = interval_s / settings.steps
+    step_s = interval_s / _STEPS
     first_s, last_s = max(fix_s[0], within_s[0] - step_s), min(fix_s[-1], within_s[1] + step_s)
     path_s = np.arange(first_s, last_s + step_s / 2, step_s)
     if len(path_s) < 2:
         return fix_s, fixes_m
     first = np.clip(np.searchsorted(fix_s, path_s) - reach, 0, len(fix_s) - 2 * reach)
     rows = first[:, None] + np.arange(2 * reach)
-    along = (fix_s[rows] - path_s[:, None]) / (settings.width * interval_s)
+    along = (fix_s[rows] - path_s[:, None]) / (_WIDTH * interval_s)
     weight = np.exp(-0.5 * along**2)
     powers = along[..., None] ** np.arange(3)
     normal = np.einsum("nk,nki,nkj->nij", weight, powers, powers)
     straight_m = np.column_stack([np.interp(path_s, fix_s, fixes_m[:, k]) for k in range(2)])
-    fitted = (np.abs(along) <= 2.0).sum(axis=1) >= settings.around
+    fitted = (np.abs(along) <= 2.0).sum(axis=1) >= _AROUND
     if fitted.any():
         right = np.einsum("nk,nki,nkd->nid", weight, powers, fixes_m[rows])
         straight_m[fitted] = np.linalg.solve(normal[fitted], right[fitted])[:, 0]
     return path_s, straight_m
 
 
-def _offset_sigma_s(
-    times_s: Floats, fixes_m: PointsM, places_m: PointsM, settings: OffsetSettings
-) -> float:
+def _offset_sigma_s(times_s: Floats, fixes_m: PointsM, places_m: PointsM) -> float:
     """One sigma of an offset by what it leaves between N fixes and places, (N, 2) each; infinite without motion.
 
     Receivers wander, so that neighbouring frames err alike, and a strip's frames, which all pull an offset one way, are
@@ -279,7 +269,7 @@ def _offset_sigma_s(
     miss_m = np.linalg.norm(fixes_m - places_m, axis=1)
     rows = np.flatnonzero(miss_m <= _outlying_m(miss_m))
     velocity_m_s = np.gradient(places_m, times_s, axis=0)[rows]
-    some = np.unique(np.linspace(0, len(rows) - 1, settings.most_frames).round().astype(int))
+    some = np.unique(np.linspace(0, len(rows) - 1, _MOST_FRAMES).round().astype(int))
     rows, velocity_m_s = rows[some], velocity_m_s[some]
     at_s, places, misses = times_s[rows], places_m[rows], (fixes_m - places_m)[rows].T.ravel()
     similar = _similar(places)
@@ -292,10 +282,8 @@ def _offset_sigma_s(
     model = np.column_stack([similar, motion])
     apart_s = np.abs(at_s[:, None] - at_s)
     likelihoods, variances = [], []
-    for memory_s in np.geomspace(
-        float(np.median(np.diff(at_s))), at_s[-1] - at_s[0], settings.memories
-    ):
-        for share in settings.shares:
+    for memory_s in np.geomspace(float(np.median(np.diff(at_s))), at_s[-1] - at_s[0], _MEMORIES):
+        for share in _SHARES:
             alike = (1 - share) * np.eye(len(at_s)) + share * np.exp(-apart_s / memory_s)
             likelihood, noise = _restricted_likelihood(alike, model, misses)
             likelihoods.append(likelihood)

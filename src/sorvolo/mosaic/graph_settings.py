@@ -4,30 +4,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-
-@dataclass(frozen=True)
-class FlightPriors:
-    """What is believed of every flight's calibration and telemetry before its pictures are looked at, one sigma."""
-
-    calibrated: float = 0.005  # relative: a focal length known so well is held
-    radial: float = 0.03  # of a lens that nobody calibrated
-    free_m: float = 1e4  # a zero of heights that nothing is known of
-    gps_offset_m: float = 5.0  # of a receiver, the same all flight
-    tilt_offset_deg: float = 2.0  # a gimbal's zero, or a camera's mount
-    heading_offset_deg: float = 5.0  # a drone's compass beside its motors
+PRIOR_CALIBRATED = 0.005  # relative: a focal length known so well is held
+PRIOR_RADIAL = 0.03  # of a lens that nobody calibrated
+PRIOR_FREE_M = 1e4  # a zero of heights that nothing is known of
+PRIOR_GPS_OFFSET_M = 5.0  # of a receiver, the same all flight
+PRIOR_TILT_OFFSET_DEG = 2.0  # a gimbal's zero, or a camera's mount
+PRIOR_HEADING_OFFSET_DEG = 5.0  # a drone's compass beside its motors
 
 
-@dataclass(frozen=True)
-class SharedOffsetSettings:
-    """When an offset that all frames share is real, and how close to zero one is held that is not."""
-
-    altitude_m: float = 0.1
-    tilt_rad: float = 0.002
-    heading_rad: float = 0.003
-    least_sigmas: float = 2.0  # of its own, without the prior: less is noise
-    widest_sigma: float = (
-        100.0  # of the prior, m or rad: a wider one is no belief that a flight could confirm
-    )
+OFFSET_ALTITUDE_M = 0.1
+OFFSET_TILT_RAD = 0.002
+OFFSET_HEADING_RAD = 0.003
+OFFSET_LEAST_SIGMAS = 2.0  # of its own, without the prior: less is noise
+OFFSET_WIDEST_SIGMA = (
+    100.0  # of the prior, m or rad: a wider one is no belief that a flight could confirm
+)
 
 
 PAIRS_PER_LINK = 40  # matches that stand for a link, spread over it
@@ -59,7 +50,6 @@ class PoseGraphSettings:
         0.0  # of gimbal or mount against the vertical, the same all flight
     )
     heading_offset_sigma_deg: float = 0.0  # of the compass, the same all flight
-    offsets: SharedOffsetSettings = SharedOffsetSettings()
 
     @classmethod
     def of_flight(
@@ -68,24 +58,23 @@ class PoseGraphSettings:
         altitude_offset_sigma_m: float | None,
         *,
         joins_map: bool,
-        priors: FlightPriors = FlightPriors(),
     ) -> "PoseGraphSettings":
         """Choose free parameters from the uncertainty of focal length, `focal_sigma` (relative), and of the zero of
         heights, `altitude_offset_sigma_m` (infinite: unknown; None: no telemetry). `joins_map`: a known map fixes
         where the flight lies.
         """
-        calibrated = focal_sigma <= priors.calibrated
+        calibrated = focal_sigma <= PRIOR_CALIBRATED
         has_telemetry = altitude_offset_sigma_m is not None
         height_known = altitude_offset_sigma_m is not None and bool(
             np.isfinite(altitude_offset_sigma_m)
         )
         return cls(
             focal_sigma=0.0 if calibrated or not height_known else focal_sigma,
-            radial_sigma=0.0 if calibrated else priors.radial,
-            altitude_offset_sigma_m=_altitude_prior_m(altitude_offset_sigma_m, priors.free_m),
-            gps_offset_sigma_m=priors.gps_offset_m if joins_map else 0.0,
-            tilt_offset_sigma_deg=priors.tilt_offset_deg if has_telemetry else 0.0,
-            heading_offset_sigma_deg=priors.heading_offset_deg if has_telemetry else 0.0,
+            radial_sigma=0.0 if calibrated else PRIOR_RADIAL,
+            altitude_offset_sigma_m=_altitude_prior_m(altitude_offset_sigma_m, PRIOR_FREE_M),
+            gps_offset_sigma_m=PRIOR_GPS_OFFSET_M if joins_map else 0.0,
+            tilt_offset_sigma_deg=PRIOR_TILT_OFFSET_DEG if has_telemetry else 0.0,
+            heading_offset_sigma_deg=PRIOR_HEADING_OFFSET_DEG if has_telemetry else 0.0,
         )
 
 

@@ -37,12 +37,16 @@ from sorvolo.mosaic.graph_rows import (
 )
 from sorvolo.mosaic.graph_settings import (
     INDEPENDENT_PAIRS,
+    OFFSET_ALTITUDE_M,
+    OFFSET_HEADING_RAD,
+    OFFSET_LEAST_SIGMAS,
+    OFFSET_TILT_RAD,
+    OFFSET_WIDEST_SIGMA,
     PAIRS_PER_LINK,
     STRAINED,
     UNEVEN,
     WINDOW,
     PoseGraphSettings,
-    SharedOffsetSettings,
 )
 from sorvolo.mosaic.ground_ties import GroundTies
 from sorvolo.mosaic.normal_equations import Factors
@@ -68,12 +72,10 @@ def shared_sigma(settings: PoseGraphSettings, as_reported: NDArray[np.bool_]) ->
             heading,
         ]
     )
-    return np.where(as_reported, np.minimum(sigma, _held_sigma(settings.offsets)), sigma)
+    return np.where(as_reported, np.minimum(sigma, _held_sigma()), sigma)
 
 
-def unconfirmed(
-    shared: Floats, sigma: Floats, factors: Factors, settings: SharedOffsetSettings
-) -> list[int]:
+def unconfirmed(shared: Floats, sigma: Floats, factors: Factors) -> list[int]:
     """The offsets, as indices of SHARED, that a flight does not show: telemetry is taken as it reports them.
 
     An offset that all frames share (altitude's zero, gimbal, compass) and that the rest of the flight sees at less than
@@ -83,12 +85,12 @@ def unconfirmed(
     variances = shared_variances(factors)
     silent = set()
     for k in (k for group in _GROUPS for k in group):
-        if not 0 < sigma[k] < settings.widest_sigma:
+        if not 0 < sigma[k] < OFFSET_WIDEST_SIGMA:
             continue
         variance = max(float(variances[k]), 1e-30)
         information = 1 / variance - 1 / sigma[k] ** 2  # of the flight alone, without the prior
         estimate = shared[k] / variance / information if information > 0 else 0.0
-        if estimate**2 * max(information, 0.0) <= settings.least_sigmas**2:
+        if estimate**2 * max(information, 0.0) <= OFFSET_LEAST_SIGMAS**2:
             silent.add(k)
     return [k for group in _GROUPS if silent.issuperset(group) for k in group]
 
@@ -100,19 +102,19 @@ def shared_variances(factors: Factors) -> Floats:
     return np.diag(factors.solve(units)[-len(SHARED) :])
 
 
-def _held_sigma(settings: SharedOffsetSettings) -> Floats:
+def _held_sigma() -> Floats:
     """(8,) prior sigma of an offset that is taken as telemetry reports it."""
-    tilt_rad = settings.tilt_rad
+    tilt_rad = OFFSET_TILT_RAD
     return np.array(
         [
             np.inf,
             np.inf,
-            settings.altitude_m,
+            OFFSET_ALTITUDE_M,
             np.inf,
             np.inf,
             tilt_rad,
             tilt_rad,
-            settings.heading_rad,
+            OFFSET_HEADING_RAD,
         ]
     )
 
@@ -310,7 +312,7 @@ class PoseGraph:
         moved = self.settle()
         sigma = shared_sigma(self._settings, self._as_reported)
         factors = self._solve(self._own(), shared=True, iterations=0).equations.factorised()
-        self._as_reported[unconfirmed(self._shared, sigma, factors, self._settings.offsets)] = True
+        self._as_reported[unconfirmed(self._shared, sigma, factors)] = True
         return moved | self.settle()
 
     def report(self) -> GraphReport:
