@@ -67,8 +67,8 @@ def commit(folder: Path, flight: str, found: ObjectSearch | None) -> None:
 
 
 def features(path: Path) -> dict[str, dict[str, object]]:
-    """The properties by id."""
-    return {each["id"]: each["properties"] for each in json.loads(path.read_text())["features"]}
+    """The properties by the object's own id; a site's list names its findings."""
+    return {each["properties"]["object"]: each["properties"] for each in json.loads(path.read_text())["features"]}
 
 
 @pytest.mark.usefixtures("kind")
@@ -109,6 +109,7 @@ def test_a_later_flight_replaces_what_it_looked_at(tmp_path: Path) -> None:
         "a",
         search((thing("a-o1", 3.0, 4.0), thing("a-o2", 9.0, -2.0), thing("a-o3", -30.0, 0.0))),
     )
+    first_id = features(tmp_path / "objects.geojson")["a-o1"]["id"]
     later = thing(
         "b-o1", 3.3, 4.1, first_seen_ns=1_700_090_000 * 10**9, last_seen_ns=1_700_090_009 * 10**9
     )
@@ -118,6 +119,7 @@ def test_a_later_flight_replaces_what_it_looked_at(tmp_path: Path) -> None:
     assert site["b-o1"]["flights"] == ["a", "b"]
     assert site["b-o1"]["first_seen"] == "2023-11-14T22:13:20.000000Z"
     assert features(tmp_path / "flights/b/objects.geojson")["b-o1"]["flights"] == ["b"]
+    assert site["b-o1"]["id"] == first_id, "a later flight leaves a finding's id as it is"
     with Archive.open(tmp_path, write=False) as archive:
         assert [each.thing.id for each in archive.newest_objects({"a"})] == ["a-o1", "a-o2", "a-o3"]
         assert [each.flight_id for each in archive.searches()] == ["a", "b"]

@@ -11,8 +11,11 @@ from sorvolo.geometry.arrays import Floats, Mask, PointsM, frozen
 from sorvolo.survey.mosaic import PlacedFrame
 
 _LOOKS = 2  # frames that must show a place before what was not found there is not there
-_BESIDE = 0.4  # of its own length, something may lie from where it was found on another date ...
-_BESIDE_M = 0.5  # ... and this much more: a person who turned
+REACH_OF_LENGTH = 0.4
+"""Of its own length, something may lie from where another mission found it ..."""
+
+REACH_M = 0.5
+"""... and this much more: a person who turned."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +69,8 @@ class MapObject:
         if self.moving or other.moving:
             return False
         reach_m = (
-            _BESIDE * float(np.nan_to_num(self.length_m))
-            + _BESIDE_M
+            REACH_OF_LENGTH * float(np.nan_to_num(self.length_m))
+            + REACH_M
             + 2 * float(np.nan_to_num(sigma_m))
         )
         return bool(np.hypot(*(self.position_m - other.position_m)) <= reach_m)

@@ -183,7 +183,8 @@ def objects_geojson(
 def object_placemarks(objects: Iterable[StoredObject], site: Site) -> list[Placemark]:
     """The objects of a site with a place on Earth as placemarks."""
     placemarks = []
-    for each in (stored.thing for stored in objects):
+    for stored in objects:
+        each = stored.thing
         words = (
             f"score {each.score:.2f} (0 to 1), {each.views} of {each.possible_views} frames, first seen "
             f"{time_words(each.first_seen_ns)}\nposition accuracy {each.sigma_m:.2f} m (1 sigma)"
@@ -191,7 +192,7 @@ def object_placemarks(objects: Iterable[StoredObject], site: Site) -> list[Place
         )
         placemarks.append(
             Placemark(
-                f"{each.id} {each.label}",
+                f"{_identity(stored)} {each.label}",
                 words,
                 *place_deg(each.position_m, site),
                 each.first_seen_ns,
@@ -210,13 +211,21 @@ def object_crops(objects: Iterable[MapObject]) -> dict[str, bytes]:
     return {crop_name(each.id): each.crop_jpeg for each in objects if each.crop_jpeg}
 
 
+def _identity(stored: StoredObject) -> str:
+    """The finding's id where the list is the site's; in a flight's own, the object's."""
+    return stored.thing.id if stored.finding is None else stored.finding.id
+
+
 def _feature_object(stored: StoredObject, site: Site, crops_from_site: bool) -> dict[str, Any]:
     each = stored.thing
     folder = f"flights/{stored.flight_id}/" if crops_from_site else ""
     east_m, north_m = each.position_m
+    found = stored.finding
+    first_ns = each.first_seen_ns if found is None else found.first_ns
     properties: dict[str, Any] = {
-        "id": each.id,
+        "id": _identity(stored),
         "flight": stored.flight_id,
+        "object": each.id,
         "class": each.label,
         "score": rounded(each.score, 4),
     }
@@ -233,9 +242,9 @@ def _feature_object(stored: StoredObject, site: Site, crops_from_site: bool) -> 
         "width_m": rounded(each.width_m, 2),
         "views": each.views,
         "possible_views": each.possible_views,
-        "first_seen": utc_text(each.first_seen_ns),
+        "first_seen": utc_text(first_ns),
         "last_seen": utc_text(each.last_seen_ns),
-        "flights": list(stored.flights),
+        "flights": [stored.flight_id] if found is None else list(found.dates),
         "moving": each.moving,
         "velocity_m_s": [rounded(speed, 3) for speed in each.velocity_m_s] if each.moving else None,
         "class_scores": {name: rounded(share, 4) for name, share in each.class_scores.items()},
@@ -244,7 +253,7 @@ def _feature_object(stored: StoredObject, site: Site, crops_from_site: bool) -> 
     }
     return {
         "type": "Feature",
-        "id": each.id,
+        "id": _identity(stored),
         "geometry": {"type": "Point", "coordinates": coordinates},
         "properties": properties,
     }

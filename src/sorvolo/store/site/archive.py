@@ -15,6 +15,7 @@ from typing import Any, Self, TypeVar
 from sqlalchemy import Connection
 
 from sorvolo.errors import InputError, NotFoundError, SettingsError, SorvoloWarning, StoreError
+from sorvolo.findings.register import MissionSighting, Register
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.paths import AnyPath
@@ -49,6 +50,7 @@ from sorvolo.store.site.files import (
 )
 from sorvolo.store.site.flight_writer import FlightWriter
 from sorvolo.store.site.journal import RunJournal
+from sorvolo.store.site.register import present_objects, site_register
 from sorvolo.store.site.tiles import GrowingTiles, TileBlobs, TileView
 from sorvolo.store.site.upkeep import (
     forget_journals,
@@ -219,17 +221,13 @@ class Archive:
         """Which ground each complete run searched for objects, by flight rank."""
         return self.catalogue_rows(change_records.load_searches)
 
+    def register(self, watched: Sequence[MissionSighting] = ()) -> Register:
+        """What all missions found, each thing one finding; with what watches saw, which the site does not keep."""
+        return self.catalogue_rows(site_register, None, watched)
+
     def newest_objects(self, flights: Collection[str] | None = None) -> list[StoredObject]:
         """What stands on the site by the newest look at each piece of ground; as far as these flights know."""
-        with self.catalogue.reading() as connection:
-            found, searches = (
-                change_records.load_objects(connection),
-                change_records.load_searches(connection),
-            )
-        return change_records.newest_objects(
-            [each for each in found if flights is None or each.flight_id in flights],
-            [each for each in searches if flights is None or each.flight_id in flights],
-        )
+        return present_objects(self.catalogue_rows(site_register, flights), self.objects())
 
     def review(self, change_ids: str | Iterable[str], verdict: Verdict, note: str = "") -> None:
         """Record a person's verdict on one change, or on several; the flights' change files follow.

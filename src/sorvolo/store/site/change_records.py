@@ -2,20 +2,21 @@
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 from sqlalchemy import Connection, Row, delete, func, select
 
 from sorvolo.errors import StoreError
+from sorvolo.findings.register import Finding
 from sorvolo.geometry.arrays import Floats, PointsM, frozen
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.site import schema
 from sorvolo.store.site.catalogue import utc_now
 from sorvolo.store.site.files import checked_name, is_plain_name
 from sorvolo.survey.findings import Change, ChangeFacts, ChangeKind, HeightChange, Verdict
-from sorvolo.survey.map_objects import MapObject, ObjectSearch, SearchedFrames, looked_at
+from sorvolo.survey.map_objects import MapObject, ObjectSearch, SearchedFrames
 
 
 @dataclass(frozen=True)
@@ -285,13 +286,13 @@ class StoredSearch:
 class StoredObject:
     """An object of a flight's complete run; its crop is `objects/<id>.jpg` in the flight's folder.
 
-    `flights` are all that saw it there, in order of rank, this one last.
+    `finding` is what it is a sighting of, None in the list of one flight.
     """
 
     flight_id: str
     rank: int
     thing: MapObject
-    flights: tuple[str, ...]
+    finding: Finding | None = None
 
 
 def add_search(connection: Connection, run_id: int, search: ObjectSearch) -> None:
@@ -337,31 +338,9 @@ def load_objects(connection: Connection, flight_id: str | None = None) -> list[S
     """The objects of complete runs by flight rank and number; of one flight if its id is given."""
     query = schema.of_complete_runs(schema.objects, flight_id).order_by(schema.objects.c.number)
     return [
-        StoredObject(row.flight_id, row.rank, _object_of(row.id, row.properties), (row.flight_id,))
+        StoredObject(row.flight_id, row.rank, _object_of(row.id, row.properties))
         for row in schema.checked_rows(connection, schema.objects, query)
     ]
-
-
-def newest_objects(
-    objects: Sequence[StoredObject], searches: Sequence[StoredSearch]
-) -> list[StoredObject]:
-    """What stands on the site by the newest look at each piece of ground.
-
-    What an earlier flight found where two frames of a later one looked for its class is replaced by what that one
-    found. What stands there still keeps the time at which it was first seen, and names all flights that saw it.
-    """
-    result: list[StoredObject] = []
-    for search in sorted(searches, key=lambda each: each.rank):
-        own = [each for each in objects if each.flight_id == search.flight_id]
-        seen_again = looked_at(
-            np.array([each.thing.position_m for each in result]).reshape(-1, 2),
-            [each.thing.label for each in result],
-            [search.frames],
-        )
-        before = [each for each, again in zip(result, seen_again) if again]
-        result = [each for each, again in zip(result, seen_again) if not again]
-        result += [_since(each, before) for each in own]
-    return result
 
 
 def is_searched(connection: Connection, run_id: int) -> bool:
@@ -376,18 +355,6 @@ def _frames_of(outlines_m: Any, searched_for: Any) -> SearchedFrames:
     return SearchedFrames(
         outlines_m, {str(name): np.array(rows, bool) for name, rows in searched_for.items()}
     )
-
-
-def _since(found: StoredObject, before: Sequence[StoredObject]) -> StoredObject:
-    """The object with the time since which it has stood there, where an earlier flight found the same."""
-    thing = found.thing
-    for each in before:
-        other = each.thing
-        sigma_m = float(np.hypot(thing.sigma_m, other.sigma_m))
-        if other.label == thing.label and thing.stands_where(other, sigma_m):
-            kept = replace(thing, first_seen_ns=min(thing.first_seen_ns, other.first_seen_ns))
-            return replace(found, thing=kept, flights=(*each.flights, found.flight_id))
-    return found
 
 
 def _object_of(object_id: str, values: dict[str, Any]) -> MapObject:

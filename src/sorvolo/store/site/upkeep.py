@@ -71,7 +71,7 @@ def repair(files: "Archive") -> None:
         searches = files.catalogue_rows(change_records.load_searches)
         if owed or bool(searches) != features_path(files.folder, OBJECTS).is_file():
             # the newest of each place; none where no flight was ever searched
-            newest_of_each = change_records.newest_objects(files.objects(), searches)
+            newest_of_each = files.newest_objects()
             with files.replacing(*(f"{OBJECTS}{ending}" for ending in LIST_ENDINGS)):
                 _write_objects(files, files.folder, newest_of_each if searches else None)
         for written in waiting:

@@ -1,0 +1,1 @@
+"""Findings: one thing on the ground is one finding, from every mission and over time."""

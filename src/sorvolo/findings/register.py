@@ -1,0 +1,410 @@
+"""The register: what missions saw of things on the ground, put together to one finding a thing."""
+
+import hashlib
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from functools import cached_property
+from itertools import groupby, takewhile
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
+
+from sorvolo.geometry.arrays import Floats, PointsM, Rows, frozen
+from sorvolo.survey.map_objects import REACH_M, REACH_OF_LENGTH, SearchedFrames, looked_at
+
+_MOST_REACH_M = 8.0  # further apart are two things, however badly they are placed
+_MOST_WALK_M = 40.0  # of what moves, from its last place by one mission to that by another
+_WALKS_M_S = (
+    2.0  # by so much what moves may be off for each second between two missions' last sight of it
+)
+_LIKE_SIZE = 2.5  # lengths further apart than this ratio are two things, where their classes differ
+_LIKE_CLASS = 0.1  # classes' shares that agree less are two classes
+_FAR = 1e3  # the cost of a pair that cannot be one thing: more than all that can
+
+
+class Origin(StrEnum):
+    """How a thing came to be known."""
+
+    DETECTED = "detected"
+    CHANGED = "changed"
+    MARKED = "marked"
+
+
+class Presence(StrEnum):
+    """What a date's flight says of a thing."""
+
+    SEEN = "seen"
+    GONE = "gone"  # looked for and not found
+    NOT_LOOKED = "not looked"
+
+
+@dataclass(frozen=True, eq=False)
+class MissionSighting:
+    """One thing as one mission saw it, in all of the mission's frames.
+
+    `date` is the flight's name and `order` its rank among the site's; several missions may read one flight. `id` is the
+    mission's own. `position_m` (2,) east, north in the site frame, of what moves where it was at `last_ns`. `sigma_m`
+    is per axis. `class_scores` gives each class's share. `gone` is the later date whose comparison saw that it had
+    left, "" where none did.
+    """
+
+    date: str
+    order: float
+    mission: str
+    id: str
+    origin: Origin
+    label: str
+    score: float
+    position_m: Floats
+    sigma_m: float
+    length_m: float
+    first_ns: int
+    last_ns: int
+    moving: bool = False
+    velocity_m_s: tuple[float, float] = (0.0, 0.0)
+    class_scores: Mapping[str, float] = field(default_factory=dict)
+    gone: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "position_m", frozen(self.position_m))
+
+
+@dataclass(frozen=True)
+class Look:
+    """The frames of a date that a detector searched."""
+
+    date: str
+    order: float
+    frames: SearchedFrames
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """One thing on the ground, by all its sightings in order of date.
+
+    `id` follows from the first sighting's content. `gone` is the first date that looked there and did not find it, ""
+    where none did. `position_m` (2,) and `sigma_m` are those of the newest date that saw it. `class_sums` are the
+    scores by class, summed over all sightings.
+    """
+
+    id: str
+    sightings: tuple[MissionSighting, ...]
+    position_m: Floats
+    sigma_m: float
+    class_sums: Mapping[str, float]
+    gone: str = ""
+
+    @property
+    def class_scores(self) -> dict[str, float]:
+        """Each class's share over all sightings, the likeliest first."""
+        return _shares(self.class_sums)
+
+    @property
+    def label(self) -> str:
+        """The likeliest class."""
+        return next(iter(self.class_scores))
+
+    @property
+    def newest(self) -> MissionSighting:
+        """The surest sighting of the newest date that saw it, a detector's own before a change's."""
+        return max(
+            _of_last_date(self.sightings),
+            key=lambda each: (each.origin is Origin.DETECTED, each.score, each.mission, each.id),
+        )
+
+    @cached_property
+    def dates(self) -> tuple[str, ...]:
+        """The dates that saw it, in order."""
+        return tuple(dict.fromkeys(each.date for each in self.sightings))
+
+    @property
+    def first_ns(self) -> int:
+        """When it was first seen."""
+        return min(each.first_ns for each in self.sightings)
+
+    @property
+    def last_ns(self) -> int:
+        """When it was last seen."""
+        return max(each.last_ns for each in self.sightings)
+
+    def presence(self, date: str) -> Presence:
+        """What a date says of it. Absence needs a look: no mission's silence is one."""
+        if date in self.dates:
+            return Presence.SEEN
+        return Presence.GONE if date == self.gone else Presence.NOT_LOOKED
+
+
+@dataclass(frozen=True, eq=False)
+class Register:
+    """All findings of a site, the missions that they are of, and the looks that ended some of them."""
+
+    findings: tuple[Finding, ...] = ()
+    looks: tuple[Look, ...] = ()
+    missions: frozenset[str] = frozenset()
+
+    @cached_property
+    def places_m(self) -> PointsM:
+        """(N, 2) where the findings are, site metres."""
+        flat = [value for each in self.findings for value in each.position_m]
+        return frozen(np.reshape(flat, (-1, 2)))
+
+    @cached_property
+    def last_order(self) -> float:
+        """The rank of the newest date that is known; -1 for none."""
+        sightings = (each.sightings[-1].order for each in self.findings)
+        return max((-1, *sightings, *(each.order for each in self.looks)))
+
+    @property
+    def present(self) -> list[Finding]:
+        """What is there by the newest look at each place."""
+        return [each for each in self.findings if not each.gone]
+
+    def present_at(self, date: str) -> list[Finding]:
+        """What a date's missions saw."""
+        return [each for each in self.findings if each.presence(date) is Presence.SEEN]
+
+    def without(self, missions: Iterable[str], dates: Iterable[str] = ()) -> "Register":
+        """The register as if these missions, and all of these dates, had never been."""
+        missions, dates = set(missions), set(dates)
+        kept = [
+            each
+            for found in self.findings
+            for each in found.sightings
+            if each.mission not in missions and each.date not in dates
+        ]
+        return associate(kept, Register(), [each for each in self.looks if each.date not in dates])
+
+
+def associate(
+    sightings: Sequence[MissionSighting], register: Register, looks: Sequence[Look] = ()
+) -> Register:
+    """The register with what missions saw added, each thing one finding; the same whatever the missions' order.
+
+    A mission that the register knows is replaced. Dates are taken in order of time, and a date's missions by name:
+    where the new ones are not the newest, what is known is put together again. Two sightings of one mission are never
+    one finding. What a date looked at and did not find is gone; the next thing there is another finding.
+    """
+    steps: list[MissionSighting | Look] = [*sightings, *looks]
+    orders = [each.order for each in steps]
+    missions = register.missions | {each.mission for each in sightings}
+    again = {each.mission for each in sightings} & register.missions
+    if register.findings or register.looks:
+        if again or min(orders, default=register.last_order + 1) <= register.last_order:
+            replaced = {each.date for each in looks}
+            kept = [
+                each
+                for found in register.findings
+                for each in found.sightings
+                if each.mission not in again
+            ]
+            old = [each for each in register.looks if each.date not in replaced]
+            return associate([*kept, *sightings], Register(), [*old, *looks])
+    working = _Working(register, sightings)
+    for date, of_date in groupby(sorted(steps, key=_order), key=lambda each: each.date):
+        taken = list(of_date)
+        seen = [each for each in taken if isinstance(each, MissionSighting)]
+        for _, mission in groupby(seen, key=lambda each: each.mission):
+            working.take(list(mission))
+        working.end(date, [each.frames for each in taken if isinstance(each, Look)])
+    return Register(working.findings(), (*register.looks, *looks), missions)
+
+
+def _order(each: MissionSighting | Look) -> tuple[float, str, str, int, str]:
+    if isinstance(each, Look):
+        return each.order, each.date, "", -1, ""
+    return each.order, each.date, each.mission, each.first_ns, each.id
+
+
+class _Thing:
+    """A finding while missions are added."""
+
+    def __init__(self, found: Finding) -> None:
+        self.id, self.gone = found.id, found.gone
+        self.sightings = list(found.sightings)
+        self.of_date = _of_last_date(found.sightings)
+        self.sums = dict(found.class_sums)
+        self.place_m, self.sigma_m = found.position_m, found.sigma_m
+
+    def add(self, sighting: MissionSighting) -> None:
+        """Take a sighting; of a date's places, the mean by their errors counts."""
+        if self.of_date and self.of_date[0].date != sighting.date:
+            self.of_date = []
+        self.of_date.append(sighting)
+        self.sightings.append(sighting)
+        for name, share in _odds(sighting).items():
+            self.sums[name] = self.sums.get(name, 0.0) + share * sighting.score
+        weights = [max(_known(each.sigma_m, 10.0), 0.01) ** -2 for each in self.of_date]
+        total = sum(weights)
+        self.sigma_m = total**-0.5
+        places_m = [each.position_m for each in self.of_date]
+        if len(places_m) == 1 or sighting.moving:
+            self.place_m = sighting.position_m
+        else:
+            self.place_m = np.array(weights) @ np.array(places_m) / total
+
+    @property
+    def left(self) -> str:
+        """The date whose comparison saw that it had left; "" where it was seen since."""
+        return next((each.gone for each in self.of_date if each.gone), "")
+
+    def finding(self) -> Finding:
+        return Finding(
+            self.id,
+            tuple(self.sightings),
+            frozen(self.place_m),
+            self.sigma_m,
+            self.sums,
+            self.gone or self.left,
+        )
+
+
+class _Working:
+    """The findings while missions are added, one after another, with the places of those that still stand."""
+
+    def __init__(self, register: Register, sightings: Sequence[MissionSighting]) -> None:
+        self._known = register.findings
+        self._count = len(self._known)
+        self._ids = {each.id for each in self._known}
+        self._things: dict[int, _Thing] = {}
+        self._places_m = np.concatenate([register.places_m, np.zeros((len(sightings), 2))])
+        self._stands = np.zeros(len(self._places_m), bool)
+        self._stands[: self._count] = [not each.gone for each in self._known]
+        self._seen: set[int] = set()  # on the date that is added
+
+    def findings(self) -> tuple[Finding, ...]:
+        """All findings, those that were not touched as they were."""
+        result = list(self._known)
+        for number, thing in sorted(self._things.items()):
+            result[number : number + 1] = [thing.finding()]
+        return tuple(result)
+
+    def take(self, mission: Sequence[MissionSighting]) -> None:
+        """Add all sightings of one mission, each to a finding of its own."""
+        places_m = np.array([each.position_m for each in mission])
+        radii_m = [_MOST_WALK_M if each.moving else _MOST_REACH_M for each in mission]
+        near = self._standing_near(places_m)
+        pairs: dict[tuple[int, int], float] = {}
+        if len(near):
+            around = cKDTree(self._places_m[near]).query_ball_point(places_m, radii_m)
+            for row, columns in enumerate(around):
+                for number in near[columns].tolist():
+                    cost = _cost(mission[row], self._thing(number))
+                    if cost is not None:
+                        pairs[row, number] = cost
+        joined = _one_to_one(pairs)
+        for row, sighting in enumerate(mission):
+            if (number := joined.get(row)) is None:
+                number, self._count = self._count, self._count + 1
+                empty = Finding(self._id(sighting), (), sighting.position_m, sighting.sigma_m, {})
+                self._things[number] = _Thing(empty)
+                self._stands[number] = True
+            self._seen.add(number)
+            thing = self._things[number]
+            thing.add(sighting)
+            self._places_m[number] = thing.place_m
+
+    def end(self, date: str, searches: Sequence[SearchedFrames]) -> None:
+        """Conclude a date: what it looked at and did not see is gone, and what had left before it."""
+        left = [
+            number for number, thing in self._things.items() if self._stands[number] and thing.left
+        ]
+        for number in set(left) - self._seen:
+            self._things[number].gone = self._things[number].left
+            self._stands[number] = False
+        if outlines_m := [each.outlines_m.reshape(-1, 2) for each in searches]:
+            near = self._standing_near(np.concatenate(outlines_m))
+            unseen = [number for number in near.tolist() if number not in self._seen]
+            things = [self._thing(number) for number in unseen]
+            labels = [next(iter(_shares(each.sums))) for each in things]
+            is_gone = looked_at(self._places_m[unseen], labels, searches)
+            self._stands[unseen] = ~is_gone
+            for thing in (things[row] for row in np.flatnonzero(is_gone)):
+                thing.gone = date
+        self._seen.clear()
+
+    def _standing_near(self, places_m: PointsM) -> Rows:
+        """Numbers of what stands within reach of the box around places (N, 2)."""
+        if not len(places_m):
+            return np.zeros(0, np.int64)
+        low_m, high_m = places_m.min(axis=0) - _MOST_WALK_M, places_m.max(axis=0) + _MOST_WALK_M
+        own_m = self._places_m[: self._count]
+        is_near = self._stands[: self._count] & ((own_m >= low_m) & (own_m <= high_m)).all(axis=1)
+        return np.flatnonzero(is_near)
+
+    def _thing(self, number: int) -> _Thing:
+        if number not in self._things:
+            self._things[number] = _Thing(self._known[number])
+        return self._things[number]
+
+    def _id(self, first: MissionSighting) -> str:
+        """By flight, time and place to 0.1 m: the same when the mission is run again, another for another thing."""
+        place = np.round(first.position_m, 1) + 0.0
+        content, attempt = f"{first.date} {first.first_ns} {place[0]:.1f} {place[1]:.1f}", 0
+        while (
+            digest := hashlib.sha256(f"{content} {attempt}".encode()).hexdigest()[:12]
+        ) in self._ids:
+            attempt += 1
+        self._ids.add(digest)
+        return digest
+
+
+def _odds(sighting: MissionSighting) -> Mapping[str, float]:
+    return sighting.class_scores or {sighting.label: 1.0}
+
+
+def _shares(sums: Mapping[str, float]) -> dict[str, float]:
+    total = sum(sums.values()) or 1.0
+    return {name: sums[name] / total for name in sorted(sums, key=lambda each: (-sums[each], each))}
+
+
+def _of_last_date(sightings: Sequence[MissionSighting]) -> list[MissionSighting]:
+    last = [each.date for each in sightings[-1:]]
+    return list(takewhile(lambda each: [each.date] == last, reversed(sightings)))[::-1]
+
+
+def _known(value: float, otherwise: float = 0.0) -> float:
+    return otherwise if math.isnan(value) else value
+
+
+def _cost(sighting: MissionSighting, thing: _Thing) -> float | None:
+    """How far a sighting is from a thing, 0 to 1 of what is allowed, plus how unlike its class; None: not the same."""
+    last = thing.of_date[-1]
+    is_same_date = last.date == sighting.date
+    if is_same_date and any(each.mission == sighting.mission for each in thing.of_date):
+        return None
+    moves = sighting.moving or last.moving
+    if moves and not is_same_date:
+        return None
+    length_m = max(_known(sighting.length_m), _known(last.length_m))
+    sigma_m = math.hypot(_known(sighting.sigma_m), _known(thing.sigma_m))
+    between_s = (sighting.last_ns - last.last_ns) / 1e9 if moves else 0.0
+    reach_m = REACH_OF_LENGTH * length_m + REACH_M + 2 * sigma_m + _WALKS_M_S * abs(between_s)
+    off_m = [
+        float(here) - float(there) - speed * between_s
+        for here, there, speed in zip(sighting.position_m, thing.place_m, last.velocity_m_s)
+    ]
+    apart = math.hypot(*off_m) / min(reach_m, _MOST_REACH_M)
+    if apart > 1:
+        return None
+    odds, own = _odds(sighting), _shares(thing.sums)
+    shared = sum(min(share, own.get(name, 0.0)) for name, share in odds.items())
+    if shared < _LIKE_CLASS:
+        shorter_m, longer_m = sorted((float(sighting.length_m), float(last.length_m)))
+        if not is_same_date or not longer_m <= _LIKE_SIZE * shorter_m:
+            return None
+    return apart + 0.5 * (1 - shared)
+
+
+def _one_to_one(pairs: Mapping[tuple[int, int], float]) -> dict[int, int]:
+    """Each row's finding: as many pairs as can be, and of those choices the nearest."""
+    rows, numbers = (sorted({pair[side] for pair in pairs}) for side in (0, 1))
+    at_row = {row: index for index, row in enumerate(rows)}
+    at_number = {number: index for index, number in enumerate(numbers)}
+    costs = np.full((len(rows), len(numbers)), _FAR)
+    for (row, number), cost in pairs.items():
+        costs[at_row[row], at_number[number]] = cost
+    chosen = zip(*linear_sum_assignment(costs))
+    return {rows[i]: numbers[j] for i, j in chosen if costs[i, j] < _FAR}
