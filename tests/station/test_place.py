@@ -37,7 +37,6 @@ def test_every_flight_that_saw_a_place_is_remembered_in_order(
             "kind": "change",
             "id": "c-1",
             "verdict": "confirmed",
-            "revision": 0,
             "note": "a shed",
         },
     )

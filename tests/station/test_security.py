@@ -115,7 +115,7 @@ def test_behind_a_proxy_its_pages_may_ask(root: Path, host: str) -> None:
         answer = client.post("/api/session", json={"token": token})
         assert answer.status_code == 200 and "Secure" in answer.headers["set-cookie"]
         client.headers["authorization"] = f"Bearer {token}"
-        body = {"kind": "change", "id": "b-1", "verdict": "confirmed", "revision": 0}
+        body = {"kind": "change", "id": "b-1", "verdict": "confirmed"}
         assert client.post("/api/sites/field/reviews", json=body).status_code == 201
         assert refused(client, "/api/events", **dict(client.headers)) == 0
         for origin in (
@@ -236,7 +236,7 @@ def test_connections_that_ask_nothing_keep_nobody_out(root: Path) -> None:
 )
 def test_pages_of_other_sites_change_nothing(client: TestClient, origin: str) -> None:
     """Nor do they open a WebSocket."""
-    body = {"kind": "change", "id": "b-1", "verdict": "confirmed", "revision": 0}
+    body = {"kind": "change", "id": "b-1", "verdict": "confirmed"}
     assert (
         client.post("/api/sites/field/reviews", json=body, headers={"origin": origin}).status_code
         == 403
@@ -330,7 +330,7 @@ def test_roles(root: Path, role: str, allowed: set[str]) -> None:
     client, token = guarded(root, role)
     with client:
         client.headers["authorization"] = f"Bearer {token}"
-        review = {"kind": "change", "id": "b-1", "verdict": "confirmed", "revision": 0}
+        review = {"kind": "change", "id": "b-1", "verdict": "confirmed"}
         statuses = {
             "view": client.get("/api/sites").status_code,
             "review": client.post("/api/sites/field/reviews", json=review).status_code,

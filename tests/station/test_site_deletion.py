@@ -54,7 +54,7 @@ def test_a_site_goes_with_all_that_the_station_keeps_of_it(
     """Its size is stated before; every page hears of it; a new site of its name knows nothing of it."""
     shutil.copytree(made_site, root / "other")
     keep_run(client, "feed", "finished")
-    body = {"kind": "change", "id": "b-1", "verdict": "confirmed", "revision": 0}
+    body = {"kind": "change", "id": "b-1", "verdict": "confirmed"}
     assert client.post(f"{FIELD}/reviews", json=body).status_code == 201
     assert client.put(f"{FIELD}/drawings", json={"revision": 0, "features": []}).status_code == 200
     wait_for(lambda: len(client.get("/api/sites").json()) == 2)

@@ -68,7 +68,10 @@ def commit(folder: Path, flight: str, found: ObjectSearch | None) -> None:
 
 def features(path: Path) -> dict[str, dict[str, object]]:
     """The properties by the object's own id; a site's list names its findings."""
-    return {each["properties"]["object"]: each["properties"] for each in json.loads(path.read_text())["features"]}
+    return {
+        each["properties"]["object"]: each["properties"]
+        for each in json.loads(path.read_text())["features"]
+    }
 
 
 @pytest.mark.usefixtures("kind")

@@ -98,7 +98,8 @@ class Station:
         events, tiles = EventLog(state), WebTiles(shelf)
         uploads = Uploads(settings, events)
         findings = Findings(state, settings.state_folder / RUNS_FOLDER)
-        reviews = Reviews(state, shelf, events, findings)
+        collections = SiteCollections(shelf, findings)
+        reviews = Reviews(state, shelf, events, collections)
         limits = IngestLimits(
             streams=settings.limits.most_streams, free_bytes=round(settings.free_floor_gb * 1e9)
         )
@@ -110,7 +111,7 @@ class Station:
             shelf,
             tiles,
             events,
-            SiteCollections(shelf, findings),
+            collections,
             reviews,
             ingest,
             uploads,

@@ -3,7 +3,7 @@
 import json
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +13,11 @@ from shapely.errors import ShapelyError
 from shapely.geometry import shape
 from shapely.geometry.base import BaseGeometry
 
+from sorvolo.station.found import Feature, Track, found_features, on_earth
 from sorvolo.station.problems import Problem
 from sorvolo.station.sites import SiteShelf
 from sorvolo.station.state import StationState
-from sorvolo.store.exports.change_files import changes_geojson, objects_geojson
+from sorvolo.store.exports.change_files import changes_geojson
 from sorvolo.store.exports.detection_files import CROPS, TRACKS
 from sorvolo.store.exports.ground_files import COVERAGE
 from sorvolo.store.exports.places import longitude_latitude
@@ -31,7 +32,7 @@ TITLES: Mapping[str, str] = {
     "frames": "Frames: what of the ground each shows, and how it was placed",
     "objects": "People, cars and small objects, each once, by the newest look at each place",
     "changes": "Changes between flights",
-    "findings": "What watches found: people, cars and small objects on no map",
+    "findings": "Everything found, each thing once, from all missions and dates; what was seen gone, too",
     "coverage": "Ground that flights saw, and its holes; ground compared, and the rest with its reason",
     "pod": "Probability of detection of the latest measured search",
     "track": "The drone's way, one line a flight",
@@ -48,8 +49,6 @@ _MOST_FLIGHTS = 400  # whose frames are kept by flight: of some ten kilobytes to
 _RESULTS = "results"
 _MOST_TRACKS_BYTES = 64_000_000  # of a watch's tracks; by choice
 _MOST_RUNS = 100  # of a site, the newest
-
-Feature = dict[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,9 +104,9 @@ class Findings:
     def __init__(self, state: StationState, folder: Path) -> None:
         self._state, self._folder = state, folder
         self._lock = threading.Lock()
-        self._kept: dict[str, tuple[int, list[Feature]]] = {}  # by run, with the time of its file
+        self._kept: dict[str, tuple[int, list[Track]]] = {}  # by run, with the time of its file
 
-    def of_site(self, site_id: str) -> list[Feature]:
+    def of_site(self, site_id: str) -> list[Track]:
         """What the watches of a site found that has a place on Earth, those of the newest watch first."""
         rows = self._state.rows(
             "SELECT id FROM runs WHERE site = ? AND mission = 'watch' ORDER BY made_at DESC LIMIT ?",
@@ -118,21 +117,17 @@ class Findings:
     def crop(self, site_id: str, finding_id: str) -> bytes:
         """The picture of a finding, JPEG. Raises Problem (404)."""
         found = next((each for each in self.of_site(site_id) if each["id"] == finding_id), None)
-        name = str((found or {"properties": {}})["properties"].get("crop") or "").removeprefix(
-            f"{CROPS}/"
-        )
+        name = str((found or {}).get("crop") or "").removeprefix(f"{CROPS}/")
         if found is None or not is_plain_name(name):
             raise Problem(
                 404, "no such picture: of a finding that a watch of this site kept one of"
             )
         try:
-            return read_below(
-                self._folder / found["properties"]["run"] / _RESULTS, f"{CROPS}/{name}"
-            )
+            return read_below(self._folder / found["run"] / _RESULTS, f"{CROPS}/{name}")
         except FileNotFoundError as error:
             raise Problem(404, "this picture was not kept") from error
 
-    def _of_run(self, run_id: str) -> list[Feature]:
+    def _of_run(self, run_id: str) -> list[Track]:
         folder = self._folder / run_id / _RESULTS
         try:
             mark = (folder / f"{TRACKS}.geojson").stat().st_mtime_ns
@@ -143,7 +138,7 @@ class Findings:
                 known = (
                     mark,
                     [
-                        _finding(each, run_id)
+                        _track_of(each, run_id)
                         for each in content["features"]
                         if each.get("geometry")
                     ],
@@ -155,28 +150,14 @@ class Findings:
         return known[1]
 
 
-def _finding(track: Feature, run_id: str) -> Feature:
-    """A track as a feature of the site: without the path that it took."""
-    values = {
-        name: each
-        for name, each in track["properties"].items()
-        if name not in ("path", "class_scores")
-    }
-    finding_id = f"{run_id}:{values['id']}"
-    values |= {
-        "id": finding_id,
-        "run": run_id,
-        "watched": True,
-        "review_kind": "finding",
-        "flight": None,
-        "datetime": values["first_seen"],
-        "end_datetime": values["last_seen"],
-    }
-    return {
-        "type": "Feature",
-        "id": finding_id,
-        "geometry": track["geometry"],
-        "properties": values,
+def _track_of(feature: Feature, run_id: str) -> Track:
+    """A track by its properties, with its place: without the path that it took."""
+    values = {**feature["properties"], "run": run_id, "lonlat": feature["geometry"]["coordinates"]}
+    for name in ("path", "best_box_px"):
+        values.pop(name, None)
+    return values | {
+        "id": f"{run_id}:{values['id']}",
+        "class_scores": values.get("class_scores") or {},
     }
 
 
@@ -220,11 +201,8 @@ class SiteCollections:
 
     def get(self, site_id: str, name: str) -> Collection:
         """A collection of a site. Raises Problem (404)."""
-        if name == FINDINGS:
-            found = self._findings.of_site(site_id)
-            if not found:
-                self._shelf.folder(site_id)  # raises where there is no such site
-            return Collection.of(found)
+        if name in (FINDINGS, "objects"):
+            return self._found(site_id, name)
         if name not in _MAKERS:
             raise Problem(404, f"no collection {name[:40]!r}; there are {', '.join(TITLES)}")
         archive = self._shelf.open(site_id)
@@ -246,10 +224,27 @@ class SiteCollections:
             self._kept[site_id, name] = _Kept(mark, content, made)
         return made
 
-
-def on_earth(site: Site) -> Site:
-    """The site with places in degrees: a local one's lie around its origin, as the station shows them."""
-    return replace(site, is_local=False)
+    def _found(self, site_id: str, name: str) -> Collection:
+        """The site's register with what its watches saw: all findings, or those that are there by the newest look."""
+        tracks = self._findings.of_site(site_id)
+        try:
+            archive: Archive | None = self._shelf.open(site_id)
+        except Problem:
+            if not tracks:
+                raise
+            archive = None
+        watches = [(each["id"], each["last_seen"], each["lonlat"]) for each in tracks]
+        content = (archive and _content(archive), watches)
+        with self._lock:
+            known = self._kept.get((site_id, name))
+        if known is None or known.content != content:
+            found = found_features(archive if archive and archive.has_site else None, tracks)
+            if name != FINDINGS:
+                found = [each for each in found if not each["properties"]["gone"]]
+            known = _Kept(None, content, Collection.of(found))
+        with self._lock:
+            self._kept[site_id, name] = known
+        return known.collection
 
 
 def _frames(archive: Archive) -> list[Feature]:
@@ -303,13 +298,6 @@ def _track(archive: Archive) -> list[Feature]:
             {"type": "Feature", "id": flight, "geometry": geometry, "properties": values}
         )
     return features
-
-
-def _objects(archive: Archive) -> list[Feature]:
-    made = objects_geojson(
-        archive.newest_objects(), on_earth(archive.site()), crops_from_site=True
-    )["features"]
-    return [_with(each, "object", each["properties"]["class"]) for each in made]
 
 
 def _changes(archive: Archive) -> list[Feature]:
@@ -389,7 +377,6 @@ def _pod(archive: Archive) -> list[Feature]:
 
 _MAKERS: Mapping[str, Callable[[Archive], list[Feature]]] = {
     "frames": _frames,
-    "objects": _objects,
     "changes": _changes,
     "coverage": _coverage,
     "pod": _pod,

@@ -8,8 +8,9 @@ from urllib.parse import quote, urlencode
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import JSONResponse
 
-from sorvolo.station.collections import TITLES, Collection, Feature, SiteCollections
+from sorvolo.station.collections import TITLES, Collection, SiteCollections
 from sorvolo.station.exports import cogs_of, tilejson_address
+from sorvolo.station.found import Feature
 from sorvolo.station.problems import Problem
 from sorvolo.station.reviews import Reviews
 from sorvolo.station.security import needs
@@ -24,7 +25,7 @@ _CONFORMS = [
 ]
 _GEOJSON = "application/geo+json"
 _MOST = 10_000  # features in one answer; by choice
-_REVIEWED = {"objects": "object", "changes": "change", "findings": "finding"}
+_REVIEWED = {"objects": "object", "changes": "change", "findings": "object"}
 Limit = Query(1000, ge=1, le=_MOST, description="Features at most.")
 Offset = Query(0, ge=0, le=10**9)
 
@@ -231,6 +232,7 @@ def _reviewed(features: Sequence[Feature], name: str, site: str, reviews: Review
         values = {
             **each["properties"],
             "review": review and review.verdict,
+            "review_state": review and review.state,
             "revision": review.revision if review else 0,
             "note": review and review.note,
             "reviewer": review and review.who,
@@ -242,10 +244,8 @@ def _reviewed(features: Sequence[Feature], name: str, site: str, reviews: Review
 
 
 def _crops(site: str, kind: str, feature: Feature) -> list[str]:
-    has_none = kind == "finding" and not feature["properties"].get(
-        "crop"
-    )  # not every watch keeps pictures
-    return [] if has_none else crop_addresses(site, kind, str(feature["id"]))
+    shown = feature["properties"].get("crop_of", (kind, str(feature["id"])))
+    return crop_addresses(site, *shown) if shown else []  # not every watch keeps pictures
 
 
 def crop_addresses(site: str, kind: str, feature_id: str) -> list[str]:

@@ -15,8 +15,9 @@ from sorvolo.errors import StoreError
 from sorvolo.geometry.arrays import PointsM
 from sorvolo.geometry.units import M_PER_DEG_LATITUDE
 from sorvolo.missions.archive.index import update_site
-from sorvolo.station.collections import Collection, Feature, SiteCollections
+from sorvolo.station.collections import Collection, SiteCollections
 from sorvolo.station.crops import FlightVideos
+from sorvolo.station.found import Feature
 from sorvolo.station.problems import Problem
 from sorvolo.station.reviews import Review, Reviews
 from sorvolo.station.security import needs
@@ -259,7 +260,13 @@ def _touching(collection: Collection, ring: Any) -> list[Feature]:
 def _review(review: Review | None) -> dict[str, Any] | None:
     if review is None:
         return None
-    return {"verdict": review.verdict, "note": review.note, "who": review.who, "at": review.at}
+    return {
+        "verdict": review.verdict,
+        "note": review.note,
+        "state": review.state,
+        "who": review.who,
+        "at": review.at,
+    }
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,11 +1,11 @@
-"""Verdicts on objects, changes and findings: each kept with who gave it and when; none is lost to another's."""
+"""Votes on objects and changes: each kept with who gave it and when; none is lost to another's."""
 
 import hashlib
 import json
 import sqlite3
 import threading
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from sorvolo.errors import SorvoloError, StoreError
 from sorvolo.missions.site.review import review_changes, withdraw_reviews
-from sorvolo.station.collections import Findings
+from sorvolo.station.collections import FINDINGS, SiteCollections
 from sorvolo.station.events import EventLog, NewEvent
 from sorvolo.station.problems import Problem
 from sorvolo.station.security import needs
@@ -27,92 +27,113 @@ from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.survey.findings import Verdict
 
 NO_VERDICT = "none"
-_OF_WATCHES = "watches"  # in place of when the site was made
-_ELSEWHERE = "sorvolo review"  # who gave a verdict by the command line
+_OF_WATCHES = "watches"  # in place of when the site was made, where there is none yet
+_ELSEWHERE = "sorvolo review"  # who votes by the command line
+_COLUMNS = "kind, id, revision, verdict, label, note, who, at"
 
 
 class ReviewWish(BaseModel):
-    """A verdict on an object, a change or a finding; `revision` is that of the verdict it was made upon, 0 for none."""
+    """A person's vote on an object or a change; "none" withdraws one's own. `label` is the class that it is held for."""
 
-    kind: Literal["object", "change", "finding"]
+    kind: Literal["object", "change"]
     id: str = Field(min_length=1, max_length=400)
-    verdict: Literal["confirmed", "rejected", "none"]
+    verdict: Literal["confirmed", "rejected", "unsure", "none"]
+    label: str = Field("", max_length=100)
     note: str = Field("", max_length=2000)
-    revision: int = Field(ge=0, le=2**62)
 
 
 @dataclass(frozen=True)
 class Review:
-    """A person's verdict on one thing; each has the next revision. Times are RFC 3339 UTC."""
+    """A vote on one thing, the next revision each; or how all votes stand, with who voted last. Times are RFC 3339 UTC.
+
+    `state` is "single", "agreed" or "disputed"; a disputed verdict is "disputed".
+    """
 
     kind: str
     id: str
     revision: int
     verdict: str
+    label: str
     note: str
     who: str
     at: str
+    state: str = "single"
 
 
 class Reviews:
-    """The verdicts on all sites' objects and changes. Threads may share it.
+    """The votes on all sites' objects and changes: only ever added. Threads may share it.
 
-    Those on changes also go into the site, where missions look: at once, or when the mission that is writing into it is
-    done (`settle`).
+    How those on changes stand also goes into the site, where missions look: at once, or when the mission that is
+    writing into it is done (`settle`).
     """
 
     def __init__(
-        self, state: StationState, shelf: SiteShelf, events: EventLog, findings: Findings
+        self, state: StationState, shelf: SiteShelf, events: EventLog, collections: SiteCollections
     ) -> None:
-        self._state, self._shelf, self._events, self._findings = state, shelf, events, findings
+        self._state, self._shelf, self._events = state, shelf, events
+        self._collections = collections
         self._settling = threading.Lock()
         self._unsettled: set[str] = set()
-        self._known: set[tuple[str, str]] = set()
 
     def current(self, site_id: str, kind: str) -> dict[str, Review]:
-        """The newest verdict on each thing of a kind, by id; those given by the command line included."""
-        rows = self._state.rows(
-            "SELECT kind, id, MAX(revision) AS revision, verdict, note, who, at FROM reviews "
-            "WHERE site = ? AND made_utc = ? AND kind = ? GROUP BY id",
-            (*self._key(site_id, kind), kind),
-        )
-        found = {row["id"]: Review(**dict(row)) for row in rows}
+        """How the votes on each thing of a kind stand, by id; those of the command line included.
+
+        An object is found under its finding's id and under those of the finding's sightings.
+        """
+        votes: dict[str, list[Review]] = {}
+        ids = self._ids(site_id, kind) if kind == "object" else {}
+        for row in reversed(self.history(site_id, kind)):
+            votes.setdefault(ids.get(row.id, row.id), []).append(row)
+        found = {thing: _standing(thing, given) for thing, given in votes.items()}
         if kind == "change":
-            found |= self._from_site(site_id, found)
-        return found
+            elsewhere = self._from_site(site_id, found)
+            return found | {
+                thing: _standing(thing, [*votes.get(thing, []), vote])
+                for thing, vote in elsewhere.items()
+            }
+        return found | {each: found[thing] for each, thing in ids.items() if thing in found}
 
     def history(self, site_id: str, kind: str = "", thing_id: str = "") -> list[Review]:
-        """All verdicts of a site, newest first; of one thing."""
+        """All votes of a site, newest first; of one thing."""
         rows = self._state.rows(
-            "SELECT kind, id, revision, verdict, note, who, at FROM reviews "
+            f"SELECT {_COLUMNS} FROM reviews "
             "WHERE site = ? AND made_utc IN (?, ?) AND (? = '' OR kind = ?) AND (? = '' OR id = ?) "
             "ORDER BY number DESC LIMIT 5000",
-            (*self._key(site_id, kind), _OF_WATCHES, kind, kind, thing_id, thing_id),
+            (*self._key(site_id), _OF_WATCHES, kind, kind, thing_id, thing_id),
         )
         return [Review(**dict(row)) for row in rows]
 
     def give(self, site_id: str, wish: ReviewWish, who: str) -> Review:
-        """Keep a verdict. Raises Problem: 404 for an unknown thing, 409 where somebody judged it since."""
-        self._demand_thing(site_id, wish.kind, wish.id)
-        now = self.current(site_id, wish.kind).get(wish.id)
-        revision = now.revision if now is not None else 0
-        if wish.revision != revision:
-            raise self._conflict(wish, now)
-        made = Review(wish.kind, wish.id, revision + 1, wish.verdict, wish.note, who, utc_now())
-        event, key = (
-            NewEvent("review.changed", asdict(made), site_id),
-            self._key(site_id, wish.kind),
+        """Add a vote; how all stand then. Raises Problem (404) for an unknown thing."""
+        thing = self._ids(site_id, wish.kind).get(wish.id)
+        if thing is None:
+            raise Problem(404, f"the site has no {wish.kind} {wish.id[:80]!r}; load the list again")
+        votes = [each for each in self.history(site_id, wish.kind) if each.id == thing][::-1]
+        if wish.kind == "change":
+            votes += filter(None, [self._from_site(site_id, _by_id(votes)).get(thing)])
+        made = Review(
+            wish.kind,
+            thing,
+            votes[-1].revision + 1 if votes else 1,
+            wish.verdict,
+            wish.label,
+            wish.note,
+            who,
+            utc_now(),
         )
+        standing = _standing(thing, [*votes, made])
+        key = self._key(site_id)
+        event = NewEvent("review.changed", asdict(standing), site_id)
         try:
             with self._events.appending([event]) as connection:
-                if now is not None and now.who == _ELSEWHERE:
-                    _keep(connection, key, now)
-                _keep(connection, key, made)
-        except sqlite3.IntegrityError as error:  # another request was quicker
-            raise self._conflict(wish, self.current(site_id, wish.kind).get(wish.id)) from error
+                for vote in (*votes[-1:], made):
+                    if vote is made or vote.who == _ELSEWHERE:
+                        _keep(connection, key, vote)
+        except sqlite3.IntegrityError:  # another vote was quicker: this one is the next
+            return self.give(site_id, wish, who)
         if wish.kind == "change":
             self.settle(site_id)
-        return made
+        return standing
 
     def forget(self, site_id: str) -> None:
         """Drop all verdicts of a site that was deleted."""
@@ -151,26 +172,18 @@ class Reviews:
             except (Problem, SorvoloError):  # gone meanwhile, or damaged
                 self._unsettled.discard(site_id)
 
-    def _key(self, site_id: str, kind: str) -> tuple[str, str]:
-        """Which site a verdict is of: a new site may have the name, and the ids, of one that was deleted.
-
-        Findings have the ids of their runs, which no others have, and a watch needs no site.
-        Verdicts of a station of format 1 become those of the site that was there when they were given.
-        """
-        if kind == "finding":
+    def _key(self, site_id: str) -> tuple[str, str]:
+        """Which site a vote is of: a new site may have the name, and the ids, of one that was deleted. A watch needs no
+        site."""
+        try:
+            return site_id, self._shelf.open(site_id).created_utc or _OF_WATCHES
+        except Problem:
+            if not self._ids(site_id, "object"):
+                raise
             return site_id, _OF_WATCHES
-        made_utc = self._shelf.open(site_id).created_utc
-        if made_utc and (site_id, made_utc) not in self._known:
-            with self._state.changing() as connection:
-                connection.execute(
-                    "UPDATE reviews SET made_utc = ? WHERE site = ? AND made_utc = '' AND at >= ?",
-                    (made_utc, site_id, made_utc),
-                )
-            self._known.add((site_id, made_utc))
-        return site_id, made_utc
 
     def _from_site(self, site_id: str, known: Mapping[str, Review]) -> dict[str, Review]:
-        """Verdicts that the command line gave after ours."""
+        """Votes that the command line gave after ours."""
         found = {}
         archive = self._shelf.open(site_id)
         at_utc = {each.change_id: each.at_utc for each in archive.reviews()}
@@ -182,35 +195,37 @@ class Reviews:
                 at > ours.at and (change.verdict, change.note) != (_as_stored(ours), ours.note)
             ):
                 revision = 1 if ours is None else ours.revision + 1
+                word = change.verdict.value
                 found[change.id] = Review(
-                    "change", change.id, revision, change.verdict.value, change.note, _ELSEWHERE, at
+                    "change", change.id, revision, word, "", change.note, _ELSEWHERE, at
                 )
         return found
 
-    def _demand_thing(self, site_id: str, kind: str, thing_id: str) -> None:
-        if thing_id not in self._ids(site_id, kind):
-            raise Problem(404, f"the site has no {kind} {thing_id[:80]!r}; load the list again")
-
-    def _ids(self, site_id: str, kind: str) -> list[str]:
-        if kind == "finding":
-            return [str(each["id"]) for each in self._findings.of_site(site_id)]
-        archive = self._shelf.open(site_id)
+    def _ids(self, site_id: str, kind: str) -> dict[str, str]:
+        """The ids under which things can be named, with the one under which votes are kept."""
         if kind == "change":
-            return [each.id for each in archive.changes()]
-        return [each.thing.id for each in archive.objects()]
+            return {each.id: each.id for each in self._shelf.open(site_id).changes()}
+        found = self._collections.get(site_id, FINDINGS).features
+        aliases = {
+            str(alias): str(each["id"])
+            for each in found
+            for alias in each["properties"]["sightings"]
+        }
+        return aliases | {str(each["id"]): str(each["id"]) for each in found}
 
-    @staticmethod
-    def _conflict(wish: ReviewWish, now: Review | None) -> Problem:
-        newer = (
-            f"{now.who} gave the verdict {now.verdict}"
-            if now is not None
-            else "the verdict was withdrawn"
-        )
-        return Problem(
-            409,
-            f"{newer} meanwhile; look at it, and give your verdict upon revision {now.revision if now else 0}",
-            current=None if now is None else asdict(now),
-        )
+
+def _standing(thing: str, votes: Sequence[Review]) -> Review:
+    """How votes, the oldest first, stand: each person's last one counts."""
+    last = votes[-1]
+    of_each = {each.who: each.verdict for each in votes}
+    counted = [each for each in of_each.values() if each != NO_VERDICT]
+    verdict = counted[0] if len(set(counted)) == 1 else "disputed" if counted else NO_VERDICT
+    state = "disputed" if verdict == "disputed" else "agreed" if len(counted) > 1 else "single"
+    return replace(last, id=thing, verdict=verdict, state=state)
+
+
+def _by_id(votes: Sequence[Review]) -> dict[str, Review]:
+    return {votes[-1].id: _standing(votes[-1].id, votes)} if votes else {}
 
 
 def review_routes(reviews: Reviews, shelf: SiteShelf) -> APIRouter:
@@ -220,43 +235,36 @@ def review_routes(reviews: Reviews, shelf: SiteShelf) -> APIRouter:
     @router.get("", dependencies=[needs(Role.VIEW)])
     def history(
         site: str,
-        kind: Literal["", "object", "change", "finding"] = "",
+        kind: Literal["", "object", "change"] = "",
         id: str = Query("", max_length=400),
     ) -> list[dict[str, Any]]:
-        """Every verdict of the site with who gave it and when, newest first."""
+        """Every vote of the site with who gave it and when, newest first."""
         return [asdict(each) for each in reviews.history(site, kind, id)]
 
     @router.post("", status_code=201)
     def give(site: str, wish: ReviewWish, holder: Holder = needs(Role.REVIEW)) -> dict[str, Any]:
-        """Confirm or reject an object, a change or a finding, or withdraw a verdict. 409 where another came first."""
+        """Vote on an object or a change, or withdraw one's own vote; how all votes stand then. None is overwritten."""
         return asdict(reviews.give(site, wish, holder.name))
 
     return router
 
 
-def _keep(connection: sqlite3.Connection, key: tuple[str, str], review: Review) -> None:
+def _keep(connection: sqlite3.Connection, key: tuple[str, str], vote: Review) -> None:
+    values = asdict(vote)
+    del values["state"]
     connection.execute(
-        "INSERT INTO reviews (site, made_utc, kind, id, revision, verdict, note, who, at) "
-        "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
-        (
-            *key,
-            review.kind,
-            review.id,
-            review.revision,
-            review.verdict,
-            review.note,
-            review.who,
-            review.at,
-        ),
+        f"INSERT INTO reviews (site, made_utc, {_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        (*key, *values.values()),
     )
 
 
 def _as_stored(review: Review) -> Verdict | None:
-    return None if review.verdict == NO_VERDICT else Verdict(review.verdict)
+    """What missions are told: nothing while people disagree, or are unsure."""
+    return Verdict(review.verdict) if review.verdict in set(Verdict) else None
 
 
 def _stored_note(review: Review) -> str:
-    return "" if review.verdict == NO_VERDICT else review.note
+    return "" if _as_stored(review) is None else review.note
 
 
 _MOST_DRAWINGS, _MOST_CORNERS = 500, 500

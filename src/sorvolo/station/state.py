@@ -17,7 +17,7 @@ from sorvolo.store.atomic import take_lock, writing
 STATE_FILE = "station.db"
 """The file of the station's memory, in its own folder."""
 
-_FORMAT = 2
+_FORMAT = 3
 _TABLES = """
 CREATE TABLE IF NOT EXISTS events (
   seq INTEGER PRIMARY KEY AUTOINCREMENT, at TEXT NOT NULL, type TEXT NOT NULL, site TEXT, run TEXT, data TEXT NOT NULL);
@@ -29,19 +29,9 @@ CREATE TABLE IF NOT EXISTS tokens (
   expires_at TEXT);
 CREATE TABLE IF NOT EXISTS reviews (
   number INTEGER PRIMARY KEY AUTOINCREMENT, site TEXT NOT NULL, made_utc TEXT NOT NULL, kind TEXT NOT NULL,
-  id TEXT NOT NULL, revision INTEGER NOT NULL, verdict TEXT NOT NULL, note TEXT NOT NULL, who TEXT NOT NULL,
-  at TEXT NOT NULL, UNIQUE (site, made_utc, kind, id, revision));
+  id TEXT NOT NULL, revision INTEGER NOT NULL, verdict TEXT NOT NULL, label TEXT NOT NULL, note TEXT NOT NULL,
+  who TEXT NOT NULL, at TEXT NOT NULL, UNIQUE (site, made_utc, kind, id, revision));
 """
-_FROM_1 = f"""
-BEGIN IMMEDIATE;
-ALTER TABLE reviews RENAME TO reviews_1;
-{_TABLES}
-INSERT INTO reviews SELECT number, site, '', kind, id, revision, verdict, note, who, at FROM reviews_1;
-DROP TABLE reviews_1;
-PRAGMA user_version = 2;
-COMMIT;
-"""
-"""Format 1 kept verdicts by a site's name alone; its rows have no `made_utc` until their site is looked at."""
 
 
 class StationState:
@@ -73,9 +63,7 @@ class StationState:
                 run("PRAGMA synchronous = FULL")
                 run("PRAGMA trusted_schema = OFF")
                 found = run("PRAGMA user_version").fetchone()[0]
-                if found == 1:
-                    state._connection.executescript(_FROM_1)
-                elif found not in (0, _FORMAT):
+                if found not in (0, _FORMAT):
                     raise StoreError(
                         f"{path} has format {found}, this Sorvolo works with {_FORMAT}; use the Sorvolo that made it, "
                         "or move the file away"

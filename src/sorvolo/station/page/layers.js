@@ -67,7 +67,7 @@ function filterForm(data) {
     on: { input: (event) => data.filter({ minArea_m2: Number(event.target.value) || 0 }) } });
   const date = (name) => el("input", { type: "date", ".value": data.filters[name], on: { change: (event) => data.filter({ [name]: event.target.value }) } });
   return el("details", { class: "filters" }, el("summary", {}, "Filter"),
-    field("Verdict", choice([["all", "all"], ["none", "not reviewed"], ["confirmed", "confirmed"], ["rejected", "rejected"]],
+    field("Verdict", choice([["all", "all"], ["none", "not reviewed"], ["confirmed", "confirmed"], ["rejected", "rejected"], ["disputed", "disputed"], ["unsure", "not sure"]],
       data.filters.verdict, (verdict) => data.filter({ verdict }))),
     el("div", { class: "row" }, field("Score at least", slider), score),
     field("Flight", choice([["", "all"], ...(data.detail.flights ?? []).map((each) => [each.id, each.id])], data.filters.flight, (flight) => data.filter({ flight }))),

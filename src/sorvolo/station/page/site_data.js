@@ -20,10 +20,9 @@ export class SiteData extends EventTarget {
   /** Load collections anew. */
   async load(names = NAMES) {
     await Promise.all(names.map(async (name) => {
-      const kept = await features(this.id, name);
-      if (name === "objects") kept.push(...await features(this.id, "findings"));
+      const kept = await features(this.id, name === "objects" ? "findings" : name);
       for (const { properties } of kept) if (properties.review === "none") properties.review = null; // withdrawn: open again
-      const watched = this.all[name].filter((each) => each.properties.watched && !kept.some(({ id }) => id === each.id));
+      const watched = this.all[name].filter((each) => each.properties.watched && !kept.some((other) => isOf(other, each.id)));
       this.all[name] = [...kept, ...watched]; // what a running watch has just found is not in its file yet
     }));
     this.changed(names);
@@ -46,6 +45,10 @@ export class SiteData extends EventTarget {
     if (name === "changes" && this.versions) {
       const [low, high] = [Math.min(...this.versions), Math.max(...this.versions)];
       list = list.filter(({ properties: { version } }) => version === undefined || version === null || (version > low && version <= high));
+    }
+    if (name === "objects") { // of the versions that are compared, else of the newest look at each place
+      const dates = (this.detail.versions ?? []).filter(({ n }) => this.versions?.includes(n)).map(({ flight }) => flight);
+      list = list.filter(({ properties: { flights, gone } }) => !flights || (this.versions ? flights.some((each) => dates.includes(each)) : !gone));
     }
     return name === "objects" || name === "changes" ? passing(list, this.filters) : list;
   }
@@ -79,15 +82,18 @@ export class SiteData extends EventTarget {
     this.changed([name]);
   }
 
-  /** A verdict came, ours or another's. */
-  judge({ kind, id, verdict, note, revision, who, at }) {
+  /** A vote came, ours or another's: how all stand. */
+  judge({ kind, id, verdict, state, note, revision, who, at }) {
     const name = kind === "change" ? "changes" : "objects";
-    const found = this.all[name].find((each) => each.id === id);
+    const found = this.all[name].find((each) => isOf(each, id));
     if (!found || (found.properties.revision ?? 0) > revision) return;
-    Object.assign(found.properties, { review: verdict === "none" ? null : verdict, note, revision, reviewer: who, reviewed_at: at });
+    Object.assign(found.properties, { review: verdict === "none" ? null : verdict, note, revision, review_state: state, reviewer: who, reviewed_at: at });
     this.changed([name]);
   }
 }
+
+/** Whether a feature has an id, or a sighting of it. */
+const isOf = (feature, id) => feature.id === id || (feature.properties.sightings ?? []).includes(id);
 
 /** Whether a feature is a change; else it is an object. */
 export const isChange = (feature) => feature.properties.kind !== undefined;

@@ -50,7 +50,7 @@ from sorvolo.store.site.files import (
 )
 from sorvolo.store.site.flight_writer import FlightWriter
 from sorvolo.store.site.journal import RunJournal
-from sorvolo.store.site.register import present_objects, site_register
+from sorvolo.store.site.register import flown_flights, present_objects, site_register
 from sorvolo.store.site.tiles import GrowingTiles, TileBlobs, TileView
 from sorvolo.store.site.upkeep import (
     forget_journals,
@@ -224,6 +224,10 @@ class Archive:
     def register(self, watched: Sequence[MissionSighting] = ()) -> Register:
         """What all missions found, each thing one finding; with what watches saw, which the site does not keep."""
         return self.catalogue_rows(site_register, None, watched)
+
+    def flown(self) -> list[tuple[str, int, int, int]]:
+        """Each flight's name, rank, and the times of its first and last frame, by rank; none of flights without."""
+        return self.catalogue_rows(flown_flights)
 
     def newest_objects(self, flights: Collection[str] | None = None) -> list[StoredObject]:
         """What stands on the site by the newest look at each piece of ground; as far as these flights know."""

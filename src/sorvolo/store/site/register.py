@@ -1,6 +1,6 @@
 """The register of a site, from the records that its missions keep: objects, searched ground, changes, watches' tracks."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from sqlalchemy import Connection, select
@@ -31,25 +31,36 @@ def site_register(
     versions = list_versions(connection)
     flight_of = {each.id: each.flight_id for each in versions}
     before = {each.flight_id: flight_of.get(each.parent_id, "") for each in versions}
-    flights_by_rank = connection.execute(select(schema.flights.c.id, schema.flights.c.rank))
-    ranks = {row.id: float(row.rank) for row in flights_by_rank}
+    dates = {name: (float(rank), span) for name, rank, *span in flown_flights(connection)}
     for change in load_changes(connection):
         if _is_of(change.flight_id, flights) and change.verdict is not Verdict.REJECTED:
-            sightings += _of_change(change, before.get(change.flight_id, ""), ranks)
+            sightings += _of_change(change, before.get(change.flight_id, ""), dates)
     looks = [Look(each.flight_id, float(each.rank), each.frames) for each in searches]
     return associate([*sightings, *watched], Register(), looks)
 
 
+def flown_flights(connection: Connection) -> list[tuple[str, int, int, int]]:
+    """Each flight's name, rank, and the times of its first and last frame, by rank."""
+    flown, flights, versions = schema.flown, schema.flights, schema.versions
+    query = (
+        select(flown, flights.c.id, flights.c.rank)
+        .join(versions, versions.c.id == flown.c.version_id)
+        .join(flights, flights.c.id == versions.c.flight_id)
+        .order_by(flights.c.rank)
+    )
+    rows = schema.checked_rows(connection, flown, query)
+    return [(row.id, row.rank, row.first_ns, row.last_ns) for row in rows]
+
+
 def present_objects(register: Register, objects: Sequence[StoredObject]) -> list[StoredObject]:
     """What stands on the site by the newest look at each place, as the newest flight that detected it found it."""
-    by_id = {each.thing.id: each for each in objects}
-    result = []
-    for found in register.present:
-        known = [by_id[each.id] for each in found.sightings if each.id in by_id]
-        if known:
-            last = known[-1]
-            result.append(StoredObject(last.flight_id, last.rank, last.thing, found))
-    return result
+    of_finding = {each.id: found for found in register.present for each in found.sightings}
+    newest = {of_finding[each.thing.id].id: each for each in objects if each.thing.id in of_finding}
+    return [
+        StoredObject(each.flight_id, each.rank, each.thing, of_finding[each.thing.id])
+        for each in objects
+        if each in set(newest.values())
+    ]
 
 
 def sighting_of(stored: StoredObject) -> MissionSighting:
@@ -74,7 +85,9 @@ def sighting_of(stored: StoredObject) -> MissionSighting:
     )
 
 
-def _of_change(change: StoredChange, before: str, ranks: dict[str, float]) -> list[MissionSighting]:
+def _of_change(
+    change: StoredChange, before: str, dates: Mapping[str, tuple[float, list[int]]]
+) -> list[MissionSighting]:
     """What a change shows of things with a class: one that stands after it, one that left with it."""
     sightings = []
     for date, label, kinds, gone in (
@@ -86,14 +99,15 @@ def _of_change(change: StoredChange, before: str, ranks: dict[str, float]) -> li
             change.flight_id,
         ),
     ):
-        if not label or date not in ranks or change.kind not in kinds:
+        if not label or date not in dates or change.kind not in kinds:
             continue
-        seen_ns = (change.first_seen_ns, change.last_seen_ns) if not gone else (0, 0)
+        rank, flown_ns = dates[date]
+        seen_ns = flown_ns if gone else (change.first_seen_ns, change.last_seen_ns)
         sigma_m = change.sigma_in_map_m
         sightings.append(
             MissionSighting(
                 date,
-                ranks[date],
+                rank,
                 f"{change.flight_id} changes",
                 change.id,
                 Origin.CHANGED,
@@ -102,7 +116,8 @@ def _of_change(change: StoredChange, before: str, ranks: dict[str, float]) -> li
                 change.centre_m,
                 change.sigma_m if np.isnan(sigma_m) else sigma_m,
                 change.length_m,
-                *seen_ns,
+                seen_ns[0],
+                seen_ns[1],
                 gone=gone,
             )
         )

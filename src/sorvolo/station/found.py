@@ -1,0 +1,147 @@
+"""The register as features on Earth: what missions of a site and its watches found, each thing once."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from datetime import datetime
+from typing import Any
+
+import numpy as np
+
+from sorvolo.findings.importance import ordered
+from sorvolo.findings.register import Finding, MissionSighting, Origin, Register, associate
+from sorvolo.geometry.geodesy import Geodetic
+from sorvolo.store.exports.change_files import objects_geojson
+from sorvolo.store.exports.places import place_deg
+from sorvolo.store.exports.plain import rounded, utc_text
+from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.change_records import StoredObject
+from sorvolo.survey.flight import Site
+
+Feature = dict[str, Any]
+Track = dict[str, Any]
+_DATED_NS = 365 * 86_400 * 10**9  # times before are those of a clock without a date
+_UNKNOWN_SIGMA_M = 2.0  # of tracks of watches that state none
+
+
+def on_earth(site: Site) -> Site:
+    """The site with places in degrees: a local one's lie around its origin, as the station shows them."""
+    return replace(site, is_local=False)
+
+
+def found_features(archive: Archive | None, tracks: Sequence[Track]) -> list[Feature]:
+    """All findings, what a person wants first in front; `tracks` of a site's watches belong to the flights whose time
+    is theirs. Without a site there are the watches' alone."""
+    if archive is None:
+        longitude_deg, latitude_deg = tracks[0]["lonlat"][:2] if tracks else (0.0, 0.0)
+        site = Site("watched", Geodetic(latitude_deg, longitude_deg, 0.0), "", 1.0)
+        register = associate(_sightings_of(tracks, site, []), Register())
+        stored: list[StoredObject] = []
+    else:
+        site = on_earth(archive.site())
+        register = archive.register(_sightings_of(tracks, site, archive.flown()))
+        stored = archive.objects()
+    objects, watched = (
+        {each.thing.id: each for each in stored},
+        {each["id"]: each for each in tracks},
+    )
+    return [_feature(each, site, objects, watched) for each in ordered(register.findings)]
+
+
+def _sightings_of(
+    tracks: Sequence[Track], site: Site, flown: Sequence[tuple[str, int, int, int]]
+) -> list[MissionSighting]:
+    """Tracks as sightings; `flown` has each flight's name, rank, and times of its first and last frame."""
+    spans: dict[str, tuple[int, int]] = {}
+    times = {each["id"]: (_ns(each["first_seen"]), _ns(each["last_seen"])) for each in tracks}
+    for each in tracks:
+        first_ns, last_ns = times[each["id"]]
+        known = spans.get(each["run"], (first_ns, last_ns))
+        spans[each["run"]] = min(known[0], first_ns), max(known[1], last_ns)
+    dates = {run: _date_of(run, span, flown) for run, span in spans.items()}
+    places_m = site.frame.ground_from_lonlat(
+        [tuple(each["lonlat"][:2]) for each in tracks] or [(0, 0)]
+    )
+    return [
+        MissionSighting(
+            *dates[each["run"]],
+            each["run"],
+            each["id"],
+            Origin.DETECTED,
+            each["class"],
+            each["score"],
+            place_m[:2],
+            each.get("sigma_m") or _UNKNOWN_SIGMA_M,
+            (each.get("size_m") or [np.nan])[0],
+            *times[each["id"]],
+            bool(each.get("moving")),
+            tuple(each.get("velocity_m_s") or (0.0, 0.0)),
+            each["class_scores"],
+        )
+        for each, place_m in zip(tracks, np.asarray(places_m))
+    ]
+
+
+def _date_of(
+    run: str, span: tuple[int, int], flown: Sequence[tuple[str, int, int, int]]
+) -> tuple[str, float]:
+    """The flight that a watch was of, with its rank: the one whose time it shares most; else a date of its own."""
+    shared = {
+        (name, float(rank)): min(last_ns, span[1]) - max(first_ns, span[0])
+        for name, rank, first_ns, last_ns in flown
+        if first_ns > _DATED_NS
+    }
+    best = max(shared, key=lambda each: shared[each], default=("", 0.0))
+    if shared.get(best, -1) >= 0:
+        return best
+    earlier = [rank for _, rank, first_ns, _ in flown if first_ns <= span[0]]
+    return run, max(earlier, default=-1) + 0.5
+
+
+def _feature(
+    found: Finding,
+    site: Site,
+    objects: Mapping[str, StoredObject],
+    watched: Mapping[str, Track],
+) -> Feature:
+    """A finding with what the mission states that saw it best: a map, else a watch, else a comparison."""
+    ids = [each.id for each in reversed(found.sightings)]
+    of_map = next((objects[each] for each in ids if each in objects), None)
+    of_watch = next((watched[each] for each in ids if each in watched), None)
+    newest = found.newest
+    values: dict[str, Any] = {"score": newest.score, "length_m": rounded(newest.length_m, 2)}
+    crop: tuple[str, str] | None = ("change", ids[0])
+    if of_map is not None:
+        (shown,) = objects_geojson([of_map], site, crops_from_site=True)["features"]
+        values, crop = shown["properties"], ("object", of_map.thing.id)
+    elif of_watch is not None:
+        values = {name: each for name, each in of_watch.items() if name != "lonlat"}
+        crop = ("finding", of_watch["id"]) if of_watch.get("crop") else None
+    longitude_deg, latitude_deg = place_deg(found.position_m, site)
+    first, last = utc_text(found.first_ns), utc_text(found.last_ns)
+    values = values | {
+        "id": found.id,
+        "class": found.label,
+        "class_scores": {name: rounded(share, 4) for name, share in found.class_scores.items()},
+        "latitude": rounded(latitude_deg, 8),
+        "longitude": rounded(longitude_deg, 8),
+        "sigma_m": rounded(found.sigma_m, 3),
+        "flight": newest.date,
+        "flights": list(found.dates),
+        "gone": found.gone or None,
+        "missions": sorted({each.mission for each in found.sightings}),
+        "origins": sorted({each.origin.value for each in found.sightings}),
+        "sightings": list(dict.fromkeys(ids)),
+        "first_seen": first,
+        "last_seen": last,
+        "datetime": first,
+        "end_datetime": last,
+        "review_kind": "object",
+        "crop_of": crop,
+    }
+    geometry = {"type": "Point", "coordinates": [values["longitude"], values["latitude"]]}
+    return {"type": "Feature", "id": found.id, "geometry": geometry, "properties": values}
+
+
+def _ns(time: str) -> int:
+    moment = datetime.fromisoformat(time)
+    return round(moment.timestamp() * 1e6) * 1000
