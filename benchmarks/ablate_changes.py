@@ -76,7 +76,7 @@ class Recorder(run.FlightChanges):
 
 
 def compare(folder: Path, name: str, length_m: int, m_per_px: float | None, seed: int) -> list[Any]:
-    """Simulate, map and compare a pair of flights: its true events, their settings, and m2 compared."""
+    """Simulate, map and compare a pair of flights: its true events, and m2 compared."""
     settings = replace(preset(name), seed=seed)
     settings = replace(
         settings,
@@ -98,11 +98,10 @@ def compare(folder: Path, name: str, length_m: int, m_per_px: float | None, seed
         mock.patch.object(evaluation, "score_events", side_effect=score_events) as scored,
     ):
         evaluation.evaluate_changes(site, simulation)
-    _, true, event_settings = matched.call_args.args
-    return [true, event_settings, scored.call_args.args[1]]
+    return [matched.call_args.args[1], scored.call_args.args[1]]
 
 
-def counted(true: Any, settings: Any, area_m2: float, switches: dict[str, Any]) -> dict[str, int]:
+def counted(true: Any, area_m2: float, switches: dict[str, Any]) -> dict[str, int]:
     """Gather the recorded views again with a rule switched off, and match the changes with the truth."""
     with ExitStack() as stack:
         for place, value in switches.items():
@@ -117,7 +116,7 @@ def counted(true: Any, settings: Any, area_m2: float, switches: dict[str, Any]) 
             changes.add(view, leans)
         found = run.reported(changes.conclude(), 0.0, [])
     events = [FoundEvent(each.id, each.kind, each.outline_m, each.sigma_m) for each in found]
-    scores = score_events(match_events(events, true, settings), area_m2, settings)
+    scores = score_events(match_events(events, true), area_m2)
     counts = {"found": scores.found, "must": scores.must_find, "false": scores.false}
     return counts | {"twice": scores.twice, "events": len(events)}
 
