@@ -64,6 +64,11 @@ def test_input_that_cannot_be_used_is_named(
         compare(reference, query, valid)
 
 
+def test_pictures_too_small_to_compare_are_refused() -> None:
+    with pytest.raises(InputError, match="50 x 20 px; at least 32"):
+        sorvolo.compare_images(PICTURE[:20], PICTURE[:20])
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -10,6 +10,8 @@ from sorvolo.change.robust import RobustSettings, compare_robust
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import Boxes, ImageGray, Mask
 
+_LEAST_PX = 32  # along a side
+
 
 class Comparison(NamedTuple):
     """`mask` (h, w) uint8, 255 where something changed, else 0; `boxes` (N, 4) int64 x, y, width, height."""
@@ -50,6 +52,8 @@ def compare_images(
     if settings is not None and not isinstance(settings, RobustSettings):
         raise SettingsError(f"settings are {type(settings).__name__}; give RobustSettings")
     reference, query = checked_pair(reference, query, valid)
+    if min(query.shape[:2]) < _LEAST_PX:
+        raise InputError(f"the pictures are {_size(query)}; at least {_LEAST_PX} px are needed each way")
     found = compare_robust(reference, query, valid, settings)
     return Comparison(found.mask, found.boxes)
 

@@ -23,7 +23,7 @@ from sorvolo.change.regions import (
 )
 from sorvolo.change.settling import Settling, settle
 from sorvolo.change.shade import ShadeSettings, shade_between
-from sorvolo.errors import InputError, SettingsError
+from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Boxes, Bytes, Floats, ImageGray, Ints32, Mask
 from sorvolo.kernels import held_parts, tree_margins
 from sorvolo.survey.findings import Shade
@@ -248,10 +248,8 @@ def compare_robust(
 ) -> RobustResult:
     """Compare two aligned BGR pictures (h, w, 3) uint8 of at least 32 px; up to about 5 px apart is fine.
 
-    Where `valid` (h, w) is False the answer is unknown: nothing is found there, nor in a thin rim around it. Raises
-    InputError where the pictures do not fit together.
+    Where `valid` (h, w) is False the answer is unknown: nothing is found there, nor in a thin rim around it.
     """
-    _check(reference, query, valid)
     settings = settings or RobustSettings()
     scratch = scratch_of_thread()
     examined = examine(reference, query, valid, settings, scratch)
@@ -318,27 +316,6 @@ def examine(
     regions = find_regions(lit, after, known, for_pair, settling.rest_px, light.unevenness, scratch)
     share = 1.0 if known is None else cv2.countNonZero(known.view(np.uint8)) / known.size
     return Examined(regions, light, settling, share, Views(lit, after))
-
-
-def _check(reference: Bytes, query: Bytes, valid: Mask | None) -> None:
-    for name, image in (("reference", reference), ("query", query)):
-        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
-            raise InputError(
-                f"{name}: found {image.dtype} of shape {image.shape}; give a BGR picture, (h, w, 3) uint8"
-            )
-    if reference.shape != query.shape:
-        raise InputError(
-            f"the reference is {reference.shape}, the query {query.shape}; align them to the same pixels"
-        )
-    height, width = query.shape[:2]
-    if min(height, width) < 32:
-        raise InputError(
-            f"the pictures are {width} x {height} px; at least 32 px are needed each way"
-        )
-    if valid is not None and (valid.shape != query.shape[:2] or valid.dtype != np.bool_):
-        raise InputError(
-            f"valid: found {valid.dtype} of shape {valid.shape}; give a bool mask of {query.shape[:2]}"
-        )
 
 
 def _half_known(valid: Mask | None, half: tuple[int, int]) -> Mask | None:
