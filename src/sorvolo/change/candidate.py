@@ -283,15 +283,15 @@ class KeptView:
 class Candidate:
     """All that views reported of one possible change.
 
-    `recall`, `see`, `ask` and `miss` take views in; `extend`, `recount` and `joined` follow its ground; `become` gives
-    a seed a number.
+    `recall`, `see`, `ask` and `miss` take views in; `extend`, `recount` and `joined` follow its ground, the window
+    `cells`. `tally` is what the views reported so far; a seed has the number 0.
     """
 
     def __init__(self, number: int, cells: CellWindow, first_seen_ns: int) -> None:
         self.number = number
         self.pictures = Pictures()
-        self._cells = cells
-        self._tally = Tally(first_seen_ns, first_seen_ns)
+        self.cells = cells
+        self.tally = Tally(first_seen_ns, first_seen_ns)
         self._places: list[Floats] = []
         self._cameras: list[Floats] = []
         self._shown_by: dict[
@@ -299,16 +299,6 @@ class Candidate:
         ] = {}  # the views in which a followed blob showed it, by its leg
         self._kind: ChangeKind | None = None
         self._kind_outline: PointsM | None = None
-
-    @property
-    def cells(self) -> CellWindow:
-        """The window of its cells."""
-        return self._cells
-
-    @property
-    def tally(self) -> Tally:
-        """What the views reported so far."""
-        return self._tally
 
     def shown_by(self, which: Callable[[int], bool]) -> list[Tally]:
         """The views in which blobs showed it that were followed, on `which` legs: one tally for each of these."""
@@ -321,11 +311,11 @@ class Candidate:
 
     def extend(self, window: CellWindow) -> None:
         """It reaches into this window, too."""
-        self._cells = self._cells.joined(window)
+        self.cells = self.cells.joined(window)
 
     def recall(self, view: KeptView, cells: Mask, cell_m: float) -> None:
         """Count a view from before the candidate was found, whose `cells` lie in its window, and its mask."""
-        report = view.laid.report(self._cells, cells, cell_m)
+        report = view.laid.report(self.cells, cells, cell_m)
         if report.seen < _SEEN:
             return
         if report.flagged < _SHOWS * report.seen:
@@ -337,8 +327,8 @@ class Candidate:
     def see(self, view: KeptView, cells: Mask, cell_m: float) -> bool:
         """Count this view; whether it shows the candidate. One that sees less than half of it does not count, unless
         the candidate is as large as the view."""
-        report = view.laid.report(self._cells, cells, cell_m)
-        is_large = max(self._cells.shape) > 0.5 * max(view.laid.window.shape)
+        report = view.laid.report(self.cells, cells, cell_m)
+        is_large = max(self.cells.shape) > 0.5 * max(view.laid.window.shape)
         if report.seen < _SEEN and not (is_large and report.flagged > 0):
             return False
         if report.flagged < _SHOWS * report.seen:
@@ -350,7 +340,7 @@ class Candidate:
 
     def ask(self, view: KeptView, cells: Mask, cell_m: float) -> bool:
         """Count this view as for a seed: whatever shows some of it shows it; and its mask. Whether it does."""
-        report = view.laid.report(self._cells, cells, cell_m)
+        report = view.laid.report(self.cells, cells, cell_m)
         if report.flagged >= max(_SHOWS * report.seen, 1e-9):
             leg = self._count(
                 view,
@@ -368,24 +358,16 @@ class Candidate:
 
     def miss(self, times: int = 1) -> None:
         """One more view that could have shown it, or several, do not."""
-        self._tally = self._tally.without_view(times)
+        self.tally = self.tally.without_view(times)
 
     def recount(self, views: int, asked: int) -> None:
         """Count anew what views reported: `views` of `asked` flagged what is left of it."""
-        self._tally = self._tally.recounted(views, asked)
+        self.tally = self.tally.recounted(views, asked)
         self._shown_by.clear()
-
-    def become(self, number: int) -> None:
-        """A seed grows up."""
-        self.number = number
 
     def note_restlessness(self, restless: float) -> None:
         """The share of the views of the ground around that flag it for nothing, as measured last."""
-        self._tally = replace(self._tally, restless=restless)
-
-    def outline_m(self, cells: Mask, cell_m: float, join_m: float) -> PointsM | None:
-        """(N, 2) its outline; `cells` is the raster of its own cells in its window."""
-        return self.pictures.outline_m(self._cells, cells, cell_m, join_m)
+        self.tally = replace(self.tally, restless=restless)
 
     def record(
         self, id_prefix: str, outline_m: PointsM, cell_m: float, score: float, announced_ns: int
@@ -395,7 +377,7 @@ class Candidate:
         `sigma_m` is that of `place_sigma_m`, and the spread of its middle over the views, per axis, / sqrt(views).
         Raises GeometryError if it has no pictures.
         """
-        patch, tally = self.pictures.patch(outline_m), self._tally
+        patch, tally = self.pictures.patch(outline_m), self.tally
         if self._kind is None or self._kind_outline is not outline_m:
             self._kind, self._kind_outline = kind_of(patch), outline_m
         size = measures(outline_m)
@@ -426,10 +408,10 @@ class Candidate:
         What the views reported of this one, and its pictures, count.
         """
         self.number = number
-        self._tally = replace(
-            self._tally,
-            first_seen_ns=min(self._tally.first_seen_ns, other.tally.first_seen_ns),
-            last_seen_ns=max(self._tally.last_seen_ns, other.tally.last_seen_ns),
+        self.tally = replace(
+            self.tally,
+            first_seen_ns=min(self.tally.first_seen_ns, other.tally.first_seen_ns),
+            last_seen_ns=max(self.tally.last_seen_ns, other.tally.last_seen_ns),
         )
         self.extend(other.cells)
         return self
@@ -445,8 +427,8 @@ class Candidate:
     ) -> int:
         """Count a view that shows it; the leg of the followed blob that shows it there, 0 for none."""
         seen = view.time_ns, report.score, residual_m, view.camera_m
-        self._tally = self._tally.with_view(*seen)
-        leg = view.laid.leg_of(self._cells, cells)
+        self.tally = self.tally.with_view(*seen)
+        leg = view.laid.leg_of(self.cells, cells)
         if leg:
             known = self._shown_by.get(leg, Tally(view.time_ns, view.time_ns))
             self._shown_by[leg] = known.with_view(*seen)
@@ -460,9 +442,9 @@ class Candidate:
         return leg
 
     def _note_rim(self, view: KeptView, cells: Mask, leg: int) -> None:
-        if view.laid.part_of(view.laid.cut_off, self._cells, cells).any():
+        if view.laid.part_of(view.laid.cut_off, self.cells, cells).any():
             return
-        self._tally = replace(self._tally, whole=self._tally.whole + 1)
+        self.tally = replace(self.tally, whole=self.tally.whole + 1)
         if leg in self._shown_by:
             self._shown_by[leg] = replace(self._shown_by[leg], whole=self._shown_by[leg].whole + 1)
 

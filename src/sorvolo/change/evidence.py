@@ -104,7 +104,7 @@ class EvidenceMap:
         self._settings, self._prefix = settings, id_prefix
         self._m_per_px = m_per_px
         self._cell_m = cell_side_m(m_per_px)
-        self._join_m = max(_JOIN_M, 3 * self._cell_m) if _JOIN_M else 0.0
+        self._join_m = max(_JOIN_M, 3 * self._cell_m)
         self._gap = int(np.ceil(self._join_m / self._cell_m))
         self._grid = EvidenceGrid(settings.n)
         self._tracker = BlobTracker()
@@ -530,7 +530,9 @@ class EvidenceMap:
         return replace(thing, views=1, score=sureness(once))
 
     def _record(self, candidate: Candidate) -> Change | None:
-        outline_m = candidate.outline_m(self._cells_of(candidate), self._cell_m, self._join_m)
+        outline_m = candidate.pictures.outline_m(
+            candidate.cells, self._cells_of(candidate), self._cell_m, self._join_m
+        )
         if outline_m is None:
             return None
         announced_ns = self._announced_ns.get(candidate.number, -1)
@@ -587,7 +589,7 @@ class EvidenceMap:
         missed = int(evidence.seen[cells].max()) - seed.tally.asked
         if missed > 0:
             seed.miss(missed)
-        seed.become(self._next_number())
+        seed.number = self._next_number()
         if is_seen_once:
             self._seen_once.add(seed.number)
         self._grid.own(seed.cells, cells, seed.number)
@@ -616,7 +618,7 @@ class EvidenceMap:
     def _is_confirmed(
         self, seed: Candidate, cells: Mask, confirms: Callable[[PointsM], bool]
     ) -> bool:
-        outline_m = seed.outline_m(cells, self._cell_m, self._join_m)
+        outline_m = seed.pictures.outline_m(seed.cells, cells, self._cell_m, self._join_m)
         return outline_m is not None and confirms(outline_m)
 
     def _joins_beside(self, window: CellWindow, cells: Mask) -> bool:
