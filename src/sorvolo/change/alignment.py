@@ -180,7 +180,7 @@ class Aligner:
     def __init__(self, reference: ReferenceMap, site_grid: SiteGrid) -> None:
         self._reference, self._site_grid = reference, site_grid
         self._fits: list[_Fit] = []
-        self.search = MapSearch(reference, site_grid, _LINKS.features)
+        self.search = MapSearch(reference, site_grid)
         """What looks for frames that no homography places."""
         self._count = 0
         self._misses = 0  # frames since the last fit

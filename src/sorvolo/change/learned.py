@@ -1,6 +1,5 @@
 """How much two pictures differ in learned features, beside what unchanged ground of the same pair differs."""
 
-from collections.abc import Callable
 from functools import lru_cache
 from importlib.resources import files
 from typing import Any
@@ -32,8 +31,7 @@ _DIRECTION = 2.0  # weight of the angle between features, beside 1 of their dist
 def learned_difference(
     reference: Image,
     query: Image,
-    known: Mask | None,
-    features: Callable[[Image], list[Floats32]] | None = None,
+    known: Mask,
 ) -> Floats32:
     """(h, w) by how many spreads the features of two aligned pictures lie farther apart than they mostly do.
 
@@ -44,19 +42,17 @@ def learned_difference(
     least what they do between two dates. The mean over four layers; 0 where nothing is `known`.
     """
     height, width = query.shape[:2]
-    seen = np.ones((height, width), bool) if known is None else known
     total = np.zeros((height, width), np.float32)
-    features = features or learned_features
-    for one, other in zip(features(reference), features(query), strict=True):
+    for one, other in zip(learned_features(reference), learned_features(query), strict=True):
         # Pixels of a picture of this width along a cell of a layer.
         stride = (width + -width % _WHOLE_PX) // one.shape[2]
         rows, columns = -(-height // stride), -(-width // stride)
         held = cv2.resize(
-            _padded(seen.view(np.uint8), stride), (columns, rows), interpolation=cv2.INTER_NEAREST
+            _padded(known.view(np.uint8), stride), (columns, rows), interpolation=cv2.INTER_NEAREST
         ).astype(bool)
         if np.count_nonzero(held) < _LEAST_KNOWN:
             return np.zeros((height, width), np.float32)
-        apart = _apart(one[:, :rows, :columns], other[:, :rows, :columns], held, _REACH)
+        apart = _apart(one[:, :rows, :columns], other[:, :rows, :columns], held)
         for row, weight in enumerate((1.0, _DIRECTION)):
             spreads = np.float32(weight) * _in_spreads(
                 apart[row],
@@ -70,7 +66,7 @@ def learned_difference(
             )
             total += larger[:height, :width]
     total /= np.float32(len(_LAYERS) * (1 + _DIRECTION))
-    total[~seen] = 0
+    total[~known] = 0
     return total
 
 
@@ -104,7 +100,7 @@ def _in_spreads(
     return np.asarray(np.clip(away, -most, most), np.float32)
 
 
-def _apart(one: Floats32, other: Floats32, held: Mask, reach: int) -> tuple[Floats32, Floats32]:
+def _apart(one: Floats32, other: Floats32, held: Mask) -> tuple[Floats32, Floats32]:
     """How far each feature of `one` (channels, rows, columns) lies from the nearest of `other` around it: root of the
     mean square over channels, and one less the cosine, (rows, columns) each."""
     deviation = np.sqrt((one[:, held].var(axis=1) + other[:, held].var(axis=1)) / 2) + np.float32(
@@ -118,14 +114,14 @@ def _apart(one: Floats32, other: Floats32, held: Mask, reach: int) -> tuple[Floa
         for each in (one, other)
     )
     _, rows, columns = ours.shape
-    around = np.pad(theirs, ((0, 0), (reach, reach), (reach, reach)), mode="edge")
+    around = np.pad(theirs, ((0, 0), (_REACH, _REACH), (_REACH, _REACH)), mode="edge")
     own, power = (np.square(each).sum(axis=0) for each in (ours, around))
     nearest, likest = (
         np.full((rows, columns), np.inf, np.float32),
         np.full((rows, columns), -1.0, np.float32),
     )
-    for dy in range(2 * reach + 1):
-        for dx in range(2 * reach + 1):
+    for dy in range(2 * _REACH + 1):
+        for dx in range(2 * _REACH + 1):
             part = np.s_[dy : dy + rows, dx : dx + columns]
             products = np.einsum("chw,chw->hw", ours, around[:, part[0], part[1]])
             np.minimum(nearest, own + power[part] - 2 * products, out=nearest)

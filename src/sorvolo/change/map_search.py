@@ -33,7 +33,7 @@ from sorvolo.registration.matching import fit_homography, match
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Features
 
-_FEATURES = FeatureSettings()
+_FEATURES = FeatureSettings(orb_count=900)  # of a frame beside its neighbours
 _QUARTERS_DEG = (0.0, 90.0, -90.0, 180.0)  # headings that are tried where none is known
 
 
@@ -116,10 +116,8 @@ _NO_PAIRS = _Pairs(np.zeros((0, 2)), np.zeros((0, 2)))
 class MapSearch:
     """Searches one flight's frames on a map; knows where earlier ones were placed. Only `remember` changes it."""
 
-    def __init__(
-        self, reference: ReferenceMap, site_grid: SiteGrid, features: FeatureSettings = _FEATURES
-    ) -> None:
-        self._reference, self._site_grid, self._features = reference, site_grid, features
+    def __init__(self, reference: ReferenceMap, site_grid: SiteGrid) -> None:
+        self._reference, self._site_grid = reference, site_grid
         self._placed: list[_Placed] = []
         self._orb: dict[int, Features] = {}
 
@@ -184,11 +182,11 @@ class MapSearch:
         # Pairs of the frame's points and the ground where placed neighbours show them.
         pairs, own = _NO_PAIRS, None
         for near in self._neighbours(sought):
-            own = orb_features(sought.even, self._features) if own is None else own
+            own = orb_features(sought.even, _FEATURES) if own is None else own
             if id(near) not in self._orb:
                 alive = {id(each) for each in self._placed}
                 self._orb = {key: each for key, each in self._orb.items() if key in alive}
-                self._orb[id(near)] = orb_features(near.even, self._features)
+                self._orb[id(near)] = orb_features(near.even, _FEATURES)
             old = self._orb[id(near)]
             both = match(own, old, None, 0.0)
             fitted = fit_homography(own.points_px[both[:, 0]], old.points_px[both[:, 1]], 3.0)

@@ -23,6 +23,7 @@ from sorvolo.survey.mosaic import Features
 _BLOCK_PX = 512  # features are found in blocks of this side
 _APRON_PX = 40  # what contrast and descriptors look at beyond a block
 _LEVEL_TILES, _LEVEL_STEP_PX = 20, 16  # by which the map's middle grey is known
+_CACHE_BYTES = 192 * 2**20  # of tiles at hand
 _MOST_PX = 48_000_000  # of the map in one view: more is a view towards the horizon
 _FEATURES = FeatureSettings(detection_side_px=_BLOCK_PX + 2 * _APRON_PX, orb_count=1100)
 _NOTHING = Features("orb", np.zeros((0, 2)), np.zeros((0, 32), np.uint8))
@@ -50,12 +51,10 @@ class ReferenceMap:
     `tiles` is any mapping from tile to RGBA; level n of the map has pixels of 2^n grid pixels.
     """
 
-    def __init__(
-        self, tiles: Mapping[TileIndex, ImageRGBA], grid: Grid, cache_bytes: int = 192 * 2**20
-    ) -> None:
+    def __init__(self, tiles: Mapping[TileIndex, ImageRGBA], grid: Grid) -> None:
         self._tiles, self._grid = tiles, grid
         self._cache: OrderedDict[tuple[int, TileIndex], ImageRGBA | None] = OrderedDict()
-        self._cache_tiles = max(8, cache_bytes // (4 * grid.tile_px**2))
+        self._cache_tiles = max(8, _CACHE_BYTES // (4 * grid.tile_px**2))
         self._windows: dict[int, tuple[int, int, ImageRGBA]] = {}  # of each level the last
         self._shrunk: dict[int, tuple[int, ImageRGBA]] = {}  # the same by how much smaller
         self._features: dict[tuple[int, TileIndex], Features] = {}

@@ -49,8 +49,8 @@ class FlightTuning:
     that one odd frame (a gust, a cloud, a frame changed all over) does not decide for itself.
     """
 
-    def __init__(self, settings: RobustSettings | None = None) -> None:
-        self._base = settings or RobustSettings()
+    def __init__(self) -> None:
+        self._base = RobustSettings()
         self._seen: deque[PairMeasures] = deque(maxlen=_MEMORY_FRAMES)
         self._frames = 0
 
