@@ -1,5 +1,8 @@
 """The robust method: what it finds, what it leaves alone, and its kernels against their NumPy twins."""
 
+import json
+from importlib.resources import files
+
 import cv2
 import numpy as np
 import numpy_robust
@@ -13,7 +16,6 @@ from sorvolo.change.regions import FEATURES
 from sorvolo.change.robust import RobustSettings, Trees, compare_robust, examine, how_sure
 from sorvolo.change.settling import settle
 from sorvolo.change.tuning import FlightTuning, PairMeasures
-from sorvolo.errors import SettingsError
 
 
 def with_box(image: np.ndarray, colour: tuple[int, int, int] = (190, 60, 40)) -> np.ndarray:
@@ -133,12 +135,12 @@ def test_trees_know_their_features() -> None:
         np.array([[1.0, 5.0]]),
         np.array([[-3.0, -1.0, 1.0, 3.0]]),
     )
-    trees = Trees(("a", "b"), 0.0, asked, thresholds, leaves)
-    sure = how_sure(np.array([[0.0, 0.0], [0.0, 6.0], [2.0, 0.0], [2.0, 6.0]]), ("a", "b"), trees)
+    trees = Trees(0.0, asked, thresholds, leaves)
+    sure = how_sure(np.array([[0.0, 0.0], [0.0, 6.0], [2.0, 0.0], [2.0, 6.0]]), trees)
     np.testing.assert_allclose(sure, 1 / (1 + np.exp([3.0, 1.0, -1.0, -3.0])))
-    with pytest.raises(SettingsError):
-        how_sure(np.zeros((1, 1)), ("a",), trees)
-    assert how_sure(np.zeros((0, len(FEATURES))), FEATURES).shape == (0,)
+    assert how_sure(np.zeros((0, 2)), trees).shape == (0,)
+    stored = json.loads(files("sorvolo.change").joinpath("region_score.json").read_text())
+    assert tuple(stored["names"]) == FEATURES
 
 
 def test_a_flight_tunes_itself_and_shows_how(ground: np.ndarray) -> None:

@@ -53,7 +53,9 @@ def compare_images(
         raise SettingsError(f"settings are {type(settings).__name__}; give RobustSettings")
     reference, query = checked_pair(reference, query, valid)
     if min(query.shape[:2]) < _LEAST_PX:
-        raise InputError(f"the pictures are {_size(query)}; at least {_LEAST_PX} px are needed each way")
+        raise InputError(
+            f"the pictures are {_size(query)}; at least {_LEAST_PX} px are needed each way"
+        )
     found = compare_robust(reference, query, valid, settings)
     return Comparison(found.mask, found.boxes)
 

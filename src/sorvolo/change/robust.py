@@ -13,7 +13,6 @@ import numpy as np
 
 from sorvolo.change.light import PairLight, fit_light, relit
 from sorvolo.change.regions import (
-    FEATURES,
     Image,
     Regions,
     RegionSettings,
@@ -23,7 +22,6 @@ from sorvolo.change.regions import (
 )
 from sorvolo.change.settling import Settling, settle
 from sorvolo.change.shade import ShadeSettings, shade_between
-from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Boxes, Bytes, Floats, ImageGray, Ints32, Mask
 from sorvolo.kernels import held_parts, tree_margins
 from sorvolo.survey.findings import Shade
@@ -33,23 +31,14 @@ from sorvolo.survey.findings import Shade
 class Trees:
     """Oblivious trees of one depth: `features` (T, D) columns, `thresholds` (T, D), `leaves` (T, 2**D) log-odds."""
 
-    names: tuple[str, ...]
     prior: float
     features: Ints32
     thresholds: Floats
     leaves: Floats
 
 
-def how_sure(features: Floats, names: tuple[str, ...], trees: Trees | None = None) -> Floats:
-    """The chance (N,) from 0 to 1 that each row of `features` (N, F) is a change; `names` names the columns are.
-
-    Raises SettingsError if the trees were trained on other columns.
-    """
-    trees = trees or trained_trees()
-    if trees.names != names:
-        raise SettingsError(
-            "the trees of region_score.json were trained on other features; train them again"
-        )
+def how_sure(features: Floats, trees: Trees) -> Floats:
+    """The chance (N,) from 0 to 1 that each row of `features` (N, F) is a change."""
     if len(features) == 0:
         return np.zeros(0)
     margin = trees.prior + tree_margins(features, trees.features, trees.thresholds, trees.leaves)
@@ -58,10 +47,9 @@ def how_sure(features: Floats, names: tuple[str, ...], trees: Trees | None = Non
 
 @lru_cache(maxsize=1)
 def trained_trees() -> Trees:
-    """The trees that come with the package."""
+    """The trees that come with the package, trained on the columns of `regions.FEATURES`."""
     stored = json.loads(files("sorvolo.change").joinpath("region_score.json").read_text())
     return Trees(
-        tuple(stored["names"]),
         float(stored["prior"]),
         np.array(stored["features"], np.int32),
         np.array(stored["thresholds"]),
@@ -253,7 +241,7 @@ def compare_robust(
     settings = settings or RobustSettings()
     scratch = scratch_of_thread()
     examined = examine(reference, query, valid, settings, scratch)
-    scores = how_sure(examined.regions.features, FEATURES)
+    scores = how_sure(examined.regions.features, trained_trees())
     return _result(examined, scores, settings, query.shape[1::-1], scratch)
 
 
