@@ -48,7 +48,6 @@ RULES: dict[str, dict[str, Any]] = {
     },
     "rigid blobs": {"motion:is_rigid": _no},
     "floating blobs": {"motion:floats": _no},
-    "late ground joins what is beside": {"evidence:EvidenceMap._joins_beside": _no},
     "what may move must stand": {"evidence:EvidenceMap._stands": lambda *_: True},
     "restless ground": {"announcing:_RESTLESS_HALF": np.inf},
     "from one place": {"announcing:_ONE_PLACE": 0.0},

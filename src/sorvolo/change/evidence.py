@@ -561,9 +561,6 @@ class EvidenceMap:
         )
         if is_seen_once:
             cells |= single
-        for piece, part in pieces(cells, self._gap):
-            if self._joins_beside(seed.cells.part(part), piece & cells[part]):
-                cells[part] &= ~piece
         if np.count_nonzero(cells) < self._least_cells:
             return
         missed = int(evidence.seen[cells].max()) - seed.tally.asked
@@ -600,20 +597,6 @@ class EvidenceMap:
     ) -> bool:
         outline_m = seed.pictures.outline_m(seed.cells, cells, self._cell_m, self._join_m)
         return outline_m is not None and confirms(outline_m)
-
-    def _joins_beside(self, window: CellWindow, cells: Mask) -> bool:
-        """Give late `cells` of a window to the candidate beside them, if there is one."""
-        beside = self._grid.read(window.grown(self._gap + 1)).owner
-        if not beside.any():
-            return False
-        candidate = self._found[self._current(int(beside[beside > 0].min()))]
-        whole = candidate.cells.joined(window)
-        evidence, there = self._grid.read(whole), np.zeros(whole.shape, bool)
-        there[window.within(whole)] = cells
-        if not _is_passing(evidence, np.s_[:, :], evidence.owner == candidate.number, there):
-            self._grid.own(window, cells, candidate.number)
-            candidate.extend(window)
-        return True
 
 
 def restlessness(grid: EvidenceGrid, window: CellWindow, own: Mask, cell_m: float) -> float:
