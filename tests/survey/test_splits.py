@@ -5,12 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sorvolo.errors import InputError, SettingsError
-from sorvolo.lab.datasets.splits import frame_number, shared_groups, split_by_blocks, split_by_group
+from sorvolo.errors import SettingsError
+from sorvolo.lab.datasets.splits import frame_number, hold_out, shared_groups
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 
 NOTHING = np.zeros((0, 4), np.float32)
-SHARES = {"train": 0.7, "val": 0.1, "test": 0.2}
 
 
 def labelled(names_and_groups, name="set"):
@@ -36,93 +35,64 @@ def numbers(part):
 
 
 @settings(max_examples=40, deadline=None)
-@given(sizes=st.lists(st.integers(1, 60), min_size=3, max_size=30), seed=st.integers(0, 9))
-def test_groups_stay_whole_and_nothing_is_lost(sizes, seed):
+@given(sizes=st.lists(st.integers(20, 60), min_size=8, max_size=30), seed=st.integers(0, 9))
+def test_videos_stay_whole_and_nothing_is_lost(sizes, seed):
     whole = videos(*sizes)
-    parts = split_by_group(whole, SHARES, seed)
-    groups = [{each.group for each in part.pictures} for part in parts.values()]
-    assert all(groups) and sum(map(len, groups)) == len(set.union(*groups)) == len(sizes)
-    assert sorted(each.path for part in parts.values() for each in part.pictures) == sorted(
+    learnt, held, remarks = hold_out(whole, 0.25, seed)
+    groups = [{each.group for each in part.pictures} for part in (learnt, held)]
+    assert all(groups) and not groups[0] & groups[1] and not remarks
+    assert sorted(each.path for part in (learnt, held) for each in part.pictures) == sorted(
         each.path for each in whole.pictures
     )
-    assert all(part.unlabelled == {"car"} for part in parts.values())
+    assert learnt.unlabelled == held.unlabelled == {"car"}
 
 
 def test_shares_are_met_as_closely_as_videos_allow():
-    parts = split_by_group(videos(*[10] * 50), SHARES, 3)
-    assert {name: len(part) for name, part in parts.items()} == {
-        "train": 350,
-        "val": 50,
-        "test": 100,
-    }
-    one_large = split_by_group(videos(400, *[10] * 20), {"train": 0.7, "test": 0.3}, 1)
-    assert abs(len(one_large["train"]) - 420) <= 10
+    assert len(hold_out(videos(*[10] * 50), 0.2, 3)[1]) == 100
+    one_large = hold_out(videos(400, *[10] * 20), 0.3, 1)[1]
+    assert abs(len(one_large) - 180) <= 10
 
 
 def test_the_seed_decides_and_the_order_does_not():
     def held_out(source, seed):
-        return frozenset(
-            each.group for each in split_by_group(source, SHARES, seed)["test"].pictures
-        )
+        return frozenset(each.group for each in hold_out(source, 0.2, seed)[1].pictures)
 
     whole = videos(*range(5, 25))
     assert held_out(whole, 1) == held_out(whole.only(whole.pictures[::-1]), 1)
     assert len({held_out(whole, seed) for seed in range(6)}) >= 4
 
 
-def test_too_few_videos_and_impossible_shares_are_reported():
-    with pytest.raises(InputError, match=r"2 videos cannot make 3 parts.*blocks"):
-        split_by_group(videos(5, 5), SHARES)
-    for shares in ({}, {"train": 0.5}, {"train": 1.2, "test": -0.2}):
-        with pytest.raises(SettingsError, match="sum up to 1"):
-            split_by_group(videos(5, 5), shares)
-
-
 @settings(max_examples=30, deadline=None)
-@given(
-    ids=st.sets(st.integers(0, 2000), min_size=60, max_size=300),
-    seed=st.integers(0, 5),
-    gap=st.integers(0, 15),
-)
-def test_no_neighbours_in_two_parts(ids, seed, gap):
-    whole = labelled([(f"0_{each % 7}_{each:05d}", f"g{each % 7}") for each in sorted(ids)])
-    parts = split_by_blocks(whole, SHARES, block=15, gap=gap, seed=seed)
-    of = {name: np.array(sorted(numbers(part))) for name, part in parts.items()}
-    for one, other in (("train", "val"), ("train", "test"), ("val", "test")):
-        if len(of[one]) and len(of[other]):
-            assert np.abs(of[one][:, None] - of[other][None]).min() > gap
-    dropped = sum(note.count for part in parts.values() for note in part.notices)
-    assert sum(map(len, parts.values())) + dropped == len(ids)
-
-
-def test_only_the_larger_part_gives_way_and_only_at_its_borders():
-    whole = labelled([(f"f_{each:05d}", "f") for each in range(400)])
-    parts = split_by_blocks(whole, {"test": 0.25, "train": 0.75}, block=100, gap=10, seed=2)
-    test, train = numbers(parts["test"]), numbers(parts["train"])
-    assert len(test) == 100 and max(test) - min(test) == 99
-    borders = (min(test) > 0) + (max(test) < 399)
-    assert len(train) == 300 - 10 * borders
-    assert [(note.code, note.count) for note in parts["train"].notices] == [
-        ("left_out_at_borders", 10 * borders)
-    ]
+@given(ids=st.sets(st.integers(0, 2000), min_size=60, max_size=300), seed=st.integers(0, 5))
+def test_no_neighbours_of_one_video_in_two_parts(ids, seed):
+    whole = labelled([(f"0_{each:05d}", "g") for each in sorted(ids)])
+    learnt, held, remarks = hold_out(whole, 0.2, seed)
+    of = [np.array(sorted(numbers(part))) for part in (learnt, held)]
+    gap = min(10, len(ids) // 10 // 2)
+    assert np.abs(of[0][:, None] - of[1][None]).min() > gap
+    assert "too good" in remarks[0]
+    left_out = len(ids) - len(learnt) - len(held)
+    assert [each.split()[1] for each in remarks[1:]] == ([str(left_out)] if left_out else [])
 
 
 def test_numbers_that_come_twice_make_a_sequence_of_each_video():
     whole = labelled(
         [(f"v{video}_{index:04d}", f"v{video}") for video in range(2) for index in range(40)]
     )
-    parts = split_by_blocks(whole, {"train": 0.5, "test": 0.5}, block=40, gap=10)
-    assert {len(part) for part in parts.values()} == {40}
-    assert all(len({each.group for each in part.pictures}) == 1 for part in parts.values())
+    learnt, held, _ = hold_out(whole, 0.1, 1)
+    assert len(held) == 8 and len({each.group for each in held.pictures}) == 1
+    assert 64 <= len(learnt) <= 68
 
 
-def test_blocks_need_numbers_and_enough_pictures():
-    with pytest.raises(InputError, match="no number in its name"):
-        split_by_blocks(labelled([("one", "a"), ("two", "b")]), {"train": 1.0})
-    with pytest.raises(InputError, match="smaller blocks"):
-        split_by_blocks(videos(50), {"train": 0.5, "test": 0.5}, block=100)
-    with pytest.raises(SettingsError, match="block must be"):
-        split_by_blocks(videos(50), {"train": 1.0}, block=0)
+def test_what_cannot_be_divided_is_learnt_whole():
+    for whole, words in (
+        (labelled([("one", "a"), ("two", "a")]), "no number in its name"),
+        (labelled([("one_1", "a")]), "too few to be divided"),
+    ):
+        learnt, held, (remark,) = hold_out(whole, 0.2, 1)
+        assert len(learnt) == len(whole) and not len(held) and words in remark
+    with pytest.raises(SettingsError, match="below 1"):
+        hold_out(videos(5, 5), 1.0, 1)
 
 
 def test_a_video_in_two_sets_is_warned_of():

@@ -1,9 +1,7 @@
 """`sorvolo reproduce`: the experiments of the thesis's chapter 4, on the UMCD dataset or a simulated one."""
 
-import json
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.box import SIMPLE_HEAD
@@ -11,10 +9,10 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sorvolo.cli.options import AsJson
-from sorvolo.cli.printing import TO_CHECK
+from sorvolo.cli.options import AsJson, OutFolder
+from sorvolo.cli.printing import TO_CHECK, print_json
 from sorvolo.cli.progress import ProgressReport
-from sorvolo.cli.train import Preset
+from sorvolo.cli.train import PresetOption
 from sorvolo.errors import SettingsError
 from sorvolo.survey.wording import counted
 
@@ -25,17 +23,9 @@ if TYPE_CHECKING:
 _DEFAULT_OUT = Path("reproduction")
 
 
-class Schedule(StrEnum):
-    """How the networks of Table 4.6 learn."""
-
-    JOINT = "joint"
-    FOUR_STEPS = "four-steps"
-
-
 Dataset = Annotated[
     Path | None, typer.Argument(help="The UMCD dataset's folder, in the thesis's layout.")
 ]
-OutFolder = Annotated[Path, typer.Option(help="Folder for tables, figures, maps and models.")]
 Simulated = Annotated[
     bool, typer.Option("--simulated", help="Simulate a dataset in the same layout instead.")
 ]
@@ -50,11 +40,9 @@ Npu = Annotated[
     Path | None, typer.Option(help="The NPU Drone-Map dataset's folder, for Table 4.1.")
 ]
 TrainSteps = Annotated[int, typer.Option(help="Steps of each network of Table 4.6; 0: train none.")]
-NetworkPreset = Annotated[
-    Preset, typer.Option(help="Network of Table 4.6: fast, accurate, or the thesis's own.")
-]
 NetworkSchedule = Annotated[
-    Schedule, typer.Option(help="How Table 4.6 is trained: joint, or the thesis's four steps.")
+    Literal["joint", "four-steps"],
+    typer.Option(help="How Table 4.6 is trained: joint, or the thesis's four steps."),
 ]
 
 
@@ -67,8 +55,8 @@ def reproduce(
     okutama: Okutama = None,
     npu: Npu = None,
     train_steps: TrainSteps = 400,
-    preset: NetworkPreset = Preset.FAST,
-    schedule: NetworkSchedule = Schedule.JOINT,
+    preset: PresetOption = "fast",
+    schedule: NetworkSchedule = "joint",
     as_json: AsJson = False,
 ) -> None:
     """Repeat the thesis's experiments of chapter 4: Tables 4.1, 4.3 to 4.6 and the figures, beside the printed ones.
@@ -89,7 +77,7 @@ def reproduce(
     from sorvolo.lab.thesis.settings import quick as quick_sizes
 
     settings = ReproductionSettings(
-        videos, detector=DetectorSettings(train_steps, preset.value, schedule=schedule.value)
+        videos, detector=DetectorSettings(train_steps, preset, schedule=schedule)
     )
     simulation = SimulatedSize()
     if quick:
@@ -98,27 +86,25 @@ def reproduce(
         raise SettingsError("give the folder of the UMCD dataset, or --simulated; one of both")
     if simulated:
         dataset = out / "dataset"
-        _simulate(dataset, simulation, settings)
+        from sorvolo.lab.thesis.simulated import simulated_dataset
+
+        with ProgressReport(Console(stderr=True)) as progress:
+            for name, step in simulated_dataset(dataset, simulation, settings):
+                if step.stage == "frames":
+                    progress.show(
+                        f"simulating {name}, {step.flight}, frame",
+                        step.frames_done,
+                        step.frames_total,
+                    )
     assert dataset is not None
     rows = _rows(dataset, out, settings, {"okutama": okutama, "npu": npu}, is_whole=not simulated)
     document = _written(out, rows, dataset, settings, simulation if simulated else None)
     if as_json:
-        typer.echo(json.dumps(document, indent=1, ensure_ascii=False))
+        print_json(document)
     else:
         _show(document, out / PAGE)
     if document["missing"]:
         raise typer.Exit(TO_CHECK)
-
-
-def _simulate(place: Path, size: "SimulatedSize", settings: "ReproductionSettings") -> None:
-    from sorvolo.lab.thesis.simulated import simulated_dataset
-
-    with ProgressReport(Console(stderr=True)) as progress:
-        for name, step in simulated_dataset(place, size, settings):
-            if step.stage == "frames":
-                progress.show(
-                    f"simulating {name}, {step.flight}, frame", step.frames_done, step.frames_total
-                )
 
 
 def _rows(

@@ -4,9 +4,8 @@ import json
 import math
 from collections.abc import Generator, Iterator
 from dataclasses import asdict
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import typer
 from rich.console import Console
@@ -17,6 +16,7 @@ from sorvolo.cli.options import (
     GroupPattern,
     IgnoredClasses,
     LabelClasses,
+    OutFolder,
     Seed,
     UnlabelledClasses,
     class_names,
@@ -30,17 +30,9 @@ if TYPE_CHECKING:  # torch is an extra, and slow to import: only this command ne
     from sorvolo.lab.training.detector import TrainingUpdate
 
 
-class Preset(StrEnum):
-    """The network's shape."""
-
-    FAST = "fast"
-    ACCURATE = "accurate"
-    THESIS = "thesis"
-
-
 PresetOption = Annotated[
-    Preset,
-    typer.Option(help="fast: laptops. accurate: GPUs. thesis: ResNet-50 with the nine modules."),
+    Literal["fast", "thesis"],
+    typer.Option(help="fast: any computer. thesis: ResNet-50 with the nine modules."),
 ]
 CheckedOn = Annotated[
     str, typer.Option(help="A labelled set to check on, or the share of videos to hold out.")
@@ -58,10 +50,8 @@ def train(
     data: Annotated[
         list[Path] | None, typer.Argument(help="Labelled sets: folders, or their label files.")
     ] = None,
-    out: Annotated[
-        Path, typer.Option(help="Folder for the model, the report and the checkpoints.")
-    ] = Path("model"),
-    preset: PresetOption = Preset.FAST,
+    out: OutFolder = Path("model"),
+    preset: PresetOption = "fast",
     val: CheckedOn = "0.15",
     weights: StartingWeights = "auto",
     steps: Annotated[int, typer.Option(help="Number of batches.")] = 8000,
@@ -86,15 +76,15 @@ def train(
 
     Example, the packaged model tuned to your own pictures: sorvolo train my-labels --out tuned --weights default
 
-    Example: sorvolo train a b --preset accurate --val c --synthetic 0.2
+    Example: sorvolo train a b --val c --synthetic 0.2
 
     Example: sorvolo train my-labels --out my-model --resume
     """
     from sorvolo.lab.training.settings import TrainSettings
 
     settings = TrainSettings(
-        preset.value,
-        rpn="extended" if preset == Preset.THESIS else "extended-residual",
+        preset,
+        rpn="extended" if preset == "thesis" else "extended-residual",
         weights=weights,
         steps=steps,
         batch=batch,

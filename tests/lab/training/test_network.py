@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
-from sorvolo.errors import SettingsError
 from sorvolo.lab.thesis.four_steps import proposal_loss
 from sorvolo.lab.thesis.network import ExtendedStack
 from sorvolo.lab.training.backbones import EfficientNetLite0, FeaturePyramid
@@ -44,14 +43,12 @@ from sorvolo.lab.training.regions import (
     pooled_levels,
     roi_align,
     suppress,
-    suppress_all_pairs,
 )
 from sorvolo.lab.training.samples import (
     Augmentation,
     Share,
     TrainingSample,
     cut_sample,
-    paste_small_objects,
 )
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 
@@ -86,7 +83,7 @@ class _TinyBackbone(torch.nn.Module):
 def tiny(stem="extended-residual"):
     torch.manual_seed(5)
     backbone = _TinyBackbone()
-    neck = FeaturePyramid(backbone.channels, 16, light=True)
+    neck = FeaturePyramid(backbone.channels, 16)
     anchors = (AnchorSettings((8, 14)), AnchorSettings((22, 32)))
     proposals = ProposalNetwork(neck.channels, backbone.strides, anchors, stem, 16, light=True)
     return FasterRCNN(
@@ -192,21 +189,6 @@ def test_another_network_s_file_is_no_export_of_this_one(trained):
     assert not check.is_good and check.box_px > 0.5, check
 
 
-def test_an_export_looks_at_as_many_regions_as_its_settings_give(trained):
-    model = trained[0].average
-    pictures = [each.image for each in squares(4, 4)]
-    whole, few = (
-        export_onnx(model, {"classes": ["square", "disc"], "name": "tiny"}, regions=count)
-        for count in (None, 2)
-    )
-    checks = [check_export(model, each, pictures) for each in (whole, few)]
-    assert all(each.is_good for each in checks), checks
-    assert checks[1].detections < checks[0].detections
-    assert model.reach.regions == 60
-    with pytest.raises(SettingsError, match="one region or more"):
-        export_onnx(model, {"classes": ["square"]}, regions=0)
-
-
 def test_training_goes_on_from_its_state_as_if_it_had_not_stopped():
     pictures = squares(8 * 4, 7)
     whole = JointTraining(tiny(), JointSettings(steps=8, batch=4), 3)
@@ -247,14 +229,13 @@ def test_the_thesis_stack_has_the_tables_layers():
 
 def test_a_residual_stack_adds_nothing_at_first():
     features = torch.randn(1, 32, 9, 9)
-    for light in (True, False):
-        stack = ResidualStack(32, 32, light=light).eval()
-        assert torch.allclose(stack(features), stack.standard(features), atol=1e-6)
+    stack = ResidualStack(32).eval()
+    assert torch.allclose(stack(features), stack.standard(features), atol=1e-6)
 
 
 def test_every_stem_shows_how_wide_it_is():
     for kind in ("standard", "extended", "extended-residual"):
-        for light in (True, False):
+        for light in (True, False)[: 1 if kind == "extended-residual" else 2]:
             stem = proposal_stem(kind, 16, 16, light=light).eval()
             assert stem(torch.zeros(1, 16, 6, 6)).shape[1] == stem.channels
 
@@ -321,18 +302,6 @@ def test_suppression_keeps_no_two_that_overlap_and_loses_none_that_stands_alone(
     for index in set(range(len(boxes))) - set(kept.tolist()):
         better = [int(k) for k in kept if scores[0, k] >= scores[0, index]]
         assert (overlap[index][better] > 0.5 - 1e-6).any()
-
-
-@settings(max_examples=50, deadline=None)
-@given(st.lists(_BOX, max_size=40), st.integers(0, 100), st.integers(1, 40), st.booleans())
-def test_suppression_over_all_pairs_keeps_the_same_in_the_same_order(boxes, seed, most, are_ties):
-    b = torch.tensor(boxes).reshape(-1, 4)
-    scores = torch.rand(2, len(boxes), generator=torch.Generator().manual_seed(seed))
-    if are_ties:
-        scores = torch.round(scores * 4) / 4
-    for iou in (0.3, 0.7):
-        at_once = suppress_all_pairs(b, scores, most, iou, 0.1)[:, 1:]
-        assert torch.equal(at_once, suppress(b, scores, most, iou, 0.1))
 
 
 def test_regions_are_cut_as_onnx_cuts_them():
@@ -451,18 +420,3 @@ def test_crops_carry_their_boxes_along():
             assert np.abs(np.array(bright) - box).max() < 2.0
             seen += 1
     assert seen > 8
-
-
-def test_pasted_objects_stand_in_their_boxes_and_not_on_others():
-    ground = np.full((200, 200, 3), 120, np.uint8)
-    taken = np.array([[0, 0, 100, 200.0]])
-    rng = np.random.default_rng(1)
-    many = 0
-    for _ in range(20):
-        out, boxes = paste_small_objects(ground, taken, rng)
-        many += len(boxes)
-        for left, top, right, bottom in boxes.astype(int):
-            assert left >= 99
-            inside = out[top:bottom, left:right].astype(int)
-            assert np.abs(inside - 120).max() > 5
-    assert many > 15

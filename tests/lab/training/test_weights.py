@@ -31,7 +31,7 @@ def lite0() -> dict[str, "torch.Tensor"]:
     """A state dict with the names and shapes of the published one; its values are one small pattern."""
     pattern = torch.linspace(0.01, 1.0, 97)
     shapes: dict[str, tuple[int, ...]] = {}
-    for name, value in EfficientNetLite0(deep=True).state_dict().items():
+    for name, value in EfficientNetLite0().state_dict().items():
         if name.endswith(".weight"):  # of lite0 the biases are the batch norms', folded in
             place, _, layer = name.removesuffix(".weight").rpartition(".")
             shapes[name] = tuple(value.shape)
@@ -58,7 +58,7 @@ def test_lite0_from_a_wheel(lite0: dict[str, "torch.Tensor"], wheel: bytes) -> N
     assert torch.equal(
         found["_blocks.7._depthwise_conv.weight"], lite0["_blocks.7._depthwise_conv.weight"]
     )
-    net = EfficientNetLite0(deep=True)
+    net = EfficientNetLite0()
     net.load_imagenet(found)
     gain = lite0["_bn0.weight"] / torch.sqrt(lite0["_bn0.running_var"] + 1e-3)
     assert torch.allclose(

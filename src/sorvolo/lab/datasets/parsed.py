@@ -169,7 +169,7 @@ def is_label_file(path: Path) -> bool:
     return path.name.lower() not in _NOT_LABELS
 
 
-PICTURE_ENDINGS = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"})
+PICTURE_ENDINGS = frozenset([".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"])
 
 _BROKEN = (
     OSError,

@@ -1,91 +1,17 @@
 """Labelled pictures divided into parts that share no video, so that a score on one part holds for new videos."""
 
 import re
-from collections import Counter
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path, PurePath
-from typing import TypeVar
 
 import numpy as np
 
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.geometry.arrays import Floats
 from sorvolo.survey.flight import Notice
 from sorvolo.survey.labels import LabelledSet
 
-_Group = TypeVar("_Group", bound=Hashable)
-
 _SHUFFLES = 16  # few, so that seeds still differ; enough that no large video lands in a small part by bad luck
 _EXPORTED = re.compile(r"[_.](jpe?g|png|bmp|tiff?)(\.rf\.[0-9a-z]+)?$", re.IGNORECASE)
-
-
-def split_by_group(
-    labelled: LabelledSet, shares: Mapping[str, float], seed: int = 0
-) -> dict[str, LabelledSet]:
-    """Whole groups (videos, flights) to each part, such as {"train": 0.8, "test": 0.2} of the pictures, by chance.
-
-    Every part gets at least one group; the shares are met as closely as whole groups allow. The same seed gives the
-    same parts whatever the pictures' order. Raises SettingsError for impossible shares, InputError when there are fewer
-    groups than parts.
-    """
-    _demand_shares(shares)
-    sizes = Counter(picture.group for picture in labelled.pictures)
-    if len(sizes) < len(shares):
-        raise InputError(
-            f"{labelled.name}: {len(sizes)} videos cannot make {len(shares)} parts that share none; take fewer parts, "
-            "name how videos are distinguished, or split by blocks of consecutive frames"
-        )
-    part_of = _assigned(sizes, shares, seed)
-    return {
-        part: labelled.only([each for each in labelled.pictures if part_of[each.group] == part])
-        for part in shares
-    }
-
-
-def split_by_blocks(
-    labelled: LabelledSet,
-    shares: Mapping[str, float],
-    block: int = 100,
-    gap: int = 10,
-    seed: int = 0,
-) -> dict[str, LabelledSet]:
-    """Whole blocks of `block` pictures with consecutive frame numbers to each part, for sets of few, long videos.
-
-    Frame numbers are the last ones in the pictures' names. Where all of a set differ they are one sequence, else each
-    group is one. Where two parts meet, pictures whose numbers are within `gap` of the other part's are near-duplicates:
-    the part with the larger share drops them and counts them. Raises SettingsError for impossible shares, InputError
-    when names have no number or there are fewer blocks than parts.
-    """
-    _demand_shares(shares)
-    if block < 1 or gap < 0:
-        raise SettingsError(f"block must be at least 1 and gap at least 0, got {block} and {gap}")
-    places = _places(labelled)
-    blocks = _blocks(places, block)
-    if len(blocks) < len(shares):
-        raise InputError(
-            f"{labelled.name}: {len(labelled)} pictures make {len(blocks)} blocks of {block}, fewer than the "
-            f"{len(shares)} parts; take smaller blocks"
-        )
-    chosen = _assigned({index: len(each) for index, each in enumerate(blocks)}, shares, seed)
-    members = {
-        part: [row for index, each in enumerate(blocks) if chosen[index] == part for row in each]
-        for part in shares
-    }
-    by_share = sorted(shares, key=lambda part: -shares[part])
-    parts = {}
-    for part in shares:
-        smaller = [row for other in by_share[by_share.index(part) + 1 :] for row in members[other]]
-        kept = _far_from(members[part], smaller, places, gap)
-        text = f"{{}} pictures of {part} are within {gap} frames of another part and were left out"
-        left_out = len(members[part]) - len(kept)
-        notices = (
-            (Notice("left_out_at_borders", left_out, text.format(left_out)),) if left_out else ()
-        )
-        pictures = tuple(labelled.pictures[row] for row in kept)
-        parts[part] = LabelledSet(
-            labelled.name, labelled.classes, pictures, labelled.unlabelled, notices
-        )
-    return parts
 
 
 def shared_groups(first: LabelledSet, second: LabelledSet) -> tuple[Notice, ...]:
@@ -124,50 +50,6 @@ def stem_of(path: str) -> str:
     """A picture's file name without its ending, nor that of an export ("_jpg.rf.0f3a")."""
     name = path.replace("\\", "/").rsplit("/", 1)[-1]
     return _EXPORTED.sub("", name.rsplit(".", 1)[0])
-
-
-def _demand_shares(shares: Mapping[str, float]) -> None:
-    if (
-        not shares
-        or not all(0 < share <= 1 for share in shares.values())
-        or abs(sum(shares.values()) - 1) > 1e-6
-    ):
-        raise SettingsError(f"shares must be above 0 and sum up to 1, got {dict(shares)}")
-
-
-def _assigned(
-    sizes: Mapping[_Group, int], shares: Mapping[str, float], seed: int
-) -> dict[_Group, str]:
-    """A part for every group: of a few shuffles the one that meets the shares best."""
-    rng = np.random.default_rng(seed)
-    groups = sorted(sizes, key=str)
-    parts = list(shares)
-    wanted = np.array(list(shares.values())) * sum(sizes.values())
-    best: dict[_Group, str] = {}
-    least = np.inf
-    for _ in range(_SHUFFLES):
-        chosen, missed = _dealt(
-            [groups[index] for index in rng.permutation(len(groups))], sizes, wanted
-        )
-        if missed < least:
-            best, least = {group: parts[part] for group, part in chosen.items()}, missed
-    return best
-
-
-def _dealt(
-    groups: Sequence[_Group], sizes: Mapping[_Group, int], wanted: Floats
-) -> tuple[dict[_Group, int], float]:
-    """Each group in turn to the part that lacks most; and by how many pictures the parts miss what was wanted."""
-    lacking = wanted.copy()
-    empty = set(range(len(wanted)))
-    chosen: dict[_Group, int] = {}
-    for index, group in enumerate(groups):
-        open_parts = sorted(empty) if len(groups) - index <= len(empty) else range(len(wanted))
-        part = max(open_parts, key=lambda each: (lacking[each], -each))
-        chosen[group] = part
-        lacking[part] -= sizes[group]
-        empty.discard(part)
-    return chosen, float(np.abs(lacking).sum())
 
 
 def _places(labelled: LabelledSet) -> list[tuple[str, int]]:
@@ -214,10 +96,7 @@ def _far_from(
     return kept
 
 
-_BLOCKS, _GAP = (
-    10,
-    10,
-)  # into which a set of too few videos is cut; frames left out between them, at most
+_BLOCKS, _GAP = 10, 10  # of a set of too few videos; frames left out between them, at most
 
 
 def hold_out(
@@ -225,34 +104,58 @@ def hold_out(
 ) -> tuple[LabelledSet, LabelledSet, list[str]]:
     """What is learnt from, what is held out, and notices about that; whole videos wherever there are enough.
 
-    `sorvolo train --val SHARE` and `read_sets` take it from here. Raises
-    SettingsError for a share outside 0 to below 1.
+    Of few videos whole blocks of neighbouring frames are held out, and near-duplicates beside them are left out. The
+    same seed gives the same parts whatever the pictures' order. Raises SettingsError for a share outside 0 to below 1.
     """
     if not 0 <= share < 1:
         raise SettingsError(f"the share to hold out must lie in 0 to below 1, got {share}")
-    shares = {"learnt": 1 - share, "held out": share}
-    empty = labelled.only([])
+    empty, count = labelled.only([]), len(labelled)
     if share == 0:
         return labelled, empty, []
-    try:
-        parts = split_by_group(labelled, shares, seed)
-        if share / 3 <= len(parts["held out"]) / len(labelled) <= min(3 * share, (1 + share) / 2):
-            return parts["learnt"], parts["held out"], []
-    except InputError:
-        pass  # too few videos: blocks of frames are held out below
-    block = max(1, len(labelled) // _BLOCKS)
-    try:
-        parts = split_by_blocks(labelled, shares, block, min(_GAP, block // 2), seed)
-    except InputError as error:
-        return labelled, empty, [f"nothing of {labelled.name} is held out: {error}"]
-    text = (
-        f"{labelled.name} has too few videos to hold whole ones out: blocks of about {block} neighbouring frames were "
-        "instead; frames of one video look alike, so the score will be too good"
+    videos: dict[str, list[int]] = {}
+    for row, picture in enumerate(labelled.pictures):
+        videos.setdefault(picture.group, []).append(row)
+    held = _drawn([videos[name] for name in sorted(videos)], share * count, seed)
+    block = max(1, count // _BLOCKS)
+    remarks, learnt = [], sorted({*range(count)} - held)
+    if not share / 3 <= len(held) / max(1, count) <= min(3 * share, (1 + share) / 2):
+        try:
+            places = _places(labelled)
+        except InputError as error:
+            return labelled, empty, [f"nothing of {labelled.name} is held out: {error}"]
+        held = _drawn(_blocks(places, block), share * count, seed)
+        if not held:
+            words = f"{count} pictures are too few to be divided"
+            return labelled, empty, [f"nothing of {labelled.name} is held out: {words}"]
+        gap, rest = min(_GAP, block // 2), sorted({*range(count)} - held)
+        learnt = _far_from(rest, sorted(held), places, gap)
+        remarks = [
+            f"{labelled.name} has too few videos to hold whole ones out: blocks of about {block} neighbouring frames were "
+            "instead; frames of one video look alike, so the score will be too good"
+        ]
+        if left_out := len(rest) - len(learnt):
+            remarks.append(
+                f"{labelled.name}: {left_out} pictures are within {gap} frames of held-out ones and were left out"
+            )
+    parts = (
+        labelled.only([labelled.pictures[row] for row in rows]) for rows in (learnt, sorted(held))
     )
-    remarks = [
-        f"{labelled.name}: {notice.text}" for each in parts.values() for notice in each.notices
-    ]
-    return parts["learnt"], parts["held out"], [text, *remarks]
+    return next(parts), next(parts), remarks
+
+
+def _drawn(units: Sequence[Sequence[int]], wanted: float, seed: int) -> set[int]:
+    """The rows of some whole units, about `wanted` in all: of a few shuffles the one that comes nearest. Nothing of
+    fewer than two units; else at least one unit is drawn and one left."""
+    rng = np.random.default_rng(seed)
+    best: set[int] = set()
+    for _ in range(_SHUFFLES if len(units) > 1 else 0):
+        drawn: set[int] = set()
+        for index in rng.permutation(len(units))[:-1]:
+            if not drawn or abs(len(drawn) + len(units[index]) - wanted) < abs(len(drawn) - wanted):
+                drawn.update(units[index])
+        if not best or abs(len(drawn) - wanted) < abs(len(best) - wanted):
+            best = drawn
+    return best
 
 
 _NUMBERED = re.compile(

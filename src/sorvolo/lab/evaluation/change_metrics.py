@@ -306,21 +306,22 @@ def score_events(match: EventMatch, compared_m2: float) -> EventScores:
         optional=len(match.optional),
         named_right=_named_right(match.pairs),
         compared_m2=compared_m2,
-        error_median_m=_percentile(errors_m, 50),
-        error_p95_m=_percentile(errors_m, 95),
-        sigma_median_m=_sigma_median_m(on_map),
-        within_two_sigma=_within_two_sigma(on_map),
-        world_sigma_median_m=_sigma_median_m(in_world),
-        world_within_two_sigma=_within_two_sigma(in_world),
+        error_median_m=percentile(errors_m, 50),
+        error_p95_m=percentile(errors_m, 95),
+        sigma_median_m=sigma_median_m(on_map),
+        within_two_sigma=within_two_sigma(on_map),
+        world_sigma_median_m=sigma_median_m(in_world),
+        world_within_two_sigma=within_two_sigma(in_world),
         by_kind={str(kind): _kind_score(match, kind) for kind in ChangeKind},
     )
 
 
-def _sigma_median_m(offsets: Sequence[tuple[Floats, float]]) -> float:
-    return _percentile([sigma_m for _, sigma_m in offsets if math.isfinite(sigma_m)], 50)
+def sigma_median_m(offsets: Sequence[tuple[Floats, float]]) -> float:
+    """The median of the stated sigmas that are known, m."""
+    return percentile([sigma_m for _, sigma_m in offsets if math.isfinite(sigma_m)], 50)
 
 
-def _within_two_sigma(offsets: Sequence[tuple[Floats, float]]) -> float:
+def within_two_sigma(offsets: Sequence[tuple[Floats, float]]) -> float:
     """The share of the axes of offsets, (2,) each, that are under twice the sigma stated with it."""
     within = [
         np.abs(offset_m) <= 2 * sigma_m for offset_m, sigma_m in offsets if math.isfinite(sigma_m)
@@ -328,7 +329,8 @@ def _within_two_sigma(offsets: Sequence[tuple[Floats, float]]) -> float:
     return float(np.mean(within)) if within else math.nan
 
 
-def _percentile(values: Sequence[float], share: float) -> float:
+def percentile(values: Sequence[float], share: float) -> float:
+    """The percentile of the values; NaN without any."""
     return float(np.percentile(values, share)) if values else math.nan
 
 

@@ -11,19 +11,9 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Mask
 from sorvolo.lab.evaluation.change_metrics import Counts, frame_counts, pixel_counts
 
-MASK_ENDINGS = {
-    ".png",
-    ".jpg",
-    ".jpeg",
-    ".bmp",
-    ".tif",
-    ".tiff",
-    ".webp",
-    ".pgm",
-    ".pbm",
-    ".ppm",
-    ".gif",
-}
+MASK_ENDINGS = set(
+    [".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".pbm", ".ppm", ".gif"]
+)
 """The files that are masks, in small letters."""
 
 _LOSSY = {".jpg", ".jpeg", ".webp"}

@@ -14,6 +14,7 @@ import numpy as np
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import Floats, Matrix3, floats, frozen
 from sorvolo.geometry.homography import apply_homography
+from sorvolo.lab.evaluation.change_metrics import percentile, sigma_median_m, within_two_sigma
 from sorvolo.lab.evaluation.frame_rows import (
     paired_flights,
     read_features,
@@ -157,24 +158,25 @@ def score_objects(
     offsets_m = _offsets_m(pairs, middle_ns, np.eye(3))
     distances_m = np.hypot(*offsets_m.T)
     counted = [each for each in true if each.must_find]
-    within, sigma_median_m = _within_two_sigma(pairs, offsets_m)
+    stated = [(offset_m, one.sigma_m) for offset_m, (one, _) in zip(offsets_m, pairs)]
     return FlightObjects(
         flight,
         {name: _counts(name, counted, match) for name in CLASSES},
         _counts(None, counted, match),
         _count_error(found, counted, match),
         _rms(distances_m),
-        float(np.percentile(distances_m, 95)) if len(pairs) else math.nan,
+        percentile(distances_m.tolist(), 95),
         _rms(np.hypot(*_offsets_m(pairs, middle_ns, map_from_truth).T)),
         map_shift_m,
-        within,
-        sigma_median_m,
-        _median(
+        within_two_sigma(stated),
+        sigma_median_m(stated),
+        percentile(
             [
                 abs(one.length_m - other.length_m)
                 for one, other in pairs
                 if not math.isnan(one.length_m)
-            ]
+            ],
+            50,
         ),
         sum(other.moves for _, other in pairs),
         sum(one.moves == other.moves for one, other in pairs),
@@ -193,21 +195,6 @@ def frames_over(outline_m: Floats, map_from_truth: Matrix3, outlines_m: Floats) 
     return sum(
         cv2.pointPolygonTest((each - place_m).astype(np.float32), (0.0, 0.0), False) > 0
         for each in outlines_m
-    )
-
-
-def _within_two_sigma(
-    pairs: Sequence[tuple[JudgedObject, JudgedObject]], offsets_m: Floats
-) -> tuple[float, float]:
-    """The share of single-axis errors under twice the stated sigma, and the median of these; NaN without any."""
-    stated = [
-        (offset_m, one.sigma_m)
-        for offset_m, (one, _) in zip(offsets_m, pairs)
-        if math.isfinite(one.sigma_m)
-    ]
-    within = [abs(error_m) <= 2 * sigma_m for offset_m, sigma_m in stated for error_m in offset_m]
-    return float(np.mean(within)) if within else math.nan, _median(
-        [sigma_m for _, sigma_m in stated]
     )
 
 
@@ -258,10 +245,6 @@ def _counts(name: str | None, counted: Sequence[JudgedObject], match: ObjectMatc
 
 def _rms(distances_m: Floats) -> float:
     return float(np.sqrt(np.mean(distances_m**2))) if len(distances_m) else math.nan
-
-
-def _median(values: Sequence[float]) -> float:
-    return float(np.median(values)) if values else math.nan
 
 
 _LEAST_FRAMES = 2  # frames that were searched must show a true object before it has to be found

@@ -31,7 +31,7 @@ from sorvolo.store.atomic import atomic_path, atomic_write_bytes, writing
 from sorvolo.store.rasters.geotiff import open_raster
 from sorvolo.survey.flight import Frame, Telemetry
 
-UMCD_COLUMNS = (
+UMCD_COLUMNS = [
     "Tick#",
     "offsetTime",
     "flightTime(msec)",
@@ -92,7 +92,7 @@ UMCD_COLUMNS = (
     "MotorLoad:LFront",
     "MotorLoad:LBack",
     "MotorLoad:RBack",
-)
+]
 """The sixty columns of the thesis's Table 2.2, spelled as there."""
 
 _UMCD_IDLE_INSTRUMENTS = (

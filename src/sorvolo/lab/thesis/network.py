@@ -146,7 +146,8 @@ def thesis_network(
 ) -> FasterRCNN:
     """The thesis's own (its 3.3.2): ResNet-50 up to res4, proposals through Table 3.2's nine modules, res5 as head.
 
-    `original` and `frozen` as for `accurate`.
+    `original`: where ResNet's strides sit (`ResNet50`); it follows from the weights that are to be loaded. `frozen`: its
+    batch norms and first layers stay as loaded.
     """
     backbone = ResNet50(original=original, frozen_norms=frozen, thaw_all=not frozen)
     proposals = ProposalNetwork(

@@ -29,7 +29,7 @@ class DetectorSettings:
     """Table 4.6: how the two networks are trained. `steps` 0 trains none; `weights` as `sorvolo train` takes it."""
 
     steps: int = 400
-    preset: Literal["fast", "accurate", "thesis"] = "fast"
+    preset: Literal["fast", "thesis"] = "fast"
     weights: str = "auto"  # the thesis, too, begins with ImageNet's
     device: str = "auto"
     side_px: int = 416  # of the training samples, as `sorvolo train` cuts them

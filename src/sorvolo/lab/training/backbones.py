@@ -14,8 +14,6 @@ _BLOCKS = (  # repeats, kernel, stride, growth, out channels
     (2, 5, 2, 6, 40),
     (3, 3, 2, 6, 80),
     (3, 5, 1, 6, 112),
-    (4, 5, 2, 6, 192),
-    (1, 3, 1, 6, 320),
 )
 
 _STRIDE_8 = 5  # so many blocks come up to it
@@ -92,11 +90,11 @@ class _Block(nn.Module):
         return x + features if self._is_residual else x
 
 
-def _blocks(deep: bool) -> list[_Block]:
-    """The blocks up to stride 16, or to 32 if `deep`, behind a stem of 32 channels."""
+def _blocks() -> list[_Block]:
+    """The blocks up to stride 16, behind a stem of 32 channels."""
     blocks: list[_Block] = []
     channels = 32
-    for repeats, kernel, stride, growth, out in _BLOCKS if deep else _BLOCKS[:5]:
+    for repeats, kernel, stride, growth, out in _BLOCKS:
         for repeat in range(repeats):
             blocks.append(_Block(channels, out, kernel, stride if repeat == 0 else 1, growth))
             channels = out
@@ -104,21 +102,20 @@ def _blocks(deep: bool) -> list[_Block]:
 
 
 class EfficientNetLite0(nn.Module):
-    """Features of strides 4, 8 and 16 (24, 40 and 112 channels), of 32 too (320) if `deep`.
+    """Features of strides 4, 8 and 16 (24, 40 and 112 channels).
 
     Its batch norms, which would stay as ImageNet left them, are folded into the convolutions. Unless `thaw_all` the
     stem and the first block are frozen, and up to stride 8 the kernels that filter each channel by itself, which are
     the dearest to learn. Input: (N, 3, H, W) floats 0 to 255, sides multiples of the last stride.
     """
 
-    def __init__(self, *, deep: bool = False, thaw_all: bool = False) -> None:
+    def __init__(self, *, thaw_all: bool = False) -> None:
         super().__init__()
         self._conv_stem = SamePadded(3, 32, 3, 2)
-        blocks = _blocks(deep)
+        blocks = _blocks()
         self._blocks = nn.ModuleList(blocks)
-        self._taps = (2, 4, 10, 15) if deep else (2, 4, 10)
-        self.channels = (24, 40, 112, 320) if deep else (24, 40, 112)
-        self.strides = (4, 8, 16, 32) if deep else (4, 8, 16)
+        self._taps = (2, 4, 10)
+        self.channels, self.strides = (24, 40, 112), (4, 8, 16)
         for layer in self.modules():
             if isinstance(
                 layer, nn.Conv2d
@@ -326,7 +323,7 @@ def resnet_stage(
 
 
 class ResNet50(nn.Module):
-    """Features of stride 16 (C4, 1024 channels), or with `deep` of strides 4, 8, 16, 32 (C2 to C5: 256 to 2048).
+    """Features of stride 16 (C4, 1024 channels).
 
     `original` places the strides as He et al. and Keras do, else as torchvision does: weights of one compute another
     function in the other. The stem and res2 stay as they are unless `thaw_all`; batch norms do if `frozen_norms`.
@@ -338,38 +335,34 @@ class ResNet50(nn.Module):
     def __init__(
         self,
         *,
-        deep: bool = False,
         original: bool = False,
         frozen_norms: bool = True,
         thaw_all: bool = False,
     ) -> None:
         super().__init__()
-        self.original, self.deep = original, deep
+        self.original = original
         self.conv1 = nn.Conv2d(3, 64, 7, 2, 3, bias=False)
         self.bn1 = FrozenNorm(64) if frozen_norms else nn.BatchNorm2d(64)
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN) * 255)
-        for index in range(1, 5 if deep else 4):
+        for index in range(1, 4):
             self.add_module(
                 f"layer{index}", resnet_stage(index, original=original, frozen_norms=frozen_norms)
             )
         nn.init.kaiming_normal_(self.conv1.weight, mode="fan_out", nonlinearity="relu")
         with torch.no_grad():  # what torchvision does to its input: (value / 255 - mean) / std
             self.conv1.weight /= torch.tensor(IMAGENET_STD)[None, :, None, None] * 255
-        self.channels = (256, 512, 1024, 2048) if deep else (1024,)
-        self.strides = (4, 8, 16, 32) if deep else (16,)
+        self.channels, self.strides = (1024,), (16,)
         if not thaw_all:
             for module in (self.conv1, self.bn1, self.get_submodule("layer1")):
                 module.requires_grad_(False)
 
     def forward(self, images: Tensor) -> list[Tensor]:
-        """One tensor (N, channels, H / stride, W / stride) per stride."""
+        """One tensor (N, 1024, H / 16, W / 16)."""
         x = functional.relu(self.bn1(self.conv1(images - self.mean[:, None, None])))
         x = functional.max_pool2d(x, 3, 2, 1)
-        levels = []
-        for index in range(1, 5 if self.deep else 4):
+        for index in range(1, 4):
             x = self.get_submodule(f"layer{index}")(x)
-            levels.append(x)
-        return levels if self.deep else levels[-1:]
+        return [x]
 
     def load_imagenet(self, weights: Mapping[str, Tensor]) -> None:
         """Take weights by torchvision's names and `mean` (`weights.ImageNetWeights`); what is not of this net is left.
@@ -411,14 +404,12 @@ def separable(channels: int, kernel: int) -> nn.Sequential:
 
 
 class FeaturePyramid(nn.Module):
-    """Levels of `width` channels each; `light` smooths them with separable convolutions."""
+    """Levels of `width` channels each, smoothed with separable convolutions."""
 
-    def __init__(self, channels: Sequence[int], width: int, *, light: bool) -> None:
+    def __init__(self, channels: Sequence[int], width: int) -> None:
         super().__init__()
         self.lateral = nn.ModuleList(nn.Conv2d(each, width, 1) for each in channels)
-        self.smooth = nn.ModuleList(
-            separable(width, 3) if light else convolution(width, width, 3) for _ in channels
-        )
+        self.smooth = nn.ModuleList(separable(width, 3) for _ in channels)
         self.channels = (width,) * len(channels)
 
     def forward(self, levels: Sequence[Tensor]) -> list[Tensor]:

@@ -12,7 +12,6 @@ from sorvolo.lab.training.backbones import (
     Depthwise,
     EfficientNetLite0,
     FeaturePyramid,
-    ResNet50,
     convolution,
     load_stage,
     separable,
@@ -142,37 +141,21 @@ class StandardStack(nn.Module):
 
 
 class ResidualStack(nn.Module):
-    """Ours: the standard convolution, to which a stack of Inception modules learns to add; at first it adds nothing.
+    """Ours: the standard convolution, to which Inception branches learn to add; at first they add nothing.
 
-    `light` is for pictures on a laptop: each module filters by 3x3, 5x5 and 7x7, channel by channel, side by side, and
-    mixes the three with its input. Else the modules are the table's, a quarter as wide.
+    For pictures on a laptop: it filters by 3x3, 5x5 and 7x7, channel by channel, side by side, and mixes the three with
+    its input.
     """
 
-    def __init__(self, channels: int, out: int, *, light: bool) -> None:
+    def __init__(self, channels: int) -> None:
         super().__init__()
-        self.channels = out
-        self.standard: nn.Module = (
-            separable(channels, 3) if light else convolution(channels, out, 3)
-        )
-        if light:
-            if channels != out:
-                raise ValueError(f"a light stack keeps its width, {channels}; got {out}")
-            self.added = nn.Sequential(_LightInception(channels))
-        else:
-            from sorvolo.lab.thesis.network import ExtendedStack
-
-            stack = ExtendedStack(channels, 0.25)
-            self.added = nn.Sequential(
-                stack, nn.Conv2d(stack.channels, out, 1, bias=False), nn.BatchNorm2d(out)
-            )
-            nn.init.zeros_(self.added[2].weight)  # type: ignore[arg-type]
+        self.channels = channels
+        self.standard = separable(channels, 3)
+        self.added = nn.Sequential(_LightInception(channels))
 
     def forward(self, features: Tensor) -> Tensor:
-        """(N, channels, H, W) -> (N, self.channels, H, W)."""
-        standard = self.standard(features)
-        if isinstance(self.added[0], _LightInception):
-            return self.added(standard)
-        return standard + self.added(features)
+        """(N, channels, H, W) -> (N, channels, H, W)."""
+        return self.added(self.standard(features))
 
 
 class _LightInception(nn.Module):
@@ -208,7 +191,7 @@ def proposal_stem(kind: Stem, channels: int, out: int, *, light: bool) -> nn.Mod
         from sorvolo.lab.thesis.network import ExtendedStack
 
         return ExtendedStack(channels, 0.125 if light else 1.0)
-    return ResidualStack(channels, out, light=light)
+    return ResidualStack(channels)
 
 
 def _predictor(channels: int, out: int, spread: float, bias: float) -> nn.Conv2d:
@@ -295,7 +278,7 @@ class FasterRCNN(nn.Module):
         return boxes[rows][order], best, labels[order]
 
 
-Preset = Literal["fast", "accurate", "thesis"]
+Preset = Literal["fast", "thesis"]
 
 _FAST_ANCHORS = (
     AnchorSettings((7, 11, 17)),
@@ -303,9 +286,6 @@ _FAST_ANCHORS = (
     AnchorSettings((80, 120, 190)),
 )
 _FAST_WIDTH = 64  # channels of the pyramid; by choice, for speed
-_ACCURATE_ANCHORS = tuple(
-    AnchorSettings(sizes, RATIOS) for sizes in ((10, 16), (25, 40), (63, 100), (160, 250))
-)
 
 
 def fast(
@@ -313,7 +293,7 @@ def fast(
 ) -> FasterRCNN:
     """For a laptop without a GPU: EfficientNet-Lite0 up to stride 16, a light pyramid down to stride 4, slim stacks."""
     backbone = EfficientNetLite0(thaw_all=thaw_all)
-    neck = FeaturePyramid(backbone.channels, _FAST_WIDTH, light=True)
+    neck = FeaturePyramid(backbone.channels, _FAST_WIDTH)
     proposals = ProposalNetwork(
         neck.channels, backbone.strides, _FAST_ANCHORS, rpn, _FAST_WIDTH, light=True
     )
@@ -321,28 +301,7 @@ def fast(
     return FasterRCNN(backbone, neck, proposals, head, Reach())
 
 
-def accurate(
-    classes: Sequence[str],
-    rpn: Stem = "extended-residual",
-    *,
-    original: bool = False,
-    frozen: bool = True,
-) -> FasterRCNN:
-    """For a GPU: ResNet-50 with a pyramid of strides 4 to 32 (P2 to P5), a stack on each, two fully connected layers.
-
-    `original`: where ResNet's strides sit (`resnet.ResNet50`); it follows from the weights that are to be loaded.
-    `frozen`: its batch norms and first layers stay as loaded.
-    """
-    backbone = ResNet50(deep=True, original=original, frozen_norms=frozen, thaw_all=not frozen)
-    neck = FeaturePyramid(backbone.channels, 256, light=False)
-    proposals = ProposalNetwork(
-        neck.channels, backbone.strides, _ACCURATE_ANCHORS, rpn, 256, light=False
-    )
-    head = TwoLayerHead(256, 1024, len(classes))
-    return FasterRCNN(backbone, neck, proposals, head, Reach(before=2000, regions=500))
-
-
-NETS: Mapping[Preset, Net] = {"fast": "lite0", "accurate": "resnet50", "thesis": "resnet50"}
+NETS: Mapping[Preset, Net] = {"fast": "lite0", "thesis": "resnet50"}
 """The backbone whose ImageNet weights a preset starts from."""
 
 
@@ -361,11 +320,10 @@ def build(
     if preset == "fast":
         model = fast(classes, rpn, thaw_all=weights is None)
     else:
-        resnet = accurate
-        if preset == "thesis":
-            from sorvolo.lab.thesis.network import thesis_network as resnet
+        from sorvolo.lab.thesis.network import thesis_network
+
         original = original if weights is None else weights.original
-        model = resnet(classes, rpn, original=original, frozen=weights is not None)
+        model = thesis_network(classes, rpn, original=original, frozen=weights is not None)
     if weights is None:
         return model
     model.backbone.load_imagenet(dict(weights.layers))  # type: ignore[operator]

@@ -4,7 +4,7 @@ import io
 import json
 import warnings
 from collections.abc import Mapping, Sequence
-from copy import copy, deepcopy
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -49,24 +49,20 @@ class ExportCheck:
         return self.box_px <= _SAME_PX and self.score <= _SAME_SCORE and self.unmatched == 0
 
 
-def export_onnx(model: FasterRCNN, info: dict[str, Any], *, regions: int | None = None) -> bytes:
+def export_onnx(model: FasterRCNN, info: dict[str, Any]) -> bytes:
     """The model as an ONNX file's bytes, with `info` as its "sorvolo" metadata (docs/model-file.md has the fields).
 
-    `regions`: how many the head looks at in a picture, None for as many as the model's own `Reach` has. The file
-    finds no more objects than that. Raises SettingsError when `info` names no classes or `regions` is below 1.
+    The file finds no more objects than the model's `Reach` has regions. Raises SettingsError when `info` names no classes.
     """
     if not info.get("classes"):
         raise SettingsError("an exported model needs the names of its classes")
-    if regions is not None and regions < 1:
-        raise SettingsError(f"a head looks at one region or more, not {regions}")
-    own = _reaching(deepcopy(model).eval().cpu(), regions or model.reach.regions)
     full = {
         "stride": model.stride,
         "least_score": model.reach.least_score,
-        "regions": own.reach.regions,
+        "regions": model.reach.regions,
         **info,
     }
-    return onnx_from_module(own, full)
+    return onnx_from_module(deepcopy(model).eval().cpu(), full)
 
 
 def onnx_from_module(model: nn.Module, info: dict[str, Any]) -> bytes:
@@ -106,8 +102,7 @@ def check_export(model: FasterRCNN, exported: bytes, pictures: Sequence[ImageRGB
     import onnxruntime
 
     session = onnxruntime.InferenceSession(exported, providers=["CPUExecutionProvider"])
-    info = json.loads(session.get_modelmeta().custom_metadata_map["sorvolo"])
-    model = _reaching(model.eval(), info["regions"])
+    model = model.eval()
     worst_px, worst_score, alone, count, undecided = 0.0, 0.0, 0, 0, 0
     for picture in pictures:
         height, width = (side // model.stride * model.stride for side in picture.shape[:2])
@@ -167,13 +162,6 @@ def _holds(found: _Found, box: Floats, score: float, label: int) -> bool:
     return bool((near & (labels == label)).any())
 
 
-def _reaching(model: FasterRCNN, regions: int) -> FasterRCNN:
-    """The same layers, looking at this many regions."""
-    own = copy(model)
-    own.reach = replace(model.reach, regions=regions)
-    return own
-
-
 _WEIGHTED = ("Conv", "Gemm")
 _AERIAL = "/aerial/"  # of a model of two networks, such as the packaged one, the part that can be learnt on from
 _OTHER_PARTS = {
@@ -190,8 +178,7 @@ class ExportedModel:
     """A model file of ours to learn on from, and what it states about itself.
 
     `thresholds` are those of the network that is learnt on from, in its own scale, and `calibration` what that scale
-    means. `left` names in words what else the file joins with it and a training does not carry on, `cost` what that
-    costs, by the model's card.
+    means. `left` names in words what else the file joins with it and a training does not carry on.
     """
 
     content: bytes
@@ -200,7 +187,6 @@ class ExportedModel:
     thresholds: Mapping[str, float]
     calibration: Mapping[str, ScoreCalibration]
     left: tuple[str, ...] = ()
-    cost: tuple[str, ...] = ()
 
     @property
     def origin(self) -> str:
@@ -219,7 +205,7 @@ def load_exported(
     names too keep what it knows of them, the others start as `model` has them; None: the same ones in the same order.
     Of a file that joins several networks, as the packaged one does, it is the aerial one.
     Raises InputError where the file's layers are not the model's, as those of a model in eight bits are not, and for a
-    model with batch norms that do not learn (ResNet-50's of the presets `accurate` and `thesis`).
+    model with batch norms that do not learn (ResNet-50's of the preset `thesis`).
     """
     graph, known = _read(exported)
     layers = {

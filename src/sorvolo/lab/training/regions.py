@@ -96,34 +96,6 @@ def _suppressed(boxes: Floats, scores: Floats, most: int, iou: float, least_scor
     return np.array(rows, np.int64).reshape(-1, 3)
 
 
-def suppress_all_pairs(
-    boxes: Tensor, scores: Tensor, most: int, iou: float, least_score: float
-) -> Tensor:
-    """(K, 3) rows of 0, class and index, as `suppress` keeps them, in few steps over all pairs of boxes (N, 4): for a
-    GPU, where many small steps wait for each other. Scores are (C, N).
-
-    Each round drops what a box that still stands outranks and overlaps; the first round that changes nothing has what
-    greedy suppression keeps, since the best box always stands and so, rank by rank, each next one is settled.
-    """
-    parts = []
-    for label, own in enumerate(scores):
-        order = torch.argsort(own, descending=True, stable=True)
-        order = order[own[order] > least_score]
-        ranked = boxes[order]
-        shared, areas = _shared(ranked, ranked), area(ranked)
-        union = (areas[:, None] + areas[None] - shared).clamp(min=1e-9)
-        outranks = torch.triu(shared > iou * union, diagonal=1)
-        stands = torch.ones_like(order, dtype=torch.bool)
-        while True:
-            settled = ~(outranks & stands[:, None]).any(0)
-            if torch.equal(settled, stands):
-                break
-            stands = settled
-        rows = order[stands][:most]
-        parts.append(torch.stack([torch.zeros_like(rows), torch.full_like(rows, label), rows], 1))
-    return torch.cat(parts)
-
-
 class _Suppress(torch.autograd.Function):
     """Greedy suppression as ONNX's NonMaxSuppression does it."""
 
@@ -132,12 +104,10 @@ class _Suppress(torch.autograd.Function):
         ctx: object, boxes: Tensor, scores: Tensor, most: int, iou: float, least_score: float
     ) -> Tensor:
         """(K, 3) rows of 0, class, index for boxes (N, 4), scores (C, N); by class, then best first."""
-        if boxes.is_cuda:
-            return suppress_all_pairs(boxes.detach(), scores.detach(), most, iou, least_score)
         # in NumPy, so that an export records one node and none of this
-        return torch.from_numpy(
-            _suppressed(boxes.detach().numpy(), scores.detach().numpy(), most, iou, least_score)
-        )
+        own, theirs = boxes.detach().cpu().numpy(), scores.detach().cpu().numpy()
+        kept = _suppressed(own, theirs, most, iou, least_score)
+        return torch.from_numpy(kept).to(boxes.device)
 
     @staticmethod
     def symbolic(g, boxes, scores, most: int, iou: float, least_score: float):  # type: ignore[no-untyped-def]

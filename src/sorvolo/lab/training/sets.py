@@ -17,7 +17,6 @@ from sorvolo.lab.training.samples import Share
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES
 
-_SMALL = CLASSES[2]
 _LOOKED_AT = 40  # pictures of a set that decide whether it is thermal
 _SUBSTANTIAL = 0.1  # share of the samples from which on a light is learnt
 _SYNTHETIC_PICTURES = (4, 1200)  # made at least and at most
@@ -132,7 +131,7 @@ def read_labels(
 
 def training_sets(read: ReadLabels, *, synthetic: float, simulated: Path) -> TrainingSets:
     """What is learnt from and checked on; `simulated` is the folder of `simulate_samples`, from which `synthetic` of
-    all samples come, with small objects composed onto the ground of the sets that have none.
+    all samples come.
 
     A class that a set does not name is unlabelled there. Raises InputError where no set holds an object to learn.
     """
@@ -143,12 +142,6 @@ def training_sets(read: ReadLabels, *, synthetic: float, simulated: Path) -> Tra
         shares = _mixed(shares, _parted(made), synthetic)
     classes = _in_order(name for each in shares for name in each.labelled.classes)
     shares = [replace(each, labelled=_honest(each.labelled, classes)) for each in shares]
-    if synthetic > 0:
-        # The share with small objects composed onto its ground, where it labels none
-        shares = [
-            replace(each, pastes=_SMALL) if _SMALL in each.labelled.unlabelled else each
-            for each in shares
-        ]
     # Raise InputError where no picture has an object to learn, with what was remarked of the sets
     if not any(len(picture.labels) for each in shares for picture in each.labelled.pictures):
         remarks = "; ".join(notices) or "all their label files are empty"

@@ -10,7 +10,7 @@ from sorvolo.errors import SettingsError
 class TrainSettings:
     """How the detector is trained (`sorvolo train`)."""
 
-    preset: Literal["fast", "accurate", "thesis"] = "fast"
+    preset: Literal["fast", "thesis"] = "fast"
     rpn: Literal["standard", "extended", "extended-residual"] = "extended-residual"
     schedule: Literal["joint", "four-steps"] = "joint"
     weights: str = "auto"  # ImageNet's of the backbone (auto, or a file), none, or a model to tune: its name or file
@@ -23,7 +23,7 @@ class TrainSettings:
 
     def __post_init__(self) -> None:
         choices = (
-            ("preset", self.preset, ("fast", "accurate", "thesis")),
+            ("preset", self.preset, ("fast", "thesis")),
             ("rpn", self.rpn, ("standard", "extended", "extended-residual")),
             ("schedule", self.schedule, ("joint", "four-steps")),
         )
@@ -39,6 +39,8 @@ class TrainSettings:
         ):
             if not low <= number <= high:
                 raise SettingsError(f"{name} must lie in {low} to {high}, got {number}")
+        if self.preset == "thesis" and self.rpn == "extended-residual":
+            raise SettingsError("the preset thesis has the rpn standard or extended")
         if self.side_px % 32:
             raise SettingsError(f"side_px must be a multiple of 32, got {self.side_px}")
         if not 0 <= self.synthetic <= 1:

@@ -1,12 +1,12 @@
 """What a training begins with: ImageNet weights of the backbone, or a model of ours that is tuned to other pictures."""
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from hashlib import sha256
 from itertools import islice
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 
@@ -31,9 +31,6 @@ from sorvolo.lab.training.samples import TrainingSample
 from sorvolo.lab.training.weights import SOURCES, ImageNetWeights, Net, read_weights
 from sorvolo.missions.fetched_files import copy_by_hash
 from sorvolo.store.atomic import atomic_path, writing
-
-_FEW_LABELS = 50  # of a class in a measured set: with fewer, two AP50 may differ by chance
-_CLEARLY = 0.03  # so much higher an AP50 is worth a word; by choice
 
 
 def load_start(choice: str, preset: Preset) -> ImageNetWeights | ExportedModel | None:
@@ -71,16 +68,13 @@ def fetch_weights(net: Net) -> Path:
 
 
 def begin_notices(start: ExportedModel, classes: Sequence[str]) -> list[str]:
-    """What of the model a training of `classes` does not carry on, and what that costs by its card."""
+    """What of the model a training of `classes` does not carry on."""
     notices = []
     if start.left:
-        text = (
+        notices.append(
             f"only the aerial network of {start.origin} is learnt on from. Not carried on: {', '.join(start.left)}; the "
             "new model begins with less than that model knows"
         )
-        if start.cost:
-            text += f" (by its card, AP50 in %: {'; '.join(start.cost)})"
-        notices.append(text)
     known = start.info.classes
     if new := [name for name in classes if name not in known]:
         notices.append(f"{start.origin} does not know {', '.join(new)}: learnt from the beginning")
@@ -156,7 +150,7 @@ def _model(choice: str, preset: Preset) -> ExportedModel:
     own, means = in_own_scale(info), info.calibration
     if not (others := other_networks(content)):
         return ExportedModel(content, info, sha256, own, means)
-    # of a file of several networks the aerial one: its own thresholds, by the card, and what the others gave
+    # of a file of several networks the aerial one, with its own thresholds by the card
     card = read_card(InstalledModel(path.stem, path, is_packaged=False))
     is_of_file = str(card.get(HASH_KEY, "")).lower() == sha256
     alone = card.get("aerial_alone", {}) if is_of_file else {}
@@ -165,26 +159,10 @@ def _model(choice: str, preset: Preset) -> ExportedModel:
         left.append(f"the second look at reports ({', '.join(info.second_look)})")
     if info.pyramid:
         left.append("the search in several sizes")
-    cost = tuple(_lost(alone.get("measured") or {}, card.get("measured") or {})) if alone else ()
-    return ExportedModel(content, info, sha256, alone.get("thresholds", {}), {}, tuple(left), cost)
+    return ExportedModel(content, info, sha256, alone.get("thresholds", {}), {}, tuple(left))
 
 
-def _lost(alone: Mapping[str, Any], whole: Mapping[str, Any]) -> Iterator[str]:
-    """Of each class that the whole model finds clearly better on a set, both AP50."""
-    for name in (each for each in whole if each in alone):
-        for label, figures in whole[name].items():
-            if label not in alone[name] or figures["labels"] < _FEW_LABELS:
-                continue
-            before, after = (each["AP50"]["value"] for each in (figures, alone[name][label]))
-            if before - after > _CLEARLY:
-                yield f"{label} on {name} {100 * after:.1f} alone, {100 * before:.1f} as a whole"
-
-
-_RATES = {
-    "fast": 1e-3,
-    "accurate": 2e-4,
-    "thesis": 2e-4,
-}  # of AdamW at its height; large networks need less
+_RATES = {"fast": 1e-3, "thesis": 2e-4}  # of AdamW at its height; large networks need less
 _BACKBONE_SHARE = 0.2  # of that rate, for layers that ImageNet taught
 _TUNED_SHARE = 0.5  # of that rate, for a model that has learnt already
 _SETTLING_PX = 6_000_000  # of pictures by which the norms of such a model are settled: a gigabyte or two of memory
