@@ -7,7 +7,6 @@ import pytest
 from rich.console import Console
 
 from sorvolo.cli.compare import show_results
-from sorvolo.cli.options import PlaceFormat
 from sorvolo.missions.compare.report import comparison_headline
 
 COVERED = {
@@ -164,7 +163,7 @@ def test_places_are_written_as_asked_for(tmp_path: Path, form: str, place: str) 
         "comparison": {"views": {"compared": 7}, "reasons": {}, **COVERED},
     }
     console = Console(record=True, width=120, file=StringIO())
-    show_results([result], tmp_path, console, PlaceFormat(form))
+    show_results([result], tmp_path, console, form)
     assert place in console.export_text()
 
 

@@ -1,8 +1,6 @@
 """`sorvolo archive` and `sorvolo site`: an index of many sites; copies of one."""
 
-import json
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,8 +10,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sorvolo.cli.options import AsJson, CatalogueAddress, wanted_classes
-from sorvolo.cli.printing import FAILED
+from sorvolo.cli.options import AsJson, CatalogueAddress, OutFile, wanted_classes
+from sorvolo.cli.printing import FAILED, print_json
 from sorvolo.cli.progress import shown_work
 from sorvolo.cli.sites import show_copy
 from sorvolo.survey.wording import counted, counted_list
@@ -56,7 +54,7 @@ def index_command(
         ),
     )
     if as_json:
-        typer.echo(json.dumps({"root": str(root), **asdict(outcome)}, indent=1))
+        print_json({"root": str(root), **vars(outcome)})
     else:
         held = outcome.holds
         typer.echo(
@@ -95,7 +93,6 @@ def find_command(
     Example: sorvolo archive find /srv/flights --at 46.5001,13.2502 --from 2026-05-01 --class car --within 10
     """
     from sorvolo.missions.archive.find import find_place
-    from sorvolo.store.exports.plain import plain_json
 
     found = find_place(
         root,
@@ -106,9 +103,7 @@ def find_command(
         within_m=within,
     )
     if as_json:
-        typer.echo(
-            json.dumps({"root": str(root), "at": at, "flights": plain_json(found)}, indent=1)
-        )
+        print_json({"root": str(root), "at": at, "flights": found})
     else:
         _show(found, Console())
 
@@ -146,7 +141,7 @@ def export_command(
     root: Annotated[
         str, typer.Argument(help="The folder that holds the site folders, or s3://BUCKET/PREFIX.")
     ],
-    out: Annotated[Path, typer.Option(help="The file to write: NAME.parquet.")],
+    out: OutFile,
     as_json: AsJson = False,
 ) -> None:
     """Write all sites, flights, versions, changes and objects as stac-geoparquet, for DuckDB, GeoPandas or QGIS.
@@ -165,7 +160,7 @@ def export_command(
         ),
     )
     if as_json:
-        typer.echo(json.dumps({"root": root, "file": str(out), **asdict(outcome)}, indent=1))
+        print_json({"root": root, "file": str(out), **vars(outcome)})
     else:
         typer.echo(f"{out}: {counted_list(outcome.kinds, none='no sites')}")
         if outcome.local:
@@ -208,8 +203,8 @@ def copy_command(
     work = verify_copy(source, target) if verify else copy_site(source, target, catalogue)
     outcome = show_copy(work, "comparing, file" if verify else "copying, file")
     if as_json:
-        row = asdict(outcome) | {"faults": dict(outcome.faults), "is_whole": not outcome.faults}
-        typer.echo(json.dumps({"source": source, "target": target, **row}, indent=1))
+        row = vars(outcome) | {"faults": dict(outcome.faults), "is_whole": not outcome.faults}
+        print_json({"source": source, "target": target, **row})
     else:
         _show_copied(outcome, target, verified=verify)
     if outcome.faults:
@@ -235,7 +230,7 @@ def prune_command(
 
     pruned = prune_site(place, keep_days, only_count=dry_run)
     if as_json:
-        typer.echo(json.dumps({"place": place, "dry_run": dry_run, **asdict(pruned)}, indent=1))
+        print_json({"place": place, "dry_run": dry_run, **vars(pruned)})
     else:
         done = "would remove" if dry_run else "removed"
         typer.echo(

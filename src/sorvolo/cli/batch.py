@@ -1,11 +1,8 @@
 """`sorvolo batch`: a mission over folders of flights, on this machine or on a Ray cluster."""
 
-import json
 from contextlib import closing
-from dataclasses import asdict
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.box import SIMPLE_HEAD
@@ -14,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from sorvolo.cli.options import AsJson, Camera, Model, Resolution
-from sorvolo.cli.printing import FAILED, TO_CHECK, show_path
+from sorvolo.cli.printing import FAILED, TO_CHECK, print_json, show_path
 from sorvolo.cli.progress import ProgressReport, shown_work
 from sorvolo.errors import SettingsError
 from sorvolo.survey.wording import counted
@@ -32,22 +29,6 @@ _COLOURS = {
 }
 
 
-class MissionName(StrEnum):
-    """What is done with each flight."""
-
-    MAP = "map"
-    COMPARE = "compare"
-    SEARCH = "search"
-    WATCH = "watch"
-
-
-class SiteByName(StrEnum):
-    """What makes flights belong to one site."""
-
-    FLIGHT = "flight"
-    PLACE = "place"
-
-
 def batch(
     context: typer.Context,
     places: Annotated[
@@ -58,10 +39,11 @@ def batch(
         typer.Option(help="Folder for the results: one folder for each site, or for each watch."),
     ],
     mission: Annotated[
-        MissionName, typer.Option(help="What to do with each flight.")
-    ] = MissionName.MAP,
+        Literal["map", "compare", "search", "watch"],
+        typer.Option(help="What to do with each flight."),
+    ] = "map",
     site_by: Annotated[
-        SiteByName | None,
+        Literal["flight", "place"] | None,
         typer.Option(
             help="flight: each flight has a site of its own. place: flights near each other share one.",
             show_default="flight; place for compare",
@@ -103,9 +85,9 @@ def batch(
         raise SettingsError(f"--workers {workers}: at least 1 is needed")
     if executor not in ("local", "ray") and not executor.startswith("ray://"):
         raise SettingsError(f"--executor {executor}: give local, ray, or ray://HOST:PORT")
-    by_place = mission is MissionName.COMPARE if site_by is None else site_by is SiteByName.PLACE
+    by_place = mission == "compare" if site_by is None else site_by == "place"
     settings = BatchSettings(
-        mission.value,
+        mission,
         _absolute(camera),
         _absolute(model),
         gsd,
@@ -126,7 +108,7 @@ def batch(
         report = shown_work(running, _show_update)
     counts = report.counts()
     if as_json:
-        typer.echo(json.dumps(_plain(report, root), indent=1))
+        print_json(_plain(report, root))
     else:
         _show(report, places, root, Console())
     if counts.get("failed") or counts.get("set aside"):
@@ -160,7 +142,7 @@ def _state_name(row: "BatchRow", is_known: bool) -> str:
 
 
 def _plain(report: "BatchReport", root: Path) -> dict[str, Any]:
-    rows = [{**asdict(row), "is_known": row.key in report.known} for row in report.rows]
+    rows = [{**vars(row), "is_known": row.key in report.known} for row in report.rows]
     return {
         "root": str(root),
         "counts": report.counts(),

@@ -1,6 +1,5 @@
 """`sorvolo calibrate`: a camera file from pictures of a checkerboard."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -8,7 +7,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from sorvolo.cli.options import AsJson
+from sorvolo.cli.options import AsJson, OutFile
+from sorvolo.cli.printing import print_json
 from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
@@ -22,14 +22,12 @@ def calibrate(
     board: Annotated[
         str, typer.Option(help="Inner corners of the board, such as 9x6 for 10 x 7 squares.")
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Camera file to write.")] = Path(
-        "camera.xml"
-    ),
+    out: OutFile = Path("camera.xml"),
     as_json: AsJson = False,
 ) -> None:
     """Make a camera file from pictures of a checkerboard, taken with the size and zoom that will fly.
 
-    Example: sorvolo calibrate board_video.mp4 --board 9x6 -o camera.xml
+    Example: sorvolo calibrate board_video.mp4 --board 9x6 --out camera.xml
     """
     from sorvolo.capture.checkerboard import BoardView
     from sorvolo.missions.calibrate_camera import (
@@ -50,7 +48,7 @@ def calibrate(
         result = calibrate_camera(looked, chessboard)
     write_calibration(out, result)
     if as_json:
-        typer.echo(json.dumps(_as_json(result, out), indent=1))
+        print_json(_as_json(result, out))
     else:
         _show(result, out)
 

@@ -1,11 +1,9 @@
 """`sorvolo compare`: a later flight against the map; each change is printed as it is announced."""
 
-import json
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.box import SIMPLE_HEAD
@@ -35,6 +33,7 @@ from sorvolo.cli.printing import (
     announce_people,
     place_heading,
     place_words,
+    print_json,
     read_json,
     show_notices_and_warnings,
     show_path,
@@ -62,15 +61,8 @@ _MAX_ROWS, _MAX_REASONS = 40, 6
 _MIN_GAP = 0.01  # of the compared ground: smaller gaps are in the report alone
 
 
-class ChangeMethod(StrEnum):
-    """How a frame is compared with the map."""
-
-    ROBUST = "robust"
-    THESIS = "thesis"
-
-
 MethodOption = Annotated[
-    ChangeMethod,
+    Literal["robust", "thesis"],
     typer.Option(help="robust: copes with light, shadows and wind. thesis: the baseline."),
 ]
 MasksFolder = Annotated[
@@ -98,7 +90,7 @@ def compare(
     telemetry: Telemetry = None,
     camera: Camera = "",
     area: Area = None,
-    method: MethodOption = ChangeMethod.ROBUST,
+    method: MethodOption = "robust",
     votes: Votes = 3,
     offset: Offset = None,
     ground_elevation: GroundElevation = None,
@@ -109,7 +101,7 @@ def compare(
     model: Model = "default",
     classes: Classes = None,
     give_up: GiveUp = 30.0,
-    coordinates: PlaceFormatOption = PlaceFormat.LATLON,
+    coordinates: PlaceFormatOption = "latlon",
     again: Again = False,
     as_json: AsJson = False,
 ) -> None:
@@ -127,7 +119,7 @@ def compare(
     from sorvolo.missions.flight.settings import CompareSettings
 
     settings = CompareSettings(
-        None if method == ChangeMethod.ROBUST else _thesis(),
+        None if method == "robust" else _thesis(),
         votes=votes,
         voters=votes + 2,
         offset_s=offset,
@@ -154,24 +146,21 @@ def compare(
             )
             results = read_results(comparing, place, coordinates)
         if masks is not None:
-            _copy_masks([result["flight"] for result in results], place.folder, masks)
+            # Leave the masks that the site keeps of these flights in a folder as well, a folder for each flight
+            flights = [result["flight"] for result in results]
+            from sorvolo.store.atomic import writing
+
+            with writing(masks):
+                for flight in flights:
+                    made = place.folder / "flights" / flight / "masks"
+                    if made.is_dir():
+                        shutil.copytree(made, masks / flight, dirs_exist_ok=True)
         if as_json:
-            typer.echo(json.dumps({"site": str(place.folder), "flights": results}, indent=1))
+            print_json({"site": str(place.folder), "flights": results})
         else:
             show_results(results, place.folder, Console(), coordinates)
     if any(result["comparison"]["headline"]["quality"] != "compared" for result in results):
         raise typer.Exit(TO_CHECK)
-
-
-def _copy_masks(flights: Sequence[str], site: Path, to: Path) -> None:
-    """Leave the masks that the site keeps of these flights in a folder as well, a folder for each flight."""
-    from sorvolo.store.atomic import writing
-
-    with writing(to):
-        for flight in flights:
-            made = site / "flights" / flight / "masks"
-            if made.is_dir():
-                shutil.copytree(made, to / flight, dirs_exist_ok=True)
 
 
 def _thesis() -> "PairMethod":
@@ -183,7 +172,7 @@ def _thesis() -> "PairMethod":
 def read_results(
     comparing: "Generator[CompareUpdate, None, Sequence[AlreadyDone]]",
     place: OpenedSite,
-    form: PlaceFormat = PlaceFormat.LATLON,
+    form: PlaceFormat = "latlon",
 ) -> list[dict[str, Any]]:
     """Compare with progress and announcements on stderr; return the results of each flight.
 
@@ -227,7 +216,7 @@ def show_results(
     results: Sequence[Mapping[str, Any]],
     site: Path,
     console: Console,
-    form: PlaceFormat = PlaceFormat.LATLON,
+    form: PlaceFormat = "latlon",
 ) -> None:
     """Print what changed, what could not be compared, and where the files are."""
     from sorvolo.store.exports.plain import features_path
@@ -370,7 +359,7 @@ def _show_changes(
             escape(change["id"]),
             f"{change['kind']}\n{what}" if what else str(change["kind"]),
             f"{change['length_m']:.2f}",
-            f"{x:.1f}, {y:.1f}" if is_local else place_text(y, x, Coordinates(form.value)),
+            f"{x:.1f}, {y:.1f}" if is_local else place_text(y, x, Coordinates(form)),
             f"{change['sigma_m']:.2f}",
             str(change["views"]),
             f"{change['score']:.2f}",

@@ -1,6 +1,5 @@
 """`sorvolo evaluate`: how good a result is, in numbers."""
 
-import json
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -24,6 +23,7 @@ from sorvolo.cli.options import (
     class_names,
     names,
 )
+from sorvolo.cli.printing import print_json
 from sorvolo.cli.progress import ProgressReport
 from sorvolo.cli.sites import opened_site
 from sorvolo.survey.wording import counted
@@ -96,7 +96,6 @@ def detector(
         read_sets,
         write_evaluation,
     )
-    from sorvolo.store.exports.plain import plain_json
 
     settings = EvaluationSettings(from_above=from_above)
     arms = [list(names(arm)) for arm in (model, *(compare or ()))]
@@ -128,7 +127,7 @@ def detector(
     if out is not None:
         write_evaluation(measured, out, description)
     if as_json:
-        typer.echo(json.dumps(plain_json(evaluation_numbers(measured, description)), indent=1))
+        print_json(evaluation_numbers(measured, description))
         return
     console = Console()
     for notice in notices:
@@ -144,7 +143,7 @@ def detector(
 @evaluate_app.command()
 def mosaic(
     site: SiteArgument,
-    truth: Annotated[Path | None, typer.Option(help="Folder that `sorvolo simulate` made.")] = None,
+    truth: Truth = None,
     reference: Annotated[
         Path | None, typer.Option(help="A reference map: a GeoTIFF of the same ground.")
     ] = None,
@@ -161,14 +160,13 @@ def mosaic(
     Example: sorvolo evaluate mosaic field-map --reference orthophoto.tif --json
     """
     from sorvolo.lab.evaluation.mosaic import evaluate_mosaic
-    from sorvolo.store.exports.plain import plain_json
 
     with opened_site(site) as place:
         measured = evaluate_mosaic(
             place.folder, truth=truth, reference=reference, positions=positions
         )
     if as_json:
-        typer.echo(json.dumps(plain_json(measured), indent=1))
+        print_json(measured)
     else:
         _show(measured)
 
@@ -194,10 +192,11 @@ def changes(
     from sorvolo.lab.evaluation.changes import as_json as measures_as_json
     from sorvolo.lab.evaluation.changes import evaluate_changes
 
+    assert truth is not None  # typer demands it
     with opened_site(found) as place:
         measured = evaluate_changes(place.folder, truth, flight=flight)
     if as_json:
-        typer.echo(json.dumps(measures_as_json(measured), indent=1))
+        print_json(measures_as_json(measured))
         return
     console = Console()
     for each in measured:
@@ -216,12 +215,12 @@ def objects(
     Example: sorvolo evaluate objects field-map --truth simulated-field
     """
     from sorvolo.lab.evaluation.objects import evaluate_objects
-    from sorvolo.store.exports.plain import plain_json
 
+    assert truth is not None  # typer demands it
     with opened_site(site) as place:
         measured = evaluate_objects(place.folder, truth, flight=flight)
     if as_json:
-        typer.echo(json.dumps(plain_json(measured), indent=1))
+        print_json(measured)
         return
     console = Console()
     for each in measured:

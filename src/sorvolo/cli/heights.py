@@ -1,7 +1,6 @@
 """`sorvolo heights` and `sorvolo measure`: height models of mapped flights, and volumes between them."""
 
 import csv
-import json
 import math
 import sys
 from collections.abc import Mapping
@@ -13,8 +12,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sorvolo.cli.options import AsJson, Flight, SiteArgument
-from sorvolo.cli.printing import TO_CHECK, read_json, show_path
+from sorvolo.cli.options import Area, AsJson, Flight, OutFile, SiteArgument
+from sorvolo.cli.printing import TO_CHECK, print_json, read_json, show_path
 from sorvolo.cli.progress import ProgressReport
 from sorvolo.cli.sites import opened_site
 from sorvolo.survey.wording import counted
@@ -48,7 +47,7 @@ def heights(
     with opened_site(site, writes=True) as place:
         report = make_and_read(place.folder, flight, cell)
         if as_json:
-            typer.echo(json.dumps({"site": str(place.folder), "heights": report}, indent=1))
+            print_json({"site": str(place.folder), "heights": report})
         else:
             show_heights(place.folder, report, Console())
     if report["contradicts_itself"]:
@@ -63,9 +62,7 @@ def measure() -> None:
 @measure_app.command()
 def volume(
     site: SiteArgument,
-    area: Annotated[
-        Path, typer.Option(help="Area to measure: GeoJSON, KML, KMZ or a list of corners.")
-    ],
+    area: Area,
     since: Annotated[
         str,
         typer.Option(
@@ -84,12 +81,12 @@ def volume(
     Example: sorvolo measure volume field --area pile.geojson
     """
     from sorvolo.missions.heights.measure import measure_volume
-    from sorvolo.store.exports.plain import plain_json
 
+    assert area is not None  # typer demands it
     with opened_site(site) as place:
         found = measure_volume(place.folder, area, flight=flight, since=since)
     if as_json:
-        typer.echo(json.dumps({**plain_json(found), "net_m3": found.volume.net_m3}, indent=1))
+        print_json({**vars(found), "net_m3": found.volume.net_m3})
     else:
         _show_volume(found, Console())
 
@@ -127,7 +124,7 @@ def profile(
 @measure_app.command()
 def contours(
     site: SiteArgument,
-    out: Annotated[Path, typer.Option(help="GeoJSON file to write.")],
+    out: OutFile,
     interval: Annotated[float, typer.Option(help="Difference in height between lines, m.")] = 1.0,
     flight: Flight = "",
 ) -> None:

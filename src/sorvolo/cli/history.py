@@ -1,6 +1,5 @@
 """`sorvolo history` and `sorvolo review`: a map's versions, and people's verdicts on its changes."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from sorvolo.cli.options import AsJson, OnlyFlight, PlaceFormat, PlaceFormatOption, SiteArgument
-from sorvolo.cli.printing import place_heading, place_words, site_of
+from sorvolo.cli.printing import place_heading, place_words, print_json, site_of
 from sorvolo.cli.sites import opened_site
 from sorvolo.errors import SettingsError
 from sorvolo.survey.wording import counted
@@ -34,7 +33,7 @@ def history(
     export: Annotated[
         Path | None, typer.Option(help="Write the map as it was: FILE.tif, .png or .kmz.")
     ] = None,
-    coordinates: PlaceFormatOption = PlaceFormat.LATLON,
+    coordinates: PlaceFormatOption = "latlon",
     as_json: AsJson = False,
 ) -> None:
     """List the versions of a map, or write the map as it was at one of them.
@@ -45,7 +44,6 @@ def history(
     """
     from sorvolo.geometry.coordinates import Coordinates, place_text
     from sorvolo.missions.site.history import export_version, site_history
-    from sorvolo.store.exports.plain import plain_json
 
     if at is not None and export is None:
         raise SettingsError(
@@ -60,18 +58,18 @@ def history(
             words = (
                 f"{export}: version {version.id}, flight {version.flight_id}, {version.created_utc}"
             )
-            plain = {"site": folder, "file": str(export), "version": plain_json(entry)}
-            typer.echo(json.dumps(plain, indent=1) if as_json else words)
+            plain = {"site": folder, "file": str(export), "version": entry}
+            print_json(plain) if as_json else typer.echo(words)
             return
         if as_json:
-            typer.echo(json.dumps({"site": folder, "versions": plain_json(entries)}, indent=1))
+            print_json({"site": folder, "versions": entries})
             return
         console = Console()
         _show_versions(entries, console)
         if entries and not (of_map := site_of(place.folder)).is_local:
             origin = of_map.origin
             written = place_text(
-                origin.latitude_deg, origin.longitude_deg, Coordinates(coordinates.value)
+                origin.latitude_deg, origin.longitude_deg, Coordinates(coordinates)
             )
             console.print(f"the map's origin lies at {written}", highlight=False)
 
@@ -144,7 +142,7 @@ def review(
     ] = False,
     note: Annotated[str, typer.Option(help="Why, in your own words.")] = "",
     flight: OnlyFlight = None,
-    coordinates: PlaceFormatOption = PlaceFormat.LATLON,
+    coordinates: PlaceFormatOption = "latlon",
     as_json: AsJson = False,
 ) -> None:
     """List the changes that flights found, or confirm or reject some.
@@ -171,7 +169,7 @@ def review(
         place_of = site_of(place.folder)
         if as_json:
             rows = [_plain(change, place_of) for change in changes]
-            typer.echo(json.dumps({"site": str(place.folder), "changes": rows}, indent=1))
+            print_json({"site": str(place.folder), "changes": rows})
         else:
             _show_changes(changes, place_of, coordinates, Console())
 

@@ -1,16 +1,15 @@
 """`sorvolo inspect`: what is in the input, what is missing or suspicious, and what to do."""
 
-import json
 import math
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from sorvolo.cli.options import AsJson, Camera, Inputs, Telemetry
+from sorvolo.cli.printing import print_json
 from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
@@ -37,11 +36,16 @@ def inspect(
     inspections = inspect_input(inputs, telemetry, camera or None)
     if as_json:
         plain = [inspection.as_json() for inspection in inspections]
-        typer.echo(json.dumps(plain, indent=2, allow_nan=False))
+        print_json(plain)
         return
     console = Console()
     for inspection in inspections:
-        console.print(_table_of(inspection))
+        table = Table(
+            title=f"{inspection.name} ({inspection.kind})", show_header=False, title_justify="left"
+        )
+        for name, text in _rows(inspection):
+            table.add_row(name, escape(text))
+        console.print(table)
         for finding in inspection.findings:
             colour = _COLOURS[finding.level]
             advice = f" [dim]-> {escape(finding.advice)}[/dim]" if finding.advice else ""
@@ -51,15 +55,6 @@ def inspect(
             )
         if not inspection.findings:
             console.print("[green]nothing is missing or suspicious: ready to map[/green]")
-
-
-def _table_of(inspection: "Inspection") -> Table:
-    table = Table(
-        title=f"{inspection.name} ({inspection.kind})", show_header=False, title_justify="left"
-    )
-    for name, text in _rows(inspection):
-        table.add_row(name, escape(text))
-    return table
 
 
 def _rows(inspection: "Inspection") -> list[tuple[str, str]]:

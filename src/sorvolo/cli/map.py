@@ -1,10 +1,8 @@
 """`sorvolo map`: flights into a site folder, and a summary of each."""
 
-import json
 from collections.abc import Mapping, Sequence
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.console import Console
@@ -34,6 +32,7 @@ from sorvolo.cli.options import (
 from sorvolo.cli.printing import (
     TO_CHECK,
     announce_people,
+    print_json,
     read_json,
     show_notices_and_warnings,
     show_path,
@@ -49,15 +48,8 @@ if TYPE_CHECKING:
 _MAX_REASONS = 6  # of frames that are not on the map, the commonest first
 
 
-class Method(StrEnum):
-    """How frames are registered."""
-
-    PLANAR = "planar"
-    THESIS = "thesis"
-
-
 MethodOption = Annotated[
-    Method,
+    Literal["planar", "thesis"],
     typer.Option(help="planar: all frames fitted together. thesis: the baseline, frame by frame."),
 ]
 CoordinateSystem = Annotated[
@@ -99,7 +91,7 @@ def map_command(
     telemetry: Telemetry = None,
     camera: Camera = "",
     area: Area = None,
-    method: MethodOption = Method.PLANAR,
+    method: MethodOption = "planar",
     gsd: Resolution = None,
     offset: Offset = None,
     ground_elevation: GroundElevation = None,
@@ -137,7 +129,7 @@ def map_command(
     from sorvolo.store.site.catalogue_place import chosen_catalogues
 
     settings = MapSettings(
-        None if method == Method.PLANAR else _thesis(),
+        None if method == "planar" else _thesis(),
         gsd,
         offset_s=offset,
         ground_elevation_m=ground_elevation,
@@ -206,9 +198,7 @@ def _print(
             {key: value for key, value in report.items() if key != "track"} for report in reports
         ]
         files = {path.name.replace(".", "_"): str(path) for path in _map_files(site).values()}
-        typer.echo(
-            json.dumps({"site": str(site), **files, "flights": plain, "heights": heights}, indent=1)
-        )
+        print_json({"site": str(site), **files, "flights": plain, "heights": heights})
         return
     for report in heights:
         show_heights(site, report, Console())
@@ -230,7 +220,22 @@ def show_reports(reports: Sequence[Mapping[str, Any]], site: Path, console: Cons
         table = Table(
             title=f"Flight {escape(report['flight'])}", show_header=False, title_justify="left"
         )
-        for name, text in (*_frame_rows(report["frames"]), *_quality_rows(report)):
+        frames = report["frames"]
+        by_gps, rejected = frames["gps-only"], frames["rejected"]
+        rows = [
+            ("frames", f"{frames['selected']:,} selected of {frames['total']:,}"),
+            (
+                "[green]matched[/green]",
+                f"{frames['vision']:,} of {counted(frames['selected'], 'frame')}",
+            ),
+            ("[yellow]by GPS alone[/yellow]", counted(by_gps, "frame") if by_gps else ""),
+            ("[red]left out[/red]", counted(rejected, "frame") if rejected else ""),
+        ]
+        reasons = list(frames["reasons"].items())[:_MAX_REASONS]
+        frame_rows = rows + [
+            ("", escape(f"{counted(count, 'frame')}: {reason}")) for reason, count in reasons
+        ]
+        for name, text in (*frame_rows, *_quality_rows(report)):
             if text:
                 table.add_row(name, text)
         console.print(escape(report["headline"]["text"]), style="bold", highlight=False)
@@ -241,23 +246,6 @@ def show_reports(reports: Sequence[Mapping[str, Any]], site: Path, console: Cons
         show_path(name, path, console)
     for report in reports:
         show_path("report", site / "flights" / report["flight"] / "report.html", console)
-
-
-def _frame_rows(frames: Mapping[str, Any]) -> list[tuple[str, str]]:
-    by_gps, rejected = frames["gps-only"], frames["rejected"]
-    rows = [
-        ("frames", f"{frames['selected']:,} selected of {frames['total']:,}"),
-        (
-            "[green]matched[/green]",
-            f"{frames['vision']:,} of {counted(frames['selected'], 'frame')}",
-        ),
-        ("[yellow]by GPS alone[/yellow]", counted(by_gps, "frame") if by_gps else ""),
-        ("[red]left out[/red]", counted(rejected, "frame") if rejected else ""),
-    ]
-    reasons = list(frames["reasons"].items())[:_MAX_REASONS]
-    return rows + [
-        ("", escape(f"{counted(count, 'frame')}: {reason}")) for reason, count in reasons
-    ]
 
 
 def _quality_rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:

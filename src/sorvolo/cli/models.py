@@ -1,6 +1,5 @@
 """`sorvolo models`: the detection models that are installed."""
 
-import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from sorvolo.cli.options import AsJson
-from sorvolo.cli.printing import FAILED
+from sorvolo.cli.printing import FAILED, print_json
 from sorvolo.errors import InputError, SettingsError
 
 if TYPE_CHECKING:
@@ -46,7 +45,7 @@ def list_models(
 
     rows = [_row(each) for each in installed_models()]
     if as_json:
-        typer.echo(json.dumps(rows, indent=1))
+        print_json(rows)
         return
     _show_rows([row for row in rows if "error" not in row])
     for row in rows:
@@ -98,9 +97,9 @@ def show(
 
     path = find_model(model)
     info, card = read_info(path), read_card(InstalledModel(path.stem, path, False))
-    facts = _facts(info) | {"path": str(path), "sha256": file_sha256(path), "card": card}
+    facts = vars(info) | {"path": str(path), "sha256": file_sha256(path), "card": card}
     if as_json:
-        typer.echo(json.dumps(facts, indent=1))
+        print_json(facts)
         return
     table = Table(title=escape(info.name), show_header=False, title_justify="left")
     table.add_column()
@@ -273,17 +272,11 @@ def _row(model: "InstalledModel") -> dict[str, Any]:
     try:
         return (
             row
-            | _facts(read_info(model.path))
+            | vars(read_info(model.path))
             | {"name": model.name, "bytes": model.path.stat().st_size}
         )
     except InputError as error:
         return row | {"error": str(error)}
-
-
-def _facts(info: "ModelInfo") -> dict[str, Any]:
-    from sorvolo.store.exports.plain import plain_json
-
-    return {key: plain_json(value) for key, value in vars(info).items()}
 
 
 def _classes(facts: Mapping[str, Any]) -> list[str]:

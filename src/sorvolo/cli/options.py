@@ -1,8 +1,7 @@
 """Options that several commands share, each worded once, and what their texts mean."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -64,6 +63,11 @@ EnoughLookedAt = Annotated[
     float,
     typer.Option(help="Exit code 3 where a smaller share of the flown ground was looked at."),
 ]
+FlightHeight = Annotated[
+    float | None, typer.Option("--height", help="Flight height above ground, m.")
+]
+OutFile = Annotated[Path, typer.Option("--out", help="File to write.")]
+OutFolder = Annotated[Path, typer.Option("--out", help="Folder for results.")]
 GiveUp = Annotated[
     float, typer.Option(help="End a live source after this many seconds without a picture.")
 ]
@@ -91,9 +95,7 @@ Cot = Annotated[
         help="Send objects or the track to TAK: udp://host:port, tcp://host:port, tls://host:port."
     ),
 ]
-CotAuthority = Annotated[
-    Path | None, typer.Option(help="For tls://: the authority of the server's certificate, PEM.")
-]
+Authority = Annotated[Path | None, typer.Option(help="Authority of the server's certificate, PEM.")]
 CotCertificate = Annotated[
     Path | None, typer.Option(help="For tls://: own certificate and its key in one PEM file.")
 ]
@@ -122,7 +124,7 @@ CatalogueAddress = Annotated[
     ),
 ]
 Truth = Annotated[
-    Path, typer.Option(help="Folder that `sorvolo simulate` made, or of true change masks.")
+    Path | None, typer.Option(help="Folder that `sorvolo simulate` made, or of true change masks.")
 ]
 Seed = Annotated[int | None, typer.Option(help="Random seed; the same seed gives the same result.")]
 LabelClasses = Annotated[
@@ -145,29 +147,15 @@ GroupPattern = Annotated[
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
 
 
-class PlaceFormat(StrEnum):
-    """How places are written: the names of `geometry.coordinates.Coordinates`."""
-
-    LATLON = "latlon"
-    UTM = "utm"
-    MGRS = "mgrs"
-
-
+PlaceFormat = Literal["latlon", "utm", "mgrs"]
 PlaceFormatOption = Annotated[
     PlaceFormat, typer.Option("--coordinates", help="How places are written: latlon, utm or mgrs.")
 ]
 
 
-class Save(StrEnum):
-    """How frames are kept, with the objects drawn in."""
-
-    NONE = "none"
-    VIDEO = "video"
-    PICTURES = "pictures"
-
-
 SaveOption = Annotated[
-    Save, typer.Option("--save", help="Keep the frames with the objects drawn in.")
+    Literal["none", "video", "pictures"],
+    typer.Option("--save", help="Keep the frames with the objects drawn in."),
 ]
 
 

@@ -1,17 +1,16 @@
 """`sorvolo plan`: how high and how fast to fly for a task, and waypoints over an area."""
 
-import json
 import math
-from dataclasses import asdict, replace
-from enum import StrEnum
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from sorvolo.cli.options import Area, AsJson, Camera, DjiDrone, Model, size_px
+from sorvolo.cli.options import Area, AsJson, Camera, DjiDrone, FlightHeight, Model, size_px
+from sorvolo.cli.printing import print_json
 from sorvolo.errors import SettingsError
 
 if TYPE_CHECKING:
@@ -19,16 +18,8 @@ if TYPE_CHECKING:
     from sorvolo.missions.plan_flight import FlightAnswers, PlanSettings
 
 
-class Purpose(StrEnum):
-    """What must be made out of an object: the names of `geometry.planning.Task`."""
-
-    DETECTION = "detection"
-    RECOGNITION = "recognition"
-    IDENTIFICATION = "identification"
-
-
 TaskOption = Annotated[
-    Purpose,
+    Literal["detection", "recognition", "identification"],
     typer.Option(
         help="detection: something is there. recognition: it is a person. identification: who."
     ),
@@ -38,9 +29,6 @@ CriticalDimension = Annotated[
     typer.Option(
         help="Smallest side of another object to be made out, m.", show_default="a person's"
     ),
-]
-FlightHeight = Annotated[
-    float, typer.Option(help="Flight height above ground, m.", show_default="as high as allowed")
 ]
 HighestFlight = Annotated[
     float, typer.Option(help="Highest flight allowed, m: the law's in most countries.")
@@ -64,9 +52,9 @@ WaypointFiles = Annotated[
 def plan(
     camera: Camera,
     size: PictureSize = "",
-    task: TaskOption = Purpose.RECOGNITION,
+    task: TaskOption = "recognition",
     critical_m: CriticalDimension = math.nan,
-    height: FlightHeight = math.nan,
+    height: FlightHeight = None,
     max_height: HighestFlight = 120.0,
     model: Model = "default",
     speed: GroundSpeed = 5.0,
@@ -91,8 +79,8 @@ def plan(
     from sorvolo.missions import plan_flight as planning
 
     settings = planning.PlanSettings(
-        task=Task(task.value),
-        height_m=height,
+        task=Task(task),
+        height_m=math.nan if height is None else height,
         max_height_m=max_height,
         model=model,
         speed_m_s=speed,
@@ -112,7 +100,7 @@ def plan(
         for path in out or []:
             planning.write_plan(path, flight, outline, dji_drone=dji_drone)
     if as_json:
-        typer.echo(json.dumps(_as_json(answers, flight, out or []), indent=1))
+        print_json(_as_json(answers, flight, out or []))
     else:
         _show(answers, flight, out or [], settings)
 
@@ -122,31 +110,8 @@ def _show(
 ) -> None:
     console = Console()
     table = Table("", "", title="Flight plan", show_header=False, title_justify="left")
-    for row in (
-        *_camera_rows(answers),
-        *_height_rows(answers, settings),
-        *_rate_rows(answers, settings),
-    ):
-        table.add_row(*row)
-    if flight is not None:
-        table.add_row(
-            "passes", f"{len(flight.passes_m)}, at {flight.strip_bearing_deg:.0f} deg and back"
-        )
-        table.add_row("photos", f"{flight.photo_count:,}")
-        minutes = flight.duration_s / 60
-        table.add_row(
-            "path", f"{flight.distance_m:,.0f} m, {minutes:.1f} min without take-off and return"
-        )
-    for path in out:
-        table.add_row("written", str(path))
-    console.print(table)
-    for warning in _warnings(answers, settings):
-        console.print(f"[yellow]warning[/yellow]  {warning}", highlight=False)
-
-
-def _camera_rows(answers: "FlightAnswers") -> list[tuple[str, str]]:
     camera = answers.camera.camera
-    return [
+    camera_rows = [
         ("camera", answers.camera.origin),
         (
             "picture size",
@@ -154,9 +119,6 @@ def _camera_rows(answers: "FlightAnswers") -> list[tuple[str, str]]:
         ),
         ("angle of view", "{:.1f} x {:.1f} deg".format(*answers.angle_of_view_deg)),
     ]
-
-
-def _height_rows(answers: "FlightAnswers", settings: "PlanSettings") -> list[tuple[str, str]]:
     rows = []
     for name, highest_m in answers.maximum_heights_m.items():
         by_resolution = (
@@ -181,15 +143,11 @@ def _height_rows(answers: "FlightAnswers", settings: "PlanSettings") -> list[tup
     rows.append(
         ("flight height", f"{answers.height_m:,.2f} m above ground ({reasons[answers.bounded_by]})")
     )
-    return rows
-
-
-def _rate_rows(answers: "FlightAnswers", settings: "PlanSettings") -> list[tuple[str, str]]:
     rate = (
         f"at least {answers.minimum_frame_rate_hz:.3g} a second for {settings.forward_overlap:.0%} overlap at "
         f"{settings.speed_m_s:g} m/s: one every {answers.photo_spacing_m:.1f} m"
     )
-    return [
+    rate_rows = [
         ("ground resolution", f"{100 * answers.ground_sampling_m:.2f} cm a pixel"),
         ("a picture covers", "{:.1f} x {:.1f} m".format(*answers.footprint_m)),
         ("picture rate", rate),
@@ -198,6 +156,26 @@ def _rate_rows(answers: "FlightAnswers", settings: "PlanSettings") -> list[tuple
             f"{answers.strip_spacing_m:.1f} m apart for {settings.side_overlap:.0%} overlap",
         ),
     ]
+    for row in (
+        *camera_rows,
+        *rows,
+        *rate_rows,
+    ):
+        table.add_row(*row)
+    if flight is not None:
+        table.add_row(
+            "passes", f"{len(flight.passes_m)}, at {flight.strip_bearing_deg:.0f} deg and back"
+        )
+        table.add_row("photos", f"{flight.photo_count:,}")
+        minutes = flight.duration_s / 60
+        table.add_row(
+            "path", f"{flight.distance_m:,.0f} m, {minutes:.1f} min without take-off and return"
+        )
+    for path in out:
+        table.add_row("written", str(path))
+    console.print(table)
+    for warning in _warnings(answers, settings):
+        console.print(f"[yellow]warning[/yellow]  {warning}", highlight=False)
 
 
 def _warnings(answers: "FlightAnswers", settings: "PlanSettings") -> list[str]:
@@ -231,7 +209,7 @@ def _as_json(
     answers: "FlightAnswers", flight: "FlightPlan | None", out: list[Path]
 ) -> dict[str, Any]:
     camera = answers.camera
-    result = asdict(answers) | {
+    result = vars(answers) | {
         "camera": {
             "origin": camera.origin,
             "focal_sigma": camera.focal_sigma,

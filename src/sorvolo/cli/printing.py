@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import typer
 from rich.console import Console
 from rich.markup import escape
 
@@ -42,7 +43,7 @@ def announce_people(objects: Mapping[str, Any], folder: Path, console: Console) 
     people = [row for row in objects.get("list", ()) if row["class"] == PERSON]
     if not people:
         return
-    words = place_words(site_of(folder), PlaceFormat.LATLON)
+    words = place_words(site_of(folder), "latlon")
     for row in people:
         place = words(np.array([row["east_m"], row["north_m"], 0.0]))
         announce_person(f"{row['id']} at {place}, score {row['score']:.2f}", console)
@@ -60,6 +61,13 @@ def show_notices_and_warnings(report: Mapping[str, Any], console: Console) -> No
         console.print(f"[blue]note[/blue]     {escape(notice['text'])}", highlight=False)
     for warning in report["warnings"]:
         console.print(f"[yellow]warning[/yellow]  {escape(warning)}", highlight=False)
+
+
+def print_json(value: Any) -> None:
+    """Print a value as JSON: records as objects, NaN as null."""
+    from sorvolo.store.exports.plain import plain_json
+
+    typer.echo(json.dumps(plain_json(value), indent=1))
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -84,7 +92,7 @@ def place_heading(site_is_local: bool, form: PlaceFormat) -> str:
     """Return the heading of a column of places."""
     from sorvolo.geometry.coordinates import Coordinates
 
-    return "east, north" if site_is_local else Coordinates(form.value).heading
+    return "east, north" if site_is_local else Coordinates(form).heading
 
 
 def place_words(site: "Site", form: PlaceFormat) -> "Callable[[Floats], str]":
@@ -95,6 +103,6 @@ def place_words(site: "Site", form: PlaceFormat) -> "Callable[[Floats], str]":
         if site.is_local:
             return f"{point_m[0]:+.1f}, {point_m[1]:+.1f}"
         latitude, longitude, _ = site.frame.wgs84_from_site(point_m[None])
-        return place_text(float(latitude[0]), float(longitude[0]), Coordinates(form.value))
+        return place_text(float(latitude[0]), float(longitude[0]), Coordinates(form))
 
     return words

@@ -1,6 +1,5 @@
 """`sorvolo search`: what a flight's search would have found, measured, and where it could not see."""
 
-import json
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -25,7 +24,7 @@ from sorvolo.cli.options import (
     Telemetry,
     wanted_classes,
 )
-from sorvolo.cli.printing import TO_CHECK, show_notices_and_warnings, show_path
+from sorvolo.cli.printing import TO_CHECK, print_json, show_notices_and_warnings, show_path
 from sorvolo.cli.progress import ProgressReport, show_progress
 from sorvolo.cli.sites import ended_by_signal, opened_site, run_on_site
 from sorvolo.errors import SettingsError
@@ -129,7 +128,7 @@ def search_command(
                     f"{update.found} of {update.planted} found" if update.planted else "",
                 )
     if as_json:
-        typer.echo(json.dumps({"folder": str(outputs.folder), **report}, indent=1))
+        print_json({"folder": str(outputs.folder), **report})
     else:
         _show(report, outputs.folder, outputs.refly, Console())
     if not report["headline"]["complete"]:

@@ -15,7 +15,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from sorvolo.cli.options import AsJson, Cot, CotAuthority, CotCertificate
+from sorvolo.cli.options import AsJson, Authority, Cot, CotCertificate
 from sorvolo.cli.sites import show_copy
 from sorvolo.errors import InputError, SettingsError
 
@@ -74,9 +74,6 @@ Mqtt = Annotated[
         "SORVOLO_MQTT_PASSWORD."
     ),
 ]
-MqttAuthority = Annotated[
-    Path | None, typer.Option(help="For mqtts://: the authority of the broker, PEM.")
-]
 LogJson = Annotated[
     bool, typer.Option("--log-json", help="Log each request and fault as a line of JSON on stderr.")
 ]
@@ -104,9 +101,9 @@ def serve(
     open_page: Opens = False,
     webhook: Webhooks = None,
     mqtt: Mqtt = "",
-    mqtt_ca: MqttAuthority = None,
+    mqtt_ca: Authority = None,
     cot: Cot = "",
-    cot_ca: CotAuthority = None,
+    cot_ca: Authority = None,
     cot_cert: CotCertificate = None,
     log_json: LogJson = False,
 ) -> None:

@@ -12,7 +12,7 @@ from rich.console import Console
 from sorvolo import __version__
 from sorvolo.cli.compare import read_results, show_results
 from sorvolo.cli.map import show_reports
-from sorvolo.cli.options import AsJson, Seed
+from sorvolo.cli.options import AsJson, FlightHeight, Seed
 from sorvolo.cli.printing import read_json
 from sorvolo.cli.progress import ProgressReport, show_progress
 from sorvolo.cli.sites import opened_site, run_on_site
@@ -47,7 +47,6 @@ FlightCount = Annotated[
 TelemetryFormat = Annotated[
     str, typer.Option(help="Telemetry format: csv, srt, nmea, gpx, all or none.")
 ]
-FlightHeight = Annotated[float | None, typer.Option(help="Flight height above ground, m.")]
 StripLength = Annotated[float | None, typer.Option(help="Length of a strip, m.")]
 StripCount = Annotated[int | None, typer.Option(help="Number of strips.")]
 AsPhotos = Annotated[

@@ -1,7 +1,6 @@
 """`sorvolo stream`: a flight sent to a station while it is flown, or a recorded one as if it were."""
 
 import hashlib
-import json
 import os
 import signal
 import threading
@@ -15,7 +14,8 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from sorvolo.cli.options import AsJson, Camera
+from sorvolo.cli.options import AsJson, Authority, Camera, Telemetry
+from sorvolo.cli.printing import print_json
 from sorvolo.cli.progress import ProgressReport
 from sorvolo.cli.serve import demand_extra
 from sorvolo.errors import SettingsError
@@ -43,19 +43,13 @@ Token = Annotated[
         help="Token of the role operate; others cannot see it in SORVOLO_TOKEN.",
     ),
 ]
-StreamTelemetry = Annotated[
-    str,
-    typer.Option(
-        help="The flight's log if not beside the video; for a live source, a receiver's address."
-    ),
-]
 Speed = Annotated[
     float, typer.Option(help="Of a recording: 1 as it was flown, 0 as fast as the link takes it.")
 ]
 Latency = Annotated[
-    float, typer.Option(help="On a slow link pictures older than this are dropped, s.")
+    float,
+    typer.Option(help="On a slow link pictures older than this are dropped, s; inf drops none."),
 ]
-KeepAll = Annotated[bool, typer.Option("--keep-all", help="Drop no picture, however late.")]
 SpoolFolder = Annotated[
     Path | None, typer.Option(help="Folder for what waits.", show_default="in the user's cache")
 ]
@@ -67,9 +61,6 @@ StreamGiveUp = Annotated[
         show_default="30 for the camera, never for the link",
     ),
 ]
-Authority = Annotated[
-    Path | None, typer.Option(help="Authority of the station's certificate, PEM.")
-]
 
 
 def stream(
@@ -77,11 +68,10 @@ def stream(
     to: To,
     name: StreamName = "",
     token: Token = "",
-    telemetry: StreamTelemetry = "",
+    telemetry: Telemetry = None,
     camera: Camera = "",
     speed: Speed = 1.0,
     latency: Latency = 5.0,
-    keep_all: KeepAll = False,
     spool: SpoolFolder = None,
     spool_mb: SpoolMb = 512.0,
     give_up: StreamGiveUp = None,
@@ -104,7 +94,7 @@ def stream(
     forever = float("inf")
     settings = StreamSettings(
         speed,
-        forever if keep_all else latency,
+        latency,
         round(spool_mb * 1e6),
         give_up_s=forever if give_up is None else give_up,
         authority=ca,
@@ -135,7 +125,13 @@ def _send(
     to, name, token = station
     url = stream_url(to, name)
     console = Console(stderr=True)
-    _warn_of_plain_token(url, token, console)
+    from urllib.parse import urlsplit
+
+    parts = urlsplit(url)
+    if token and parts.scheme == "ws" and parts.hostname not in ("127.0.0.1", "::1", "localhost"):
+        console.print(
+            "[yellow]warning[/yellow]  without TLS (https://) who listens in this network can read the token"
+        )
     reports = []
     waiting = Spool(folder, settings.spool_bytes)
     if footage.is_live and (remains := remains_of(waiting, time.time_ns())) is not None:
@@ -185,32 +181,31 @@ def _show_end(
 ) -> None:
     if as_json:
         flights = [_result(each) for each in reports]
-        typer.echo(json.dumps({"flights": flights, "notices": list(footage.notices())}, indent=1))
+        print_json({"flights": flights, "notices": list(footage.notices())})
         return
     for report in reports:
+        samples = counted(report.samples, "telemetry sample")
+        words = [
+            f"{counted(report.frames, 'frame')} and {samples}, {report.sent_bytes / 1e6:.1f} MB"
+        ]
+        if report.late:
+            words.append(f"{counted(report.late, 'frame')} dropped: the link was too slow")
+        if report.overflowed:
+            words.append(f"{counted(report.overflowed, 'frame')} dropped: the spool was full")
+        if report.outages:
+            words.append(f"{counted(report.outages, 'outage')}, {report.outage_s:.1f} s in all")
+        if report.spooled:
+            words.append(
+                f"{counted(report.spooled, 'frame')} still waiting; the same command sends them"
+            )
+        words_of_end = "; ".join(words)
         console.print(
-            f"Sent as {escape(report.stream)}: {_words_of_end(report)}",
+            f"Sent as {escape(report.stream)}: {words_of_end}",
             highlight=False,
             soft_wrap=True,
         )
     for text in footage.notices():
         console.print(f"  {escape(text)}", highlight=False, soft_wrap=True)
-
-
-def _words_of_end(report: "StreamReport") -> str:
-    samples = counted(report.samples, "telemetry sample")
-    words = [f"{counted(report.frames, 'frame')} and {samples}, {report.sent_bytes / 1e6:.1f} MB"]
-    if report.late:
-        words.append(f"{counted(report.late, 'frame')} dropped: the link was too slow")
-    if report.overflowed:
-        words.append(f"{counted(report.overflowed, 'frame')} dropped: the spool was full")
-    if report.outages:
-        words.append(f"{counted(report.outages, 'outage')}, {report.outage_s:.1f} s in all")
-    if report.spooled:
-        words.append(
-            f"{counted(report.spooled, 'frame')} still waiting; the same command sends them"
-        )
-    return "; ".join(words)
 
 
 def _result(report: "StreamReport") -> dict[str, Any]:
@@ -228,16 +223,6 @@ def _result(report: "StreamReport") -> dict[str, Any]:
         "delay_median_s": delays_s[len(delays_s) // 2] if delays_s else None,
         "delay_p95_s": delays_s[len(delays_s) * 95 // 100] if delays_s else None,
     }
-
-
-def _warn_of_plain_token(url: str, token: str, console: Console) -> None:
-    from urllib.parse import urlsplit
-
-    parts = urlsplit(url)
-    if token and parts.scheme == "ws" and parts.hostname not in ("127.0.0.1", "::1", "localhost"):
-        console.print(
-            "[yellow]warning[/yellow]  without TLS (https://) who listens in this network can read the token"
-        )
 
 
 def _cache() -> Path:

@@ -1,6 +1,5 @@
 """`sorvolo telemetry`: a mapped flight's telemetry corrected by its map, and in words what was wrong with it."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,16 +10,16 @@ from rich.markup import escape
 
 from sorvolo.cli.options import (
     AsJson,
+    Authority,
     Camera,
     Cot,
-    CotAuthority,
     CotCertificate,
     Flight,
     ResultsFolder,
     SiteOption,
     Telemetry,
 )
-from sorvolo.cli.printing import show_path
+from sorvolo.cli.printing import print_json, show_path
 from sorvolo.cli.progress import show_progress
 from sorvolo.cli.sites import OpenedSite, opened_site, run_on_site
 from sorvolo.errors import InputError, SettingsError
@@ -40,7 +39,7 @@ def telemetry_command(
     camera: Camera = "",
     out: ResultsFolder = None,
     cot: Cot = "",
-    cot_ca: CotAuthority = None,
+    cot_ca: Authority = None,
     cot_cert: CotCertificate = None,
     as_json: AsJson = False,
 ) -> None:
@@ -84,7 +83,7 @@ def telemetry_command(
             cot=receiver,
         )
     if as_json:
-        typer.echo(json.dumps({"folder": str(target), **report}, indent=1))
+        print_json({"folder": str(target), **report})
     else:
         _show(report, target, Console())
 

@@ -1,6 +1,5 @@
 """`sorvolo watch`: each object printed when it is found; in the end how many of what, where, and how sure."""
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
@@ -16,10 +15,10 @@ from sorvolo.cli.options import (
     AlertCommand,
     AlertUrl,
     AsJson,
+    Authority,
     Camera,
     Classes,
     Cot,
-    CotAuthority,
     CotCertificate,
     EnoughLookedAt,
     GiveUp,
@@ -30,7 +29,6 @@ from sorvolo.cli.options import (
     PlaceFormat,
     PlaceFormatOption,
     ResultsFolder,
-    Save,
     SaveOption,
     SearchRate,
     Telemetry,
@@ -41,6 +39,7 @@ from sorvolo.cli.printing import (
     TO_CHECK,
     announce_person,
     place_heading,
+    print_json,
     read_json,
     show_notices_and_warnings,
     show_path,
@@ -74,10 +73,10 @@ def watch_command(
     model: Model = "default",
     classes: Classes = None,
     out: ResultsFolder = None,
-    save: SaveOption = Save.NONE,
+    save: SaveOption = "none",
     labels: Labels = "",
     cot: Cot = "",
-    cot_ca: CotAuthority = None,
+    cot_ca: Authority = None,
     cot_cert: CotCertificate = None,
     alert_command: AlertCommand = "",
     alert_url: AlertUrl = "",
@@ -88,7 +87,7 @@ def watch_command(
     height_model: HeightModel = "",
     give_up: GiveUp = 30.0,
     enough_looked_at: EnoughLookedAt = 0.9,
-    coordinates: PlaceFormatOption = PlaceFormat.LATLON,
+    coordinates: PlaceFormatOption = "latlon",
     as_json: AsJson = False,
 ) -> None:
     """Find people and cars in a flight, live or recorded, and where on the ground they are; small objects by --classes.
@@ -121,7 +120,7 @@ def watch_command(
     )
     outputs = WatchOutputs(
         out,
-        save.value,
+        save,
         names(labels),
         cot,
         alert_command=alert_command,
@@ -149,7 +148,7 @@ def watch_command(
             folders[folder] = None
     results = [_result(folder) for folder in folders]
     if as_json:
-        typer.echo(json.dumps({"watches": results}, indent=1))
+        print_json({"watches": results})
     else:
         for result in results:
             _show_result(result, Console(), coordinates)
@@ -183,7 +182,7 @@ def _show_progress(
         for update in updates:
             resumed.take(update.frames_detected, is_resumed=update.is_resumed)
             for track in () if is_quiet or update.is_resumed else update.new:
-                name, rest = found_words(track, update.site, Coordinates(form.value))
+                name, rest = found_words(track, update.site, Coordinates(form))
                 if track.label == PERSON:
                     announce_person(f"{name}  {rest}", console)
                 else:
@@ -257,7 +256,7 @@ def _show_tracks(
         table.add_column(name, no_wrap=name in ("id", place_name), overflow="fold")
     for track in tracks[:_MAX_ROWS]:
         if on_ground:
-            place = place_text(track["latitude"], track["longitude"], Coordinates(form.value))
+            place = place_text(track["latitude"], track["longitude"], Coordinates(form))
         else:
             segment = f"{track['segment']}: " if has_cuts else ""
             place = f"{segment}{track['x_px']:.0f}, {track['y_px']:.0f}"

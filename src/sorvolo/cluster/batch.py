@@ -229,7 +229,14 @@ def _read(path: Path) -> dict[tuple[str, str], BatchRow]:
         try:
             plain = json.loads(line) if line else None
             if number == 0:
-                _check_head(path, plain)
+                if not isinstance(plain, dict) or plain.get("made_by") != _HEAD["made_by"]:
+                    raise StoreError(
+                        f"{path} is not a table of sorvolo batch; move it away, or choose another --root"
+                    )
+                if plain != _HEAD:
+                    raise StoreError(
+                        f"{path} has format {plain.get('format')}, this version reads {_HEAD['format']}; use the version that wrote it"
+                    )
             elif plain is not None:
                 if (seen := plain["scouted"]) is not None:
                     seen = Scouted(**{**seen, "box": tuple(seen["box"]) if seen["box"] else None})
@@ -243,17 +250,6 @@ def _read(path: Path) -> dict[tuple[str, str], BatchRow]:
                 f"{path}: line {number + 1} is no row of a batch ({error}); move the file away"
             ) from error
     return rows
-
-
-def _check_head(path: Path, head: Any) -> None:
-    if not isinstance(head, dict) or head.get("made_by") != _HEAD["made_by"]:
-        raise StoreError(
-            f"{path} is not a table of sorvolo batch; move it away, or choose another --root"
-        )
-    if head != _HEAD:
-        raise StoreError(
-            f"{path} has format {head.get('format')}, this version reads {_HEAD['format']}; use the version that wrote it"
-        )
 
 
 def _line(content: Mapping[str, Any]) -> bytes:

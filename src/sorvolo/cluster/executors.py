@@ -269,7 +269,13 @@ def ray_executor(name: str, slots: int | None, root: Path) -> Iterator[RayExecut
 
     address = name
     if name == "ray":
-        address = os.environ.get("RAY_ADDRESS", "auto" if _is_started() else "local")
+        # Whether `ray start` noted a cluster that this machine is part of
+        address = os.environ.get(
+            "RAY_ADDRESS",
+            "auto"
+            if (Path(os.environ.get("RAY_TMPDIR", "/tmp"), "ray", "ray_current_cluster").is_file())
+            else "local",
+        )
     if ":" in address:  # Ray waits for minutes where nothing listens
         host, _, port = address.removeprefix("ray://").rpartition(":")
         try:
@@ -295,11 +301,6 @@ def ray_executor(name: str, slots: int | None, root: Path) -> Iterator[RayExecut
     finally:
         executor.end()
         ray.shutdown()
-
-
-def _is_started() -> bool:
-    """Whether `ray start` noted a cluster that this machine is part of."""
-    return Path(os.environ.get("RAY_TMPDIR", "/tmp"), "ray", "ray_current_cluster").is_file()
 
 
 def _run_there(order: Order, root: str, version: str) -> TryEnding:
