@@ -51,6 +51,13 @@ ThroughCrowns = Annotated[
         help="Share of a body that crowns leave free: 0 counts ground under trees as not seen."
     ),
 ]
+ThroughTrees = Annotated[
+    bool,
+    typer.Option(
+        "--through-trees",
+        help="Look for people below crowns: put all pictures together on the forest floor, in place of measuring.",
+    ),
+]
 
 
 def search_command(
@@ -69,6 +76,7 @@ def search_command(
     plants: Plants = 80,
     enough: Enough = 0.5,
     through_crowns: ThroughCrowns = 0.0,
+    through_trees: ThroughTrees = False,
     refly: Refly = None,
     dji_drone: DjiDrone = "fly",
     out: ResultsFolder = None,
@@ -86,6 +94,8 @@ def search_command(
 
     Example: sorvolo search field --area search-area.kml --refly holes.kml
 
+    Example: sorvolo search forest --through-trees
+
     Example: sorvolo search DJI_0042.MP4 --site field --poa segments.geojson
 
     Example: sorvolo search rtsp://192.168.1.10/live --site field --area search-area.kml --refly holes.kml
@@ -98,6 +108,10 @@ def search_command(
         raise SettingsError(
             f"{option} is for flights that are mapped now; give --site FOLDER, or leave it out"
         )
+    if through_trees and (site or len(flight or ()) > 1):
+        raise SettingsError(
+            "--through-trees looks at one mapped flight; give the map's folder and one --flight"
+        )
     settings = SearchSettings(plants, wanted_classes(classes), model, enough, through_crowns)
     with opened_site(site or _map_of(inputs), writes=bool(site)) as place:
         outputs = SearchOutputs(
@@ -108,6 +122,9 @@ def search_command(
             tuple(refly or ()),
             dji_drone,
         )
+        if through_trees:
+            _look_through_trees(place, outputs, as_json=as_json)
+            return
         if site:
             if flight:
                 raise SettingsError(
@@ -133,6 +150,29 @@ def search_command(
         _show(report, outputs.folder, outputs.refly, Console())
     if not report["headline"]["complete"]:
         raise typer.Exit(TO_CHECK)
+
+
+def _look_through_trees(place: "OpenedSite", outputs: "SearchOutputs", *, as_json: bool) -> None:
+    from sorvolo.missions.search.through_trees import search_under_trees
+    from sorvolo.survey.wording import counted
+
+    flight = outputs.flights[0] if outputs.flights else ""
+    report = search_under_trees(place.folder, outputs.folder, flight=flight)
+    if as_json:
+        typer.echo(json.dumps({"folder": str(outputs.folder), **report}, indent=1, default=dict))
+        return
+    console = Console()
+    found = counted(len(report["people"]), "possible person")
+    seen = f"{report['seen_m2']:,.0f} m2 of floor, {report['views_median']:.0f} views of each spot"
+    console.print(f"{found} under trees; {seen}", style="bold", highlight=False, soft_wrap=True)
+    for row in report["people"]:
+        where = f"{row['latitude_deg']:.6f}, {row['longitude_deg']:.6f}"
+        pictures = escape(", ".join(row["pictures"]))
+        console.print(f"  {where}  {row['anomaly']:.0f} sigmas, see {pictures}", highlight=False)
+    for notice in report["notices"]:
+        console.print(f"[yellow]notice[/yellow] {escape(notice)}", highlight=False)
+    for name, file in (("GeoTIFF", "under_trees.tif"), ("places", "under_trees.geojson")):
+        show_path(name, outputs.folder / file, console)
 
 
 def _map_all(
