@@ -159,7 +159,7 @@ def _look_through_trees(place: "OpenedSite", outputs: "SearchOutputs", *, as_jso
     flight = outputs.flights[0] if outputs.flights else ""
     report = search_under_trees(place.folder, outputs.folder, flight=flight)
     if as_json:
-        typer.echo(json.dumps({"folder": str(outputs.folder), **report}, indent=1, default=dict))
+        print_json({"folder": str(outputs.folder), **report})
         return
     console = Console()
     found = counted(len(report["people"]), "possible person")

@@ -94,7 +94,7 @@ def search_under_trees(
     report = {
         "flight": name,
         "people": rows,
-        "refused": finds.refused,
+        "refused": dict(finds.refused),
         "pictures": len(views),
         "seen_m2": float(seen.sum()) * cell_m**2,
         "views_median": float(np.median(under.views[seen])) if seen.any() else 0.0,
