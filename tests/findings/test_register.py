@@ -8,6 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sorvolo.findings.importance import between, ordered
 from sorvolo.findings.register import (
     Look,
     MissionSighting,
@@ -83,6 +84,8 @@ def test_all_missions_of_two_dates_see_each_thing_once() -> None:
     assert [(each.label, each.gone) for each in gone] == [("car", "flight1"), ("person", "flight1")]
     assert gone[0].presence("flight1") is Presence.GONE
     assert len(register.present) == 4
+    assert between(register, "flight0", "flight1") == "1 person came, 1 left; 1 car left"
+    assert [each.label for each in ordered(register.findings)] == ["person"] * 2 + ["car"] * 4
 
 
 def test_silence_is_no_absence() -> None:

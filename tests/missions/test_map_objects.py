@@ -158,7 +158,7 @@ def test_compare_names_changes(simulated: Path, compared: Path) -> None:
         newest, searches = archive.newest_objects(), archive.searches()
     assert {each.flight_id for each in searches} == {"flight1", "flight2"}
     assert sum(each.flight_id == "flight2" for each in newest) >= 4
-    assert any(each.flights == ("flight1", "flight2") for each in newest)
+    assert any(each.finding.dates == ("flight1", "flight2") for each in newest)
     assert "is now" in (compared / "flights/flight2/changes.html").read_text()
 
 

@@ -47,7 +47,8 @@ def between(register: Register, before: str, after: str) -> str:
 
 
 def _was_looked_for(found: Finding, date: str, looks: dict[str, Look]) -> bool:
-    look = looks.get(date)
-    if look is None:
-        return any(each.origin is Origin.CHANGED for each in found.sightings)
-    return bool(looked_at(np.array([found.position_m]), [found.label], [look.frames])[0])
+    """Whether a thing's own comparison saw it come, or a date's frames were searched for its class where it is."""
+    if any(each.origin is Origin.CHANGED and not each.gone for each in found.sightings):
+        return True
+    searched = [looks[date].frames] if date in looks else []
+    return bool(looked_at(np.array([found.position_m]), [found.label], searched)[0])

@@ -237,13 +237,12 @@ class _Thing:
         for name, share in _odds(sighting).items():
             self.sums[name] = self.sums.get(name, 0.0) + share * sighting.score
         weights = [max(_known(each.sigma_m, 10.0), 0.01) ** -2 for each in self.of_date]
-        total = sum(weights)
-        self.sigma_m = total**-0.5
+        self.sigma_m = max(weights) ** -0.5  # missions of one flight err in common
         places_m = [each.position_m for each in self.of_date]
         if len(places_m) == 1 or sighting.moving:
             self.place_m = sighting.position_m
         else:
-            self.place_m = np.array(weights) @ np.array(places_m) / total
+            self.place_m = np.array(weights) @ np.array(places_m) / sum(weights)
 
     @property
     def left(self) -> str:

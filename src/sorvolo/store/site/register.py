@@ -2,7 +2,6 @@
 
 from collections.abc import Collection, Mapping, Sequence
 
-import numpy as np
 from sqlalchemy import Connection, select
 
 from sorvolo.findings.register import Look, MissionSighting, Origin, Register, associate
@@ -103,7 +102,6 @@ def _of_change(
             continue
         rank, flown_ns = dates[date]
         seen_ns = flown_ns if gone else (change.first_seen_ns, change.last_seen_ns)
-        sigma_m = change.sigma_in_map_m
         sightings.append(
             MissionSighting(
                 date,
@@ -114,7 +112,7 @@ def _of_change(
                 label,
                 change.score,
                 change.centre_m,
-                change.sigma_m if np.isnan(sigma_m) else sigma_m,
+                change.sigma_m,
                 change.length_m,
                 seen_ns[0],
                 seen_ns[1],
