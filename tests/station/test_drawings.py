@@ -1,7 +1,5 @@
 """Drawings that all pages of a site share: kept, numbered, never overwritten unseen."""
 
-import json
-import os
 import shutil
 import time
 from pathlib import Path
@@ -68,19 +66,4 @@ def test_a_new_site_has_none_of_a_deleted_one_of_its_name(
         made_site, root / "field"
     )  # the first site is back, and what was drawn since is not of it
     wait_for(lambda: client.get(URL).status_code == 200)
-    assert client.get(URL).json()["features"] == []
-
-
-def test_drawings_of_an_earlier_station_stay_with_the_site_that_was_there(
-    client: TestClient, root: Path
-) -> None:
-    client.put(URL, json={"revision": 0, "features": [zone("a")]})
-    (path,) = (root / "station" / "drawings").iterdir()
-    kept = json.loads(path.read_bytes())
-    del kept["made_utc"]
-    path.write_text(json.dumps(kept))
-    assert [each["id"] for each in client.get(URL).json()["features"]] == ["a"]
-    os.utime(
-        path, (1_000_000_000, 1_000_000_000)
-    )  # before the site was made: of one that had its name
     assert client.get(URL).json()["features"] == []

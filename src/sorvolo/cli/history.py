@@ -43,7 +43,7 @@ def history(
     Example: sorvolo history field --at 2026-05-31 --export may.tif
     """
     from sorvolo.geometry.coordinates import Coordinates, place_text
-    from sorvolo.missions.site.history import export_version, site_history
+    from sorvolo.missions.site.history import came_and_left, export_version, site_history
 
     if at is not None and export is None:
         raise SettingsError(
@@ -66,6 +66,7 @@ def history(
             return
         console = Console()
         _show_versions(entries, console)
+        console.print(came_and_left(place.folder), highlight=False, soft_wrap=True)
         if entries and not (of_map := site_of(place.folder)).is_local:
             origin = of_map.origin
             written = place_text(

@@ -6,7 +6,6 @@ import sqlite3
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -353,21 +352,12 @@ class Drawings:
             self._path(site_id).unlink(missing_ok=True)
 
     def _kept(self, site_id: str, made_utc: str) -> dict[str, Any]:
-        """What is kept for the site that was made then; nothing of a deleted one that had its name.
-
-        Files of earlier stations do not name the site's time: they are of one that was there when they were written.
-        """
-        path = self._path(site_id)
+        """What is kept for the site that was made then; nothing of a deleted one that had its name."""
         try:
-            kept: dict[str, Any] = json.loads(path.read_bytes())
-            at_utc = datetime.fromtimestamp(path.stat().st_mtime, UTC).isoformat()
+            kept: dict[str, Any] = json.loads(self._path(site_id).read_bytes())
         except (FileNotFoundError, ValueError):
             return {}
-        of_utc = kept.get("made_utc")
-        is_ours = (
-            at_utc >= made_utc if of_utc is None else of_utc in ("", made_utc)
-        )  # "": before its first map
-        return kept if is_ours else {}
+        return kept if kept.get("made_utc") in ("", made_utc) else {}  # "": before its first map
 
     def _path(self, site_id: str) -> Path:
         return self._folder / f"{hashlib.sha256(site_id.encode()).hexdigest()[:32]}.json"

@@ -7,6 +7,7 @@ from datetime import UTC, date, datetime, time, timedelta
 from pathlib import Path
 
 from sorvolo.errors import InputError, SettingsError, StoreError
+from sorvolo.findings.importance import between
 from sorvolo.store.exports.map_pictures import write_kmz, write_preview
 from sorvolo.store.rasters.geotiff import write_cog
 from sorvolo.store.site.archive import Archive
@@ -63,6 +64,15 @@ def site_history(site: Path) -> list[HistoryEntry]:
             )
             for each in versions
         ]
+
+
+def came_and_left(site: Path) -> str:
+    """What came and left between the newest two flights of the site, in a sentence; "" for one flight."""
+    with Archive.open(site, write=False) as archive:
+        flights = list(dict.fromkeys(each.flight_id for each in archive.versions()))[-2:]
+        if len(flights) < 2:
+            return ""
+        return f"from {flights[0]} to {flights[1]}: {between(archive.register(), *flights)}"
 
 
 def _entry(
