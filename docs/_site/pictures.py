@@ -19,9 +19,8 @@ from rich.text import Text
 IMAGES = Path(__file__).parents[1] / "images"
 COLUMNS = 104
 FLIGHT = "demo-site/simulation/flight{0}/flight{0}.mp4"
-CAMERA = ["--camera", "demo-site/simulation/camera.xml"]
 COMMANDS = {
-    "inspect": ["inspect", FLIGHT.format(1), *CAMERA],
+    "inspect": ["inspect", FLIGHT.format(1)],
     "plan": [
         "plan",
         "--camera",
@@ -33,9 +32,9 @@ COMMANDS = {
         "--out",
         "field.kmz",
     ],
-    "map": ["map", FLIGHT.format(1), *CAMERA, "--site", "field"],
-    "compare": ["compare", FLIGHT.format(2), *CAMERA, "--site", "field"],
-    "watch": ["watch", FLIGHT.format(2), *CAMERA, "--out", "search"],
+    "map": ["map", FLIGHT.format(1), "--site", "field"],
+    "compare": ["compare", FLIGHT.format(2), "--site", "field"],
+    "watch": ["watch", FLIGHT.format(2), "--out", "search"],
     "review": ["review", "field"],
     "search": ["search", "field", "--out", "found"],
     "labelled": ["simulate", "labelled", "--pictures", "60", "--seed", "7"],

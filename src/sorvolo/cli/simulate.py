@@ -217,7 +217,7 @@ def demo(
 
     simulation, site = folder / "simulation", folder / "site"
     console, errors = Console(), Console(stderr=True)
-    settings, camera = preset("demo"), str(simulation / "camera.xml")
+    settings = preset("demo")
     if _is_simulated(simulation, settings):
         console.print(
             f"using the flights of an earlier demo: {simulation}", soft_wrap=True, highlight=False
@@ -227,7 +227,7 @@ def demo(
         _show_progress(simulate_site(simulation, settings))
     console.print("mapping the first flight")
     with opened_site(str(site), writes=True) as place:
-        mapping = map_flights([simulation / "flight1" / "flight1.mp4"], site, camera=camera)
+        mapping = map_flights([simulation / "flight1" / "flight1.mp4"], site)
         folders = run_on_site(
             mapping, place, lambda updates: show_progress(updates, errors), "mapped"
         )
@@ -241,7 +241,7 @@ def demo(
                 f"would cost {corners.floor.rms_m:.2f} m; relative to each other they lie {corners.shape.rms_m:.3f} m off."
             )
         console.print("comparing the second flight with the map")
-        comparing = compare_flights([simulation / "flight2" / "flight2.mp4"], site, camera=camera)
+        comparing = compare_flights([simulation / "flight2" / "flight2.mp4"], site)
         show_results(read_results(comparing, place), site, console)
     for measured in evaluate_changes(site, simulation):
         if measured.events is not None:

@@ -107,6 +107,8 @@ def test_everything_is_there(site):
     files = set(hashes(site))
     assert {
         "camera.xml",
+        "flight1/camera.xml",
+        "flight2/camera.xml",
         "simulation.json",
         "flight1/flight1.mp4",
         "flight1/flight1.csv",

@@ -19,6 +19,7 @@ from sorvolo.errors import InputError, SettingsError
 from sorvolo.lab.evaluation.change_metrics import Counts
 from sorvolo.lab.evaluation.mask_folders import frames_against_times
 from sorvolo.lab.simulation.flight_files import write_mask
+from sorvolo.lab.thesis import umcd, umcd_writing
 from sorvolo.lab.thesis.comparisons import TABLE, _judged, _times_of
 from sorvolo.lab.thesis.detectors import okutama_labels
 from sorvolo.lab.thesis.npu_folder import photos_of_sequence, read_npu_folder
@@ -164,8 +165,8 @@ def test_tables_have_the_printed_figures_beside_ours(
 def test_npus_flights_are_mapped_and_compared_with_the_published_mosaics(
     dataset: Path, reproduced: tuple[Path, list[ReproductionUpdate]], tmp_path: Path
 ) -> None:
-    umcd = read_umcd_folder(dataset)
-    (flown,) = umcd.mosaicking
+    folder = read_umcd_folder(dataset)
+    (flown,) = folder.mosaicking
     own = tmp_path / "npu" / "phantom3-npu"
     own.mkdir(parents=True)
     for each in (flown.video, *flown.texts):
@@ -175,7 +176,7 @@ def test_npus_flights_are_mapped_and_compared_with_the_published_mosaics(
         own / "bu-et-al.tif",
     )
     (tmp_path / "npu" / "phantom3-village.mp4").write_bytes(b"no video")
-    work = _Work(umcd, tmp_path / "out", replace(SETTINGS, videos=None))
+    work = _Work(folder, tmp_path / "out", replace(SETTINGS, videos=None))
     rows = {row.id: row for row, _ in map(work.done, work.npu_tasks(tmp_path / "npu"))}
     assert len(rows) == 8
     made = [
@@ -272,6 +273,46 @@ def test_npus_sequences_are_read_as_published(tmp_path: Path) -> None:
         photos_of_sequence(folder, tmp_path / "again")
 
 
+def test_a_set_with_what_chapter_2_lists_and_no_more_fills_every_table(
+    dataset: Path,
+    reproduced: tuple[Path, list[ReproductionUpdate]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """No masks; metadata of type, shape, dimension, colour and movement; a benchmark mosaic; times of Table 2.4.
+
+    The times are made up, and exact: the path is flown in two seconds.
+    """
+    place, out = copied(dataset, tmp_path / "umcd"), tmp_path / "out"
+    shutil.copytree(reproduced[0], out)
+    (later,) = read_umcd_folder(place).change_detection
+    assert later.masks is not None and later.metadata is not None
+    shutil.rmtree(later.masks)
+    listed = [
+        line
+        for line in later.metadata.read_text().splitlines()
+        if not line.startswith(("Fps", "Appearance", "Box"))
+    ]
+    later.metadata.write_text("\n".join(listed))
+    length_s = video_input(later, None, tmp_path).length_s
+    monkeypatch.setitem(APPEARANCES, later.key, (round(length_s), ((0.2, 0.6), (1.0, 1.4))))
+    for module in (umcd, umcd_writing):
+        monkeypatch.setattr(module, "ROUNDED_S", 0.1)
+    mosaic = place / BENCHMARK / WITH / MOSAICKING / "Countryside" / "path1.tif"
+    mosaic.parent.mkdir(parents=True)
+    shutil.copy(out / "sites" / "countryside-path1" / "planar" / "mosaic.tif", mosaic)
+    rows = [each.row for each in reproduce(place, out, SETTINGS, is_whole=False)]
+    assert [each.missing for each in rows] == [""] * len(rows)
+    tables = tables_of(rows)
+    assert all(tables[name]["ours"] for name in tables)
+    assert {each["judged_by"] for each in tables["tables_4_3_and_4_4"]["ours"]} == {TABLE}
+    for each in tables["table_4_5"]["ours"]:
+        assert each["tn"] > 0 and each["precision"] is None and each["accuracy"] is not None
+    (detector,) = tables["table_4_6"]["ours"]
+    assert "places by the comparison of both flights" in detector["split"]
+    assert tables["section_4_1_1"]["ours"][1]["benchmarks"] == 1
+
+
 def test_a_changed_pair_without_anything_to_judge_it_by_is_named(
     dataset: Path, reproduced: tuple[Path, list[ReproductionUpdate]], tmp_path: Path
 ) -> None:
@@ -287,7 +328,7 @@ def test_a_changed_pair_without_anything_to_judge_it_by_is_named(
         "neither a folder of change masks (path1_masks) nor"
         in reasons["comparison/countryside/path1/robust"]
     )
-    assert "no metadata file gives the places of objects" in reasons["detector/UMCD/packaged"]
+    assert "nor a comparison of two flights gives the places" in reasons["detector/UMCD/packaged"]
     assert len(reasons) == 5
 
 

@@ -110,7 +110,8 @@ def frames_against_times(
 ) -> Iterator[ComparedMask]:
     """Judge masks of a video's frames where it is only known which frames show a change; None: not judged.
 
-    Masks are named by the numbers of their frames; others are passed over. Raises InputError as `compared_masks`.
+    Masks are named by the numbers of their frames; others are passed over. Pixels are counted where nothing changed.
+    Raises InputError as `compared_masks`.
     """
     for name, path in _masks(found).items():
         if not name.isdecimal():
@@ -123,7 +124,9 @@ def frames_against_times(
             counts = Counts(tp=1) if changed.any() else Counts(fn=1)
         else:
             counts = Counts(fp=1) if changed.any() else Counts(tn=1)
-        yield ComparedMask(name, path, Counts(), counts)
+        nothing = np.zeros(changed.shape, bool)
+        pixels = pixel_counts(changed, nothing, unknown) if there is False else Counts()
+        yield ComparedMask(name, path, pixels, counts)
 
 
 def has_masks(folder: Path) -> bool:

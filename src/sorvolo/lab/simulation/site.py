@@ -87,8 +87,7 @@ def simulate_site(
             )
             features += frame_features(flight)
             _write_truth(flight, partial / "truth")
-            if flight.settings.imaging != settings.imaging:
-                write_camera(partial / flight.name / "camera.xml", flight.camera)
+            write_camera(partial / flight.name / "camera.xml", flight.camera)
             if flight.number == 1:
                 write_camera(partial / "camera.xml", flight.camera)
                 _write_ground(flight, partial / "truth" / "ground.tif")

@@ -4,8 +4,8 @@ docs/errata.md lists where the text is read otherwise than it is printed.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import ClassVar, NamedTuple
+from dataclasses import dataclass, field, fields, replace
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -46,8 +46,17 @@ class ThesisSettings:
     least_distance: float = 0.3  # T_B
 
     def __post_init__(self) -> None:
+        most = kernels.LARGEST_WINDOW_PX
         for name in ("averaging_px", "pattern_px", "isolation_px"):
-            _check_window(name, getattr(self, name))
+            match window := getattr(self, name):
+                case (int(width), int(height)) if (
+                    1 <= min(width, height) <= max(width, height) <= most
+                ):
+                    pass
+                case _:
+                    raise SettingsError(
+                        f"{name} is {window}; give width and height as whole numbers from 1 to {most}"
+                    )
         for name in ("hamming_share", "isolation_share", "area_share", "least_distance"):
             share = getattr(self, name)
             if not (share is None and name == "hamming_share") and not 0 <= share <= 1:
@@ -116,16 +125,11 @@ class ThesisSteps:
     boxes: Boxes
 
     def pictures(self) -> dict[str, NDArray[np.uint8]]:
-        """The pictures by name, in the figure's order; BGR or gray."""
+        """The pictures by name, such as "a-reference-equalised", in the figure's order; BGR or gray."""
+        shown = [each.name for each in fields(self) if each.name != "boxes"]
         return {
-            "a-reference-equalised": self.reference_equalised,
-            "b-query-equalised": self.query_equalised,
-            "c-reference-averaged": self.reference_averaged,
-            "d-query-averaged": self.query_averaged,
-            "e-difference": self.difference,
-            "f-without-isolations": self.without_isolations,
-            "g-changes": self.changes,
-            "h-highlighted": self.highlighted,
+            f"{letter}-{name.replace('_', '-')}": getattr(self, name)
+            for letter, name in zip("abcdefgh", shown)
         }
 
 
@@ -160,7 +164,7 @@ def compare_thesis(
     do not count in histograms. A box that lost all its white pixels to another one that was removed is removed, too.
     Raises InputError where the sizes differ, SettingsError where the reference was prepared with another window.
     """
-    return _compare(reference, query, valid, settings or ThesisSettings(), threads).changes
+    return _compare(reference, query, valid, settings or ThesisSettings(), threads)[-1]
 
 
 def thesis_steps(
@@ -171,20 +175,25 @@ def thesis_steps(
     threads: int = 1,
 ) -> ThesisSteps:
     """`compare_thesis` with all that lies between: the pictures of Figure 3.14."""
-    run = _compare(reference, query, valid, settings or ThesisSettings(), threads)
-    highlighted = query // 3
-    marked = run.changes.mask > 0
-    highlighted[marked] = query[marked]
+    before, after, difference, kept, found = _compare(
+        reference, query, valid, settings or ThesisSettings(), threads
+    )
+    both = before, after
+    equalised = [
+        np.asarray(cv2.LUT(each.picture, each.tables.T.reshape(1, 256, 3)), np.uint8)
+        for each in both
+    ]
+    averaged = [np.ascontiguousarray(each.planes.transpose(1, 2, 0)) for each in both]
     return ThesisSteps(
-        _looked_up(run.reference),
-        _looked_up(run.query),
-        _interleaved(run.reference.planes),
-        _interleaved(run.query.planes),
-        run.difference,
-        run.without_isolations,
-        run.changes.mask,
-        highlighted,
-        run.changes.boxes,
+        equalised[0],
+        equalised[1],
+        averaged[0],
+        averaged[1],
+        difference,
+        kept,
+        found.mask,
+        np.where(found.mask[..., None] > 0, query, query // 3),
+        found.boxes,
     )
 
 
@@ -210,27 +219,20 @@ def bhattacharyya_distances(first: NDArray[np.int64], second: NDArray[np.int64])
     return np.sqrt(np.maximum(0.0, 1.0 - overlap))
 
 
-class _Run(NamedTuple):
-    reference: ThesisReference
-    query: ThesisReference
-    difference: ImageGray
-    without_isolations: ImageGray
-    changes: Comparison
-
-
 def _compare(
     reference: Picture | ThesisReference,
     query: Picture,
     valid: Mask | None,
     settings: ThesisSettings,
     threads: int,
-) -> _Run:
+) -> tuple[ThesisReference, ThesisReference, ImageGray, ImageGray, Comparison]:
+    """Both pictures prepared, M_diff, that without isolations, and the changes."""
     if isinstance(reference, ThesisReference):
-        _, query = checked_pair(reference.picture, query, valid)
         before = reference
     else:
-        picture, query = checked_pair(reference, query, valid)
+        picture, _ = checked_pair(reference, query, valid)
         before = prepare_reference(picture, valid, settings, threads)
+    _, query = checked_pair(before.picture, query, valid)
     if before.averaging_px != settings.averaging_px:
         raise SettingsError(
             f"the reference was prepared with averaging_px {before.averaging_px}, the settings have "
@@ -248,7 +250,7 @@ def _compare(
     )
     if after.known is not None:
         kept[after.known == 0] = 0
-    return _Run(before, after, difference, kept, _similar_removed(before, after, kept, settings))
+    return before, after, difference, kept, _similar_removed(before, after, kept, settings)
 
 
 def _differences(
@@ -280,46 +282,16 @@ def _similar_removed(
 ) -> Comparison:
     """Bounding boxes less those too small (T_area) or with similar histograms (T_B), their pixels black."""
     mask, boxes = kept.copy(), kernels.region_boxes(kept)
-    small = boxes[:, 2] * boxes[:, 3] < settings.area_share * mask.size
-    _blacken(mask, boxes[small])
-    boxes = boxes[~small]
+    removed = boxes[:, 2] * boxes[:, 3] < settings.area_share * mask.size
     histograms = [
-        kernels.gray_histograms(each.picture, each.tables, boxes, after.known)
+        kernels.gray_histograms(each.picture, each.tables, boxes[~removed], after.known)
         for each in (before, after)
     ]
-    similar = bhattacharyya_distances(*histograms) < settings.least_distance
-    _blacken(mask, boxes[similar])
-    boxes = boxes[~similar]
-    white = np.array(
-        [mask[y : y + height, x : x + width].any() for x, y, width, height in boxes], bool
-    )
-    return Comparison(mask, boxes[white])
-
-
-def _blacken(mask: ImageGray, boxes: Boxes) -> None:
-    for x, y, width, height in boxes:
+    removed[~removed] = bhattacharyya_distances(*histograms) < settings.least_distance
+    for x, y, width, height in boxes[removed]:
         mask[y : y + height, x : x + width] = 0
-
-
-def _looked_up(prepared: ThesisReference) -> Picture:
-    return np.asarray(cv2.LUT(prepared.picture, prepared.tables.T.reshape(1, 256, 3)), np.uint8)
-
-
-def _interleaved(planes: NDArray[np.uint8]) -> Picture:
-    return np.ascontiguousarray(planes.transpose(1, 2, 0))
-
-
-def _check_window(name: str, window: object) -> None:
-    most = kernels.LARGEST_WINDOW_PX
-    whole = (
-        isinstance(window, tuple)
-        and len(window) == 2
-        and all(isinstance(side, int) for side in window)
-    )
-    if not whole or not all(1 <= side <= most for side in window):  # type: ignore[attr-defined]
-        raise SettingsError(
-            f"{name} is {window}; give width and height as whole numbers from 1 to {most}"
-        )
+    white = [mask[y : y + height, x : x + width].any() for x, y, width, height in boxes]
+    return Comparison(mask, boxes[~removed & np.array(white, bool)])
 
 
 def _whole_share(share: float, count: int) -> int:

@@ -1,10 +1,11 @@
 """Section 4.2: change detection videos against the maps of their paths, counted by frame and by pixel, and timed."""
 
-import math
+import json
 import os
 import shutil
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -26,11 +27,14 @@ from sorvolo.lab.thesis.published import APPEARANCES
 from sorvolo.lab.thesis.settings import COMPARISONS, FIGURE_PX
 from sorvolo.lab.thesis.umcd import UmcdMetadata, read_umcd_metadata
 from sorvolo.lab.thesis.umcd_folder import UmcdVideo
+from sorvolo.lab.thesis.umcd_writing import placed_metadata
 from sorvolo.lab.thesis.video_input import VideoInput
 from sorvolo.missions.compare.flights import compare_flights
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.store.atomic import writing
 from sorvolo.store.exports.annotated import with_outlines
+from sorvolo.store.exports.change_files import BOXES_FILE
+from sorvolo.store.exports.plain import rounded
 from sorvolo.store.images import jpeg_from_image
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.flight import Frame
@@ -70,13 +74,22 @@ def compare_video(
     cpu_s = time.process_time() - started_cpu_s
     (masks,) = (scratch / "flights").glob("*/masks")
     judged_by, judged = _judged(masks, truth, times, later.fps)
+    boxes = json.loads((masks / BOXES_FILE).read_bytes())
     values = {
         "judged_by": judged_by,
         "views": updates[-1].views,
         "compared": updates[-1].compared,
         "cpu_seconds_per_view": cpu_s / max(1, updates[-1].views),
-        "frames": _plain(_sum(each.frame for each in judged)),
-        "pixels": _plain(_sum(each.pixels for each in judged)) if judged_by == MASKS else None,
+        "frames": asdict(sum((each.frame for each in judged), Counts())),
+        "pixels": asdict(sum((each.pixels for each in judged), Counts())),
+        "labels": next(
+            (
+                placed_metadata(each, each.fps or later.fps, boxes)
+                for each in times.values()
+                if each.has_times
+            ),
+            None,
+        ),
     }
     pictures = _examples(judged, later, scratch, masks.parent.name)
     with writing(scratch):
@@ -115,14 +128,11 @@ def time_comparison(first: VideoInput, later: VideoInput, repeats: int) -> dict[
 
 
 def rates(counts: Counts) -> dict[str, float | None]:
-    """The rates of section 4.2.1, None where nothing was to divide by."""
-    named = {
-        "precision": counts.precision,
-        "recall": counts.recall,
-        "accuracy": counts.accuracy,
-        "f1": counts.f1,
+    """The rates of section 4.2.1; None where nothing was to divide by, all but the accuracy where nothing was there."""
+    names = ("precision", "recall", "accuracy", "f1") if counts.tp + counts.fn else ("accuracy",)
+    return dict.fromkeys(("precision", "recall", "accuracy", "f1")) | {
+        name: rounded(getattr(counts, name), 4) for name in names
     }
-    return {name: None if math.isnan(rate) else round(rate, 4) for name, rate in named.items()}
 
 
 def _times_of(truth: UmcdVideo, later: VideoInput) -> dict[str, UmcdMetadata]:
@@ -133,7 +143,8 @@ def _times_of(truth: UmcdVideo, later: VideoInput) -> dict[str, UmcdMetadata]:
     found = {} if truth.metadata is None else {TIMES: read_umcd_metadata(truth.metadata)}
     length_s, in_view_s = APPEARANCES.get(truth.key, (0, ()))
     if abs(later.length_s - length_s) <= _LENGTH_S:
-        found[TABLE] = UmcdMetadata(later.fps, in_view_s, frozenset())
+        names = found[TIMES].names if found else ()
+        found[TABLE] = UmcdMetadata(later.fps, in_view_s, frozenset(), names)
     if truth.masks is None and not found:
         raise InputError(
             f"{truth.video}: neither a folder of change masks ({truth.name}_masks) nor a metadata file lies beside it, "
@@ -165,25 +176,19 @@ def _judged(
     )
 
 
-def _sum(counts: Iterable[Counts]) -> Counts:
-    return sum(counts, Counts())
-
-
-def _plain(counts: Counts) -> dict[str, int]:
-    return {
-        "tp": counts.tp,
-        "fp": counts.fp,
-        "fn": counts.fn,
-        "tn": counts.tn,
-        "unknown": counts.unknown,
-    }
-
-
 def _examples(
     judged: Sequence[ComparedMask], later: VideoInput, site: Path, flight: str
 ) -> dict[str, tuple[bytes, bytes]]:
     """The best found change, and the largest false one: the map under the frame, and the frame with the outlines."""
-    wanted = _extremes(judged)
+    # the view with the most true pixels, and the one without a change that has the most false ones, if any
+    wanted = {
+        name: max(views, key=lambda each: (each.pixels.tp, -each.pixels.fp * sign))
+        for name, sign, views in (
+            ("found", 1, [each for each in judged if each.frame.tp]),
+            ("false", -1, [each for each in judged if each.frame.fp]),
+        )
+        if views
+    }
     frames = _frames(later, {int(each.name) for each in wanted.values()})
     with Archive.open(site, write=False) as archive:
         rows = {row.name: row for row in map_frames(site, archive.site())[flight]}
@@ -198,18 +203,6 @@ def _examples(
             for name, each in shown.items()
             if rows[each.name].has_outline
         }
-
-
-def _extremes(judged: Sequence[ComparedMask]) -> dict[str, ComparedMask]:
-    """The view with the most true pixels, and the one without a change that has the most false ones, if any."""
-    found = [each for each in judged if each.frame.tp]
-    false = [each for each in judged if each.frame.fp]
-    wanted = {}
-    if found:
-        wanted["found"] = max(found, key=lambda each: (each.pixels.tp, -each.pixels.fp))
-    if false:
-        wanted["false"] = max(false, key=lambda each: each.pixels.fp)
-    return wanted
 
 
 def _side_by_side(

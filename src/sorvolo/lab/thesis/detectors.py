@@ -1,7 +1,7 @@
 """Section 4.3, Table 4.6: both proposal networks trained on the dataset's labelled frames, and measured on others."""
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,9 +11,10 @@ from sorvolo.capture.source import open_sources
 from sorvolo.capture.video import read_video_info
 from sorvolo.detection.detector import Detector
 from sorvolo.errors import InputError
+from sorvolo.lab.datasets.parsed import read_text
 from sorvolo.lab.evaluation.detector import EvaluationSettings, evaluate_detector, read_sets
 from sorvolo.lab.thesis.settings import FIGURE_PX, DetectorSettings
-from sorvolo.lab.thesis.umcd import UmcdMetadata, read_umcd_metadata
+from sorvolo.lab.thesis.umcd import read_umcd_metadata
 from sorvolo.lab.thesis.umcd_folder import UmcdVideo
 from sorvolo.lab.training.settings import TrainSettings
 from sorvolo.mosaic.selection import every
@@ -22,7 +23,6 @@ from sorvolo.store.exports.annotated import annotated
 from sorvolo.store.images import jpeg_from_image
 from sorvolo.survey.flight import Frame
 from sorvolo.survey.labels import LabelledSet
-from sorvolo.survey.objects import Detections
 
 HELD_OUT = 0.2
 """The share of the frames that is tested on, of whole videos where there are enough (thesis: 818 of 4,088 frames)."""
@@ -63,22 +63,33 @@ def okutama_labels(place: Path) -> Labels:
     return Labels("Okutama Action", place, "okutama")
 
 
-def extract_frames(videos: Sequence[UmcdVideo], folder: Path, views_per_second: float) -> int:
-    """Write the videos' frames and metadata as `read_dataset` takes them (a folder for each video); how many frames.
+def extract_frames(
+    videos: Sequence[UmcdVideo],
+    folder: Path,
+    views_per_second: float,
+    placed: Mapping[str, str],
+) -> str:
+    """Write the videos' frames and metadata as `read_dataset` takes them (a folder for each video); whose places.
 
     Of a video whose metadata has `Box:` lines the frames with places and those that clearly show nothing are taken.
-    Raises InputError where none has such lines: UMCD's own metadata has no places (docs/datasets.md).
+    UMCD's own metadata has no places (docs/datasets.md): then `placed` has, by the video's key, a text with those of
+    a comparison. Raises InputError where neither has places.
     """
-    boxed = [(each, stated) for each, stated in _stated(videos) if stated.boxed]
-    if not boxed:
-        raise InputError(
-            "no metadata file gives the places of objects in the frames, so nothing can be learnt; add lines "
-            "'Box: FRAME LEFT TOP WIDTH HEIGHT' to the objects (docs/datasets.md)"
-        )
     with writing(folder):
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-    return sum(_extract(each, stated, folder, views_per_second) for each, stated in boxed)
+    own = {each.key: read_text(each.metadata) for each in videos if each.metadata is not None}
+    for texts, whose in ((own, ""), (placed, "; places by the comparison of both flights")):
+        if sum(
+            _extract(each, texts[each.key], folder, views_per_second)
+            for each in videos
+            if each.key in texts
+        ):
+            return whose
+    raise InputError(
+        "neither a metadata file nor a comparison of two flights gives the places of objects in the frames, so nothing "
+        "can be learnt; add lines 'Box: FRAME LEFT TOP WIDTH HEIGHT' to the objects (docs/datasets.md)"
+    )
 
 
 def train_network(
@@ -156,7 +167,7 @@ def example_pictures(model: str, labelled: LabelledSet) -> list[bytes]:
                     image,
                     detections.boxes_px,
                     detections.labels.tolist(),
-                    _words(detections),
+                    [f"{a} {b:.2f}" for a, b in zip(detections.names, detections.scores)],
                     [True] * len(detections),
                 ),
                 FIGURE_PX,
@@ -165,22 +176,17 @@ def example_pictures(model: str, labelled: LabelledSet) -> list[bytes]:
     return found
 
 
-def _words(found: Detections) -> list[str]:
-    return [f"{name} {score:.2f}" for name, score in zip(found.names, found.scores)]
-
-
-def _stated(videos: Sequence[UmcdVideo]) -> list[tuple[UmcdVideo, UmcdMetadata]]:
-    return [
-        (each, read_umcd_metadata(each.metadata)) for each in videos if each.metadata is not None
-    ]
-
-
-def _extract(video: UmcdVideo, stated: UmcdMetadata, folder: Path, views_per_second: float) -> int:
-    name = f"{video.environment}-{video.name}".lower()
+def _extract(video: UmcdVideo, text: str, folder: Path, views_per_second: float) -> int:
+    """How many frames of a video were written; none where its metadata's text has no places."""
+    place = folder / video.key.replace("/", "-")
+    listed = place.with_name(f"{place.name}.txt")
+    atomic_write_bytes(listed, text.encode(), durable=False)
+    stated = read_umcd_metadata(listed)
+    if not stated.boxed:
+        listed.unlink()
+        return 0
     with writing(folder):
-        (folder / name).mkdir()
-    assert video.metadata is not None
-    atomic_write_bytes(folder / f"{name}.txt", video.metadata.read_bytes(), durable=False)
+        place.mkdir(exist_ok=True)
     rate_hz = stated.fps or read_video_info(video.video).frame_rate_hz
     steady = every(1 / views_per_second)
     (source,) = open_sources([video.video])
@@ -192,7 +198,8 @@ def _extract(video: UmcdVideo, stated: UmcdMetadata, folder: Path, views_per_sec
         )
     ):
         if isinstance(each, Frame):
-            path = folder / name / f"{each.index:06d}.jpg"
-            atomic_write_bytes(path, jpeg_from_image(each.image), durable=False)
+            atomic_write_bytes(
+                place / f"{each.index:06d}.jpg", jpeg_from_image(each.image), durable=False
+            )
             count += 1
     return count

@@ -3,7 +3,7 @@
 import shutil
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -57,21 +57,17 @@ def outline_distortion(outlines_m: Sequence[Floats]) -> OutlineDistortion:
     lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
     pairs = np.stack([lengths[:, :2], lengths[:, 2:]])
     areas = np.abs([signed_area(each) for each in corners])
+    away = corners.mean(axis=1) - corners[0].mean(axis=0)
+    chord = away[-1]
+    length2 = float(chord @ chord)
     return OutlineDistortion(
         float((pairs.max(axis=0) / pairs.min(axis=0)).max()),
         float(areas.max() / areas.min()),
-        _bend(corners.mean(axis=1), float(np.sqrt(areas[0]))),
+        np.nan
+        if length2 < areas[0] / 4
+        else float(np.abs(away @ [chord[1], -chord[0]]).max() / length2),
         len(known),
     )
-
-
-def _bend(centres_m: Floats, width_m: float) -> float:
-    chord = centres_m[-1] - centres_m[0]
-    length = float(np.linalg.norm(chord))
-    if length < width_m / 2:
-        return float("nan")
-    away = centres_m - centres_m[0]
-    return float(np.abs(away[:, 0] * chord[1] - away[:, 1] * chord[0]).max() / length**2)
 
 
 Transform = Literal["similarity", "homography"]
@@ -91,10 +87,8 @@ def map_video(
     settings = MapSettings(thesis if method == "thesis" else None, model="none")
     started_s, started_cpu_s = time.monotonic(), time.process_time()
     updates = list(map_flights([flight.video], site, settings, **flight.options))
-    minutes, cpu_minutes = (
-        (time.monotonic() - started_s) / 60,
-        (time.process_time() - started_cpu_s) / 60,
-    )
+    minutes = (time.monotonic() - started_s) / 60
+    cpu_minutes = (time.process_time() - started_cpu_s) / 60
     deviation = evaluate_mosaic(site).deviation
     with Archive.open(site, write=False) as archive:
         headline = archive.report(archive.flights()[0].id).get("headline", {})
@@ -126,28 +120,16 @@ def example_jpegs(site: Path) -> dict[str, bytes]:
         shown = MapDeviation(archive.tiles(), archive.site_grid()).shown(
             archive.image(middle), middle.site_from_image
         )
-    return {
-        "mosaic": jpeg_from_image(shown.mosaic, FIGURE_PX),
-        "frame": jpeg_from_image(shown.frame, FIGURE_PX),
-        "difference": jpeg_from_image(shown.difference, FIGURE_PX),
-    }
+    return {name: jpeg_from_image(each, FIGURE_PX) for name, each in vars(shown).items()}
 
 
 def distortion_of(site: Path) -> dict[str, Any]:
-    """Figure 3.12 in numbers: how far the frames of a mapped flight are distorted, and their outlines, metres."""
+    """Figure 3.12 in numbers: how far the frames of a mapped flight are distorted."""
     with Archive.open(site, write=False) as archive:
         described = archive.site()
     (rows,) = map_frames(site, described).values()
     outlines = [row.outline_m for row in rows if row.has_outline]
-    measured = outline_distortion(outlines)
-    return {
-        "sides": measured.sides,
-        "areas": measured.areas,
-        "bend": measured.bend,
-        "frames": measured.frames,
-        "selected": len(rows),
-        "outlines_m": [each.round(3) for each in outlines],
-    }
+    return {**asdict(outline_distortion(outlines)), "selected": len(rows)}
 
 
 def correlation_of(site: Path, mosaic: Path) -> dict[str, Any]:
@@ -160,12 +142,8 @@ def correlation_of(site: Path, mosaic: Path) -> dict[str, Any]:
         return _correlation_with_picture(site, mosaic)
     reference = evaluate_mosaic(site, reference=mosaic).reference
     assert reference is not None
-    return {
-        "correlation": reference.correlation,
-        "correlation_after_shift": reference.correlation_after_shift,
-        "m_per_px": reference.m_per_px,
-        "area_m2": reference.area_m2,
-    }
+    names = "correlation", "correlation_after_shift", "m_per_px", "area_m2"
+    return {name: getattr(reference, name) for name in names}
 
 
 def _correlation_with_picture(site: Path, mosaic: Path) -> dict[str, Any]:

@@ -25,15 +25,9 @@ _ANCHORS = (
     AnchorSettings((16, 32, 64, 128, 256), RATIOS),
 )  # of Faster R-CNN, an octave finer on either side
 _TABLE_3_2 = (  # of each layer, its branches: filters, kernel
-    ((64, 1), (96, 3), (64, 5)),
-    ((64, 1), (96, 3), (64, 5)),
-    ((64, 1), (96, 3), (64, 5)),
-    ((192, 1), (192, 7), (192, 7)),
-    ((192, 1), (192, 7), (192, 7)),
-    ((192, 1), (192, 7), (192, 7)),
-    ((192, 1), (192, 7), (192, 7)),
-    ((320, 1), (384, 3), (384, 3), (384, 3), (384, 3)),
-    ((320, 1), (384, 3), (384, 3), (384, 3), (384, 3)),
+    *[((64, 1), (96, 3), (64, 5))] * 3,
+    *[((192, 1), (192, 7), (192, 7))] * 4,
+    *[((320, 1), *[(384, 3)] * 4)] * 2,
 )
 _POOLED_LAYER = 2  # layer 3 has a branch more, which pools
 _REDUCED = {5: 48, 3: 64}  # channels in front of the larger kernels of layers 1 to 3

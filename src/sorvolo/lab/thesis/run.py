@@ -90,10 +90,17 @@ class _Work:
         self._rows = RowStore(out)
         self._input = cache(self._look_into)
         self._unmapped: dict[Path, str] = {}  # sites of maps that could not be made, and why
-        self._has_frames = False
+        self._placed: dict[str, str] = {}  # by video: metadata with places of a comparison
+        self._places: str | None = None  # whose places the frames have that were extracted
 
     def done(self, task: _Task) -> tuple[Row, bool]:
         """The task's row, and whether an earlier run made it."""
+        row, is_known = self._done(task)
+        if row.values.get("method") == "robust" and row.values["labels"]:
+            self._placed[row.values["sequence"]] = row.values["labels"]
+        return row, is_known
+
+    def _done(self, task: _Task) -> tuple[Row, bool]:
         if task.make is None:
             return Row(task.id, task.kind, missing=task.missing), False
         try:
@@ -353,15 +360,16 @@ class _Work:
 
     def _detect(self, videos: Sequence[UmcdVideo], model: str) -> _Made:
         frames = self._out / "frames"
-        if not self._has_frames:
-            detectors.extract_frames(videos, frames, self._settings.views_per_second)
-            self._has_frames = True
-        return self._measured(detectors.Labels("UMCD", frames, "umcd"), model)
+        if self._places is None:
+            self._places = detectors.extract_frames(
+                videos, frames, self._settings.views_per_second, self._placed
+            )
+        return self._measured(detectors.Labels("UMCD", frames, "umcd"), model, self._places)
 
     def _detect_okutama(self, place: Path, model: str) -> _Made:
         return self._measured(detectors.okutama_labels(place), model)
 
-    def _measured(self, labels: detectors.Labels, model: str) -> _Made:
+    def _measured(self, labels: detectors.Labels, model: str, places: str = "") -> _Made:
         """Train the model, unless it is the packaged one, measure it on what is held out, and show it at work."""
         wanted, seed = self._settings.detector, self._settings.seed
         tested = detectors.held_out(labels, seed)
@@ -378,7 +386,7 @@ class _Work:
         values = {
             "dataset": labels.name,
             "model": model,
-            "split": labels.split,
+            "split": labels.split + places,
             **trained,
             **detectors.measure_model(file, tested),
         }

@@ -11,10 +11,10 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
+from scipy.sparse import lil_array
 from scipy.sparse.linalg import spsolve
 
-from sorvolo.errors import GeometryError, SettingsError
+from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import (
     Descriptors,
     Floats,
@@ -53,22 +53,19 @@ class RoiStitchingSettings:
     roi_frames: float = 3.0  # side of the region, in frames ("three times the size of a frame")
 
     def __post_init__(self) -> None:
-        for name, fits, needed in (
-            ("side_px", 256 <= self.side_px <= 8192, "256 to 8192"),
-            ("akaze_threshold", self.akaze_threshold > 0, "a positive number"),
-            ("max_features", self.max_features >= 1, "at least 1"),
-            (
-                "transform",
-                self.transform in ("similarity", "homography"),
-                "similarity or homography",
-            ),
-            ("ransac_px", self.ransac_px > 0, "a positive number"),
-            ("min_inliers", self.min_inliers >= 4, "at least 4"),
-            ("roi_frames", self.roi_frames >= 1, "at least 1"),
+        if self.transform not in ("similarity", "homography"):
+            raise SettingsError(f"transform is {self.transform!r}; give similarity or homography")
+        for name, least in (
+            ("side_px", 256),
+            ("akaze_threshold", 1e-9),
+            ("max_features", 1),
+            ("ransac_px", 0.1),
+            ("min_inliers", 4),
+            ("roi_frames", 1),
         ):
-            if not fits:
+            if not getattr(self, name) >= least:
                 raise SettingsError(
-                    f"method thesis: {name} is {getattr(self, name)!r}; give {needed}"
+                    f"method thesis: {name} is {getattr(self, name)}; give {least:g} or more"
                 )
 
 
@@ -96,7 +93,6 @@ class Stitched:
 class NotStitched:
     """A frame that was not placed, and why, in words. The region stays where it was."""
 
-    frame_id: int
     reason: str
 
 
@@ -131,14 +127,15 @@ class RoiStitcher:
         height, width = gray.shape
         if not self._pasted:
             placed = Stitched(frame_id, np.eye(3), _barycentre(np.eye(3), width, height), 0, 0, 0.0)
+        elif isinstance(
+            found := self._register(frame_id, gray, self._pasted[-1].placed), NotStitched
+        ):
+            return found
         else:
-            found = self._register(frame_id, gray, self._pasted[-1].placed)
-            if isinstance(found, NotStitched):
-                return found
             placed = found
         outline = apply_homography(placed.mosaic_from_image, _corners(width, height))
         if reason := _misplaced(outline, width * height):
-            return NotStitched(frame_id, reason)
+            return NotStitched(reason)
         small = cv2.resize(
             gray, (width // _SHRINK, height // _SHRINK), interpolation=cv2.INTER_AREA
         ).astype(np.float64)
@@ -160,16 +157,13 @@ class RoiStitcher:
 
     def _overlap(self, old: _Pasted, new: _Pasted) -> None:
         height, width = new.small.shape
-        full_from_small = resized(_SHRINK, _SHRINK)
-        new_from_old = (
-            np.linalg.inv(new.placed.mosaic_from_image @ full_from_small)
-            @ old.placed.mosaic_from_image
-            @ full_from_small
+        mosaic_from_new, mosaic_from_old = (
+            each.placed.mosaic_from_image @ resized(_SHRINK, _SHRINK) for each in (new, old)
         )
         under = np.asarray(
             cv2.warpPerspective(
                 old.small,
-                new_from_old,
+                np.linalg.inv(mosaic_from_new) @ mosaic_from_old,
                 (width, height),
                 borderMode=cv2.BORDER_CONSTANT,
                 borderValue=-1e6,
@@ -191,20 +185,17 @@ class RoiStitcher:
         in_frame = self._features(gray, None)
         if min(len(in_mosaic[0]), len(in_frame[0])) < self._settings.min_inliers:
             return NotStitched(
-                frame_id,
                 f"too few features: {len(in_frame[0])} in the frame, {len(in_mosaic[0])} in the mosaic",
             )
         # "identical patterns", each with one partner: two pictures have none, but mutually nearest ones
         found = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(in_frame[1], in_mosaic[1])
         pairs = np.array([(m.trainIdx, m.queryIdx) for m in found], dtype=np.int64).reshape(-1, 2)
         if len(pairs) < self._settings.min_inliers:
-            return NotStitched(
-                frame_id, f"only {len(pairs)} matches with the mosaic around the last frame"
-            )
+            return NotStitched(f"only {len(pairs)} matches with the mosaic around the last frame")
         mosaic_px, frame_px = in_mosaic[0][pairs[:, 0]] + origin, in_frame[0][pairs[:, 1]]
         mosaic_from_image, inliers = self._fit(mosaic_px, frame_px)
         if mosaic_from_image is None or inliers.sum() < self._settings.min_inliers:
-            return NotStitched(frame_id, f"only {int(inliers.sum())} of {len(pairs)} matches agree")
+            return NotStitched(f"only {int(inliers.sum())} of {len(pairs)} matches agree")
         miss = apply_homography(mosaic_from_image, frame_px[inliers]) - mosaic_px[inliers]
         return Stitched(
             frame_id,
@@ -287,26 +278,18 @@ def solve_gains(
     An overlap of frames a and b is its size, the mean level there in a and that in b.
     """
     column = {each: number for number, each in enumerate(frames)}
-    rows, columns, values = [], [], []
-    right = np.zeros(len(frames))
+    normal, right = lil_array((len(frames), len(frames))), np.zeros(len(frames))
     for (a, b), (size, level_a, level_b) in overlaps.items():
         for i, j, own, other in (
             (column[a], column[b], level_a, level_b),
             (column[b], column[a], level_b, level_a),
         ):
-            rows += [i, i]
-            columns += [i, j]
-            values += [
-                size * (2 * own**2 / _NOISE_LEVELS**2 + _GAIN_SIGMA**-2),
-                -2 * size * own * other / _NOISE_LEVELS**2,
-            ]
+            normal[i, i] += size * (2 * own**2 / _NOISE_LEVELS**2 + _GAIN_SIGMA**-2)
+            normal[i, j] -= 2 * size * own * other / _NOISE_LEVELS**2
             right[i] += size * _GAIN_SIGMA**-2
-    lonely = np.flatnonzero(right == 0)
-    right[lonely] = 1.0
-    rows, columns = [*rows, *lonely], [*columns, *lonely]
-    values += [1.0] * len(lonely)
-    normal = coo_array((values, (rows, columns)), shape=(len(frames), len(frames))).tocsc()
-    return dict(zip(frames, np.atleast_1d(spsolve(normal, right)).tolist(), strict=True))
+    for lonely in np.flatnonzero(right == 0):
+        normal[lonely, lonely] = right[lonely] = 1.0
+    return dict(zip(frames, np.atleast_1d(spsolve(normal.tocsc(), right)).tolist(), strict=True))
 
 
 def georeference(barycentres_mosaic_px: PointsPx, fixes_site_m: PointsM) -> Matrix3:
@@ -314,14 +297,8 @@ def georeference(barycentres_mosaic_px: PointsPx, fixes_site_m: PointsM) -> Matr
 
     The mosaic's y points down, so it is reflected first. Raises GeometryError for fewer than two different points.
     """
-    barycentres = np.asarray(barycentres_mosaic_px, dtype=np.float64)
-    fixes_m = np.asarray(fixes_site_m, dtype=np.float64)
-    if barycentres.shape != fixes_m.shape or barycentres.shape[1:] != (2,):
-        raise GeometryError(
-            f"barycentres {barycentres.shape} and fixes {fixes_m.shape} must both be (N, 2)"
-        )
     upright = np.diag([1.0, -1.0, 1.0])
-    return fit_similarity(fixes_m, apply_homography(upright, barycentres)) @ upright
+    return fit_similarity(fixes_site_m, apply_homography(upright, barycentres_mosaic_px)) @ upright
 
 
 def _corners(width: int, height: int) -> PointsPx:

@@ -1,6 +1,7 @@
 """The rows put together to the thesis's tables, the published figures beside ours."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 from sorvolo.lab.evaluation.change_metrics import Counts
@@ -20,8 +21,6 @@ from sorvolo.lab.thesis.published import (
 from sorvolo.lab.thesis.rows import Row
 from sorvolo.lab.thesis.settings import BENCHMARK, COMPARISONS, MAP_METHODS, PUBLISHED
 
-_COUNTS = ("tp", "fp", "fn", "tn")
-
 
 def tables_of(rows: Sequence[Row]) -> dict[str, Any]:
     """Tables 4.1 and 4.3 to 4.6, sections 4.1.1 and 4.2.2 and Figure 3.12, each `published` and `ours`.
@@ -29,45 +28,32 @@ def tables_of(rows: Sequence[Row]) -> dict[str, Any]:
     A rate that nothing was there to divide by is None. A table whose rows are all missing has an empty `ours`.
     """
     made = [row for row in rows if not row.missing]
-    frames = _pooled(made, "frames")
+
+    def of_kind(kind: str) -> list[dict[str, Any]]:
+        return [
+            {name: value for name, value in row.values.items() if name != "histogram"}
+            for row in made
+            if row.kind == kind
+        ]
+
+    pairs: dict[str, tuple[Any, list[dict[str, Any]]]] = {
+        "table_4_1": (TABLE_4_1, of_kind("mosaic")),
+        "section_4_1_1": (SECTION_4_1_1, _deviations(made)),
+        "figure_3_12": (FIGURES["3.12"], of_kind("transform")),
+        "tables_4_3_and_4_4": (
+            {"method": "thesis", **TABLE_4_3, **TABLE_4_4},
+            _pooled(made, "frames"),
+        ),
+        "table_4_5": (TABLE_4_5, _pooled(made, "pixels")),
+        "section_4_2_2": (SECTION_4_2_2, of_kind("seconds")),
+        "table_4_6": (TABLE_4_6, of_kind("detector")),
+    }
     tables: dict[str, Any] = {
-        "table_4_1": _both(TABLE_4_1, _mosaics(made)),
-        "section_4_1_1": _both(SECTION_4_1_1, _deviations(made)),
-        "figure_3_12": _both(
-            FIGURES["3.12"], [dict(row.values) for row in made if row.kind == "transform"]
-        ),
-        "tables_4_3_and_4_4": _both({"method": "thesis", **TABLE_4_3, **TABLE_4_4}, frames),
-        "table_4_5": _both(TABLE_4_5, _pooled(made, "pixels")),
-        "section_4_2_2": _both(
-            SECTION_4_2_2, [dict(row.values) for row in made if row.kind == "seconds"]
-        ),
-        "table_4_6": _both(TABLE_4_6, [dict(row.values) for row in made if row.kind == "detector"]),
+        name: {"published": published, "ours": ours} for name, (published, ours) in pairs.items()
     }
     for name, texts in DIFFERENCES.items():
         tables[name]["differences"] = list(texts)
     return tables
-
-
-def _both(published: Any, ours: Any) -> dict[str, Any]:
-    return {"published": published, "ours": ours}
-
-
-def _mosaics(rows: Iterable[Row]) -> list[dict[str, Any]]:
-    keys = (
-        "sequence",
-        "has_telemetry",
-        "method",
-        "frames",
-        "keyframes",
-        "matched",
-        "minutes",
-        "cpu_minutes",
-        "seconds_per_keyframe",
-        "deviation",
-        "quality",
-        "camera",
-    )
-    return [{key: row.values[key] for key in keys} for row in rows if row.kind == "mosaic"]
 
 
 def _deviations(rows: Sequence[Row]) -> list[dict[str, Any]]:
@@ -112,33 +98,26 @@ def _mean(values: Sequence[float]) -> float | None:
 
 def _pooled(rows: Iterable[Row], kind: str) -> list[dict[str, Any]]:
     """Counts of all videos together and the rates of section 4.2.1, by method and by what they were judged by."""
-    compared = [
-        row.values for row in rows if row.kind == "comparison" and row.values[kind] is not None
-    ]
-    result = []
-    for title in COMPARISONS:
-        for judged_by in (MASKS, TIMES, TABLE):
-            parts = [
-                each
-                for each in compared
-                if each["method"] == title and each["judged_by"] == judged_by
-            ]
-            if parts:
-                result.append(_summed(title, judged_by, parts, kind))
-    return result
-
-
-def _summed(
-    title: str, judged_by: str, parts: Sequence[Mapping[str, Any]], kind: str
-) -> dict[str, Any]:
-    whole = sum((Counts(**each[kind]) for each in parts), Counts())
-    return {
-        "method": title,
-        "judged_by": judged_by,
-        "videos": len(parts),
-        "views": sum(each["views"] for each in parts),
-        "compared": sum(each["compared"] for each in parts),
-        **{name: getattr(whole, name) for name in _COUNTS},
-        **rates(whole),
-        "cpu_seconds_per_view": sum(each["cpu_seconds_per_view"] for each in parts) / len(parts),
+    groups: dict[tuple[str, str], list[Mapping[str, Any]]] = {
+        (title, judged_by): [] for title in COMPARISONS for judged_by in (MASKS, TIMES, TABLE)
     }
+    for row in rows:
+        if row.kind == "comparison":
+            groups[row.values["method"], row.values["judged_by"]].append(row.values)
+    result = []
+    for (title, judged_by), parts in groups.items():
+        whole = sum((Counts(**each[kind]) for each in parts), Counts())
+        if parts:
+            result.append(
+                {
+                    "method": title,
+                    "judged_by": judged_by,
+                    "videos": len(parts),
+                    "views": sum(each["views"] for each in parts),
+                    "compared": sum(each["compared"] for each in parts),
+                    **asdict(whole),
+                    **rates(whole),
+                    "cpu_seconds_per_view": _mean([each["cpu_seconds_per_view"] for each in parts]),
+                }
+            )
+    return result

@@ -1,7 +1,7 @@
 """UMCD: a metadata text file for each video, a block for each object: what it is and when it is in view."""
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from math import inf, isfinite
 from pathlib import Path
@@ -35,7 +35,7 @@ _KNOWN = frozenset(
     }
 )
 _NUMBER = re.compile(r"\d{1,9}(?:\.\d{1,9})?")
-_ROUNDED_S = 1.0  # times of appearance are whole seconds, rounded one way or the other
+ROUNDED_S = 1.0  # times of appearance are whole seconds, rounded one way or the other
 
 
 @dataclass
@@ -43,7 +43,7 @@ class _Object:
     """One block while it is read; `boxes` by frame are left, top, width, height in pixels."""
 
     name: str = ""
-    keys: set[str] = field(default_factory=set)
+    has_type: bool = False
     from_s: float = -inf
     until_s: float = inf
     boxes: dict[int, tuple[float, ...]] = field(default_factory=dict)
@@ -71,7 +71,11 @@ def read_umcd(place: Path) -> ParsedSet:
         raise no_frames(place, FORM, frames)
     result: list[ParsedPicture] = []
     for path, video in videos.items():
-        _demand_times(path, video)
+        if not video.fps > 0 and any(each.from_s > -inf for each in video.objects):
+            raise InputError(
+                f"{path} states at which second objects are in view but not how many frames make a second; add a line "
+                "such as 'Fps: 25' before the first object"
+            )
         result += _labelled_frames(path.stem, video, frames[path.stem])
     if all(each.is_ignored and not each.boxes for each in result):
         raise InputError(
@@ -79,7 +83,11 @@ def read_umcd(place: Path) -> ParsedSet:
             "learnt from them; add lines 'Box: FRAME LEFT TOP WIDTH HEIGHT' to the objects, or label the frames anew"
         )
     names = dict.fromkeys(each.name for video in videos.values() for each in video.objects)
-    return ParsedSet(FORM, tuple(result), tuple(names), tuple(_findings(videos.values(), result)))
+    findings = [each for video in videos.values() for each in video.malformed]
+    findings += [
+        LabelFinding("no_boxes_for_frame", each.path.name) for each in result if each.is_ignored
+    ]
+    return ParsedSet(FORM, tuple(result), tuple(names), tuple(findings))
 
 
 @dataclass(frozen=True)
@@ -92,17 +100,23 @@ class UmcdMetadata:
     fps: float
     in_view_s: tuple[tuple[float, float], ...]
     boxed: frozenset[int]
+    names: tuple[str, ...] = ()  # of the objects
+
+    @property
+    def has_times(self) -> bool:
+        """Whether it states of every object when it is in view."""
+        return bool(self.in_view_s) and all(map(isfinite, sum(self.in_view_s, ())))
 
     def shows_object(self, time_s: float) -> bool | None:
         """Whether an object is in view at a time; None within a second of where one comes or goes, or unknown."""
         inside_s = [
             min(time_s - start, end - time_s) for start, end in self.in_view_s
         ]  # negative: out of view
-        if not inside_s or not all(map(isfinite, inside_s)):
+        if not self.has_times:
             return None
-        if max(inside_s) > _ROUNDED_S:
+        if max(inside_s) > ROUNDED_S:
             return True
-        return False if max(inside_s) < -_ROUNDED_S else None
+        return False if max(inside_s) < -ROUNDED_S else None
 
 
 def read_umcd_metadata(path: Path) -> UmcdMetadata:
@@ -116,6 +130,7 @@ def read_umcd_metadata(path: Path) -> UmcdMetadata:
         video.fps,
         tuple((each.from_s, each.until_s) for each in video.objects),
         frozenset(frame for each in video.objects for frame in each.boxes),
+        tuple(each.name for each in video.objects),
     )
 
 
@@ -144,22 +159,15 @@ def _videos(place: Path) -> dict[Path, _Video]:
     return videos
 
 
-def _findings(
-    videos: Iterable[_Video], pictures: Iterable[ParsedPicture]
-) -> Iterator[LabelFinding]:
-    """What was wrong in the metadata files, and the frames that show objects at unknown places."""
-    for video in videos:
-        yield from video.malformed
-    for each in pictures:
-        if each.is_ignored:
-            yield LabelFinding("no_boxes_for_frame", each.path.name)
-
-
 def _labelled_frames(
     name: str, video: _Video, frames: Mapping[int, Path]
 ) -> Iterator[ParsedPicture]:
     for number, picture in sorted(frames.items()):
-        boxes = [_box(each, number) for each in video.objects if number in each.boxes]
+        boxes = []
+        for each in video.objects:
+            if number in each.boxes:
+                left, top, width, height = each.boxes[number]
+                boxes.append(ParsedBox(each.name, left, top, left + width, top + height))
         unplaced = any(
             _is_in_view(each, number, video.fps)
             for each in video.objects
@@ -183,62 +191,36 @@ def _field(line: str) -> tuple[str, str]:
 
 
 def _parsed(path: Path) -> _Video:
+    """A file's objects: what comes before the first one is about the video, a second type begins another one."""
     video = _Video()
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         key, value = _field(line)
         numbers = [float(each) for each in _NUMBER.findall(value)]
-        if key == "object":
-            video.objects.append(_Object(value))
+        last = video.objects[-1] if video.objects else None
+        understood = bool(key)
+        if key == "object" or (key == "type" and (last is None or last.has_type)):
+            video.objects.append(_Object(value, has_type=key == "type"))
         elif key in ("fps", "frequency"):
             video.fps = next(iter(numbers), 0.0)
-        elif line.strip() and not (key and _add_field(video, key, value, numbers)):
+        elif last is None:
+            understood = bool(key) and key not in _KNOWN and key != "box"
+        elif key == "type":
+            last.name, last.has_type = value or last.name, True
+        elif key == "appearance":
+            understood = len(numbers) == 2 and numbers[0] <= numbers[1]
+            if understood:
+                last.from_s, last.until_s = numbers
+        elif key == "box":
+            understood = len(numbers) == 5
+            if understood:
+                last.boxes[int(numbers[0])] = tuple(numbers[1:])
+        if line.strip() and not understood:
             video.malformed.append(LabelFinding("malformed_labels", f"{path.name}, line {number}"))
     video.objects = [each for each in video.objects if each.name]
     return video
 
 
-def _add_field(video: _Video, key: str, value: str, numbers: list[float]) -> bool:
-    """Add one field to the last object, or to a new one where the last has its type; whether it was understood."""
-    if key == "type" and (not video.objects or "type" in video.objects[-1].keys):
-        video.objects.append(_Object())
-    if not video.objects:
-        return (
-            key not in _KNOWN and key != "box"
-        )  # what comes before the first object is about the video
-    last = video.objects[-1]
-    last.keys.add(key)
-    return _set_field(last, key, value, numbers)
-
-
-def _set_field(each: _Object, key: str, value: str, numbers: list[float]) -> bool:
-    """Set what a field gives of an object; whether it was understood."""
-    if key == "type":
-        each.name = value or each.name
-    elif key == "appearance":
-        if len(numbers) != 2 or numbers[1] < numbers[0]:
-            return False
-        each.from_s, each.until_s = numbers
-    elif key == "box":
-        if len(numbers) != 5:
-            return False
-        each.boxes[int(numbers[0])] = tuple(numbers[1:])
-    return True
-
-
-def _demand_times(path: Path, video: _Video) -> None:
-    if not video.fps > 0 and any(each.from_s > -inf for each in video.objects):
-        raise InputError(
-            f"{path} states at which second objects are in view but not how many frames make a second; add a line such "
-            "as 'Fps: 25' before the first object"
-        )
-
-
 def _is_in_view(each: _Object, frame: int, fps: float) -> bool:
     if each.from_s == -inf:
         return True
-    return each.from_s - _ROUNDED_S <= frame / fps <= each.until_s + _ROUNDED_S
-
-
-def _box(each: _Object, frame: int) -> ParsedBox:
-    left, top, width, height = each.boxes[frame]
-    return ParsedBox(each.name, left, top, left + width, top + height)
+    return each.from_s - ROUNDED_S <= frame / fps <= each.until_s + ROUNDED_S

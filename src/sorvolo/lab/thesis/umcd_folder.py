@@ -1,12 +1,11 @@
 """The UMCD dataset's folder (the thesis's chapter 2): which videos it has, and which files belong to each."""
 
 import re
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sorvolo.errors import InputError
-from sorvolo.lab.evaluation.mask_folders import MASK_ENDINGS
+from sorvolo.lab.evaluation.mask_folders import has_masks
 from sorvolo.lab.thesis.umcd import looks_like_umcd
 
 WITH, WITHOUT = "Videos With Telemetry", "Videos Without Telemetry"
@@ -65,19 +64,19 @@ class UmcdFolder:
         known for sure.
         """
         below = sorted(self.benchmarks.rglob("*")) if self.benchmarks is not None else []
-        found = []
+        found = {}
         for path in below:
-            folders = [_letters(each) for each in path.parts[len(self.place.parts) : -1]]
+            folders = _letters("/".join(path.parts[len(self.place.parts) : -1]), "/")
             if (
                 path.suffix.lower() in PICTURE_ENDINGS
                 and path.stem.lower() == video.name.lower()
-                and _letters(video.environment) in folders
-                and not any(each.startswith("change") for each in folders)
+                and _letters(video.environment) in folders.split("/")
+                and "/change" not in folders
             ):
-                found.append((path, any("without" in each for each in folders)))
+                found[path] = "without" in folders
         if len(found) > 1:
-            found = [each for each in found if each[1] != video.has_telemetry]
-        return found[0][0] if len(found) == 1 else None
+            found = {path: bare for path, bare in found.items() if bare != video.has_telemetry}
+        return next(iter(found)) if len(found) == 1 else None
 
     def mosaic_of(self, later: UmcdVideo) -> UmcdVideo | None:
         """The mosaicking video of the path that a change detection video flew: path4 of path4_1 (thesis 2.2)."""
@@ -104,7 +103,10 @@ def read_umcd_folder(place: Path) -> UmcdFolder:
             f"{place}: not the UMCD dataset: no videos in '{WITHOUT}', nor in '{MOSAICKING}' or '{CHANGES}' of "
             f"'{WITH}' (thesis, chapter 2); give the folder that holds these"
         )
-    return UmcdFolder(place, videos, maps, later, _camera(parts[CALIBRATION]), parts[BENCHMARK])
+    calibration = parts[CALIBRATION]
+    files = sorted(calibration.iterdir()) if calibration is not None else []
+    cameras = (each for each in files if each.suffix.lower() in (".xml", ".yml", ".yaml"))
+    return UmcdFolder(place, videos, maps, later, next(cameras, None), parts[BENCHMARK])
 
 
 def videos_in(part: Path | None) -> tuple[UmcdVideo, ...]:
@@ -121,42 +123,31 @@ def _folder(place: Path | None, name: str) -> Path | None:
     """The folder of this name, whatever its case and separators."""
     if place is None:
         return None
-    wanted = _letters(name)
-    return next(
-        (
-            each
-            for each in sorted(place.iterdir())
-            if each.is_dir() and _letters(each.name) == wanted
-        ),
-        None,
-    )
+    folders = (each for each in sorted(place.iterdir()) if each.is_dir())
+    return next((each for each in folders if _letters(each.name) == _letters(name)), None)
 
 
-def _letters(name: str) -> str:
-    return re.sub(r"[^a-z0-9]", "", name.lower())
+def _letters(name: str, kept: str = "") -> str:
+    return re.sub(f"[^a-z0-9{kept}]", "", name.lower())
 
 
 def _video(path: Path, part: Path) -> UmcdVideo:
     beside = [each for each in sorted(path.parent.iterdir()) if _belongs(each, path)]
-    texts = list(filter(_is_text, beside))
-    metadata = next((each for each in texts if _is_metadata(each)), None)
-    others = tuple(each for each in texts if each != metadata)
+    texts = [each for each in beside if each.suffix.lower() in _TEXT_ENDINGS and each.is_file()]
+    metadata = next(
+        (each for each in texts if each.suffix.lower() == ".txt" and looks_like_umcd(each)), None
+    )
+    masks = (
+        each for each in beside if each.name.lower().endswith(MASKS_ENDING) and has_masks(each)
+    )
     return UmcdVideo(
         path.parent.name if path.parent != part else "",
         path.stem,
         path,
-        others,
+        tuple(each for each in texts if each != metadata),
         metadata,
-        _masks(beside),
+        next(masks, None),
     )
-
-
-def _is_text(path: Path) -> bool:
-    return path.suffix.lower() in _TEXT_ENDINGS and path.is_file()
-
-
-def _is_metadata(path: Path) -> bool:
-    return path.suffix.lower() == ".txt" and looks_like_umcd(path)
 
 
 def _belongs(other: Path, video: Path) -> bool:
@@ -164,28 +155,4 @@ def _belongs(other: Path, video: Path) -> bool:
     stem, name = video.stem.lower(), other.stem.lower() if other.is_file() else other.name.lower()
     return (
         other != video and name.startswith(stem) and _REST.fullmatch(name[len(stem) :]) is not None
-    )
-
-
-def _masks(beside: Sequence[Path]) -> Path | None:
-    folders = (
-        each for each in beside if each.is_dir() and each.name.lower().endswith(MASKS_ENDING)
-    )
-    return next((each for each in folders if _holds(each, MASK_ENDINGS)), None)
-
-
-def _holds(folder: Path, endings: Iterable[str]) -> bool:
-    return any(each.suffix.lower() in endings for each in folder.iterdir())
-
-
-def _camera(folder: Path | None) -> Path | None:
-    if folder is None:
-        return None
-    return next(
-        (
-            each
-            for each in sorted(folder.iterdir())
-            if each.suffix.lower() in (".xml", ".yml", ".yaml")
-        ),
-        None,
     )

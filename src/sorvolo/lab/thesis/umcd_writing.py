@@ -1,10 +1,11 @@
 """A video's metadata file as the UMCD dataset has one, of a simulated flight whose truth is known."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from math import ceil, floor
 from typing import Any
 
 from sorvolo.lab.datasets.checking import DEFAULT_CLASSES, plain
+from sorvolo.lab.thesis.umcd import ROUNDED_S, UmcdMetadata
 
 _FIRST_AS_BEFORE = 1  # a simulation counts flights from 1
 
@@ -29,6 +30,25 @@ def umcd_metadata(
     lines = [f"Fps: {fps:g}", ""]
     for number, (thing, views) in enumerate(seen.items(), start=1):
         lines += [*_block(number, came[thing], views, fps), ""]
+    return "\n".join(lines)
+
+
+def placed_metadata(
+    stated: UmcdMetadata, fps: float, boxes: Mapping[str, Sequence[Sequence[int]]]
+) -> str:
+    """The text with the objects' places where a comparison of both flights shows them: `boxes` by the frame's name.
+
+    The first flight has no objects, so a frame's only box is the object that is surely the only one in view.
+    """
+    lines = [f"Fps: {fps:g}"]
+    for number, (name, (start, end)) in enumerate(zip(stated.names, stated.in_view_s)):
+        lines += [f"Object {number + 1}", f"Type: {name}", f"Appearance: {start:g} to {end:g}"]
+        for frame, found in boxes.items():
+            time_s = int(frame) / fps
+            others = stated.in_view_s[:number] + stated.in_view_s[number + 1 :]
+            is_alone = all(not a - ROUNDED_S <= time_s <= b + ROUNDED_S for a, b in others)
+            if len(found) == 1 and is_alone and start + ROUNDED_S <= time_s <= end - ROUNDED_S:
+                lines.append(f"Box: {frame} {' '.join(map(str, found[0]))}")
     return "\n".join(lines)
 
 

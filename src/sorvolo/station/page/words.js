@@ -108,7 +108,7 @@ export function counted(count, one, many = `${one}s`) {
 export function changeWords(properties) {
   const { kind, class_before: before, class_after: after } = properties;
   if (kind === "replaced" && before && after) return `${before} replaced by ${after}`;
-  const what = (kind === "disappeared" ? before : after) || { area: "ground", moving: "something" }[kind] || "something";
+  const what = (kind === "disappeared" ? before : after) || "unknown object";
   return { appeared: `${what} appeared`, disappeared: `${what} disappeared`, moving: `${what} moving`,
     area: "ground changed", replaced: `${what} replaced` }[kind] || kind;
 }

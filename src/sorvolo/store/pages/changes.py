@@ -352,11 +352,10 @@ def _details(change: StoredChange, site: Site) -> tuple[tuple[str, str], ...]:
         for name, value in _cells(change, site)
     ]
     details.append(("last seen", time_words(change.last_seen_ns)))
-    details += [
-        (name, label)
-        for name, label in (("was", change.class_before), ("is now", change.class_after))
-        if label
-    ]
+    if change.kind in (ChangeKind.DISAPPEARED, ChangeKind.REPLACED):
+        details.append(("was", change.class_before or "unknown object"))
+    if change.kind in (ChangeKind.APPEARED, ChangeKind.REPLACED, ChangeKind.MOVING):
+        details.append(("is now", change.class_after or "unknown object"))
     if not site.is_local and np.isfinite(change.sigma_in_map_m):
         details.append(("position on this map (1 sigma)", _length(change.sigma_in_map_m)))
     if change.height_change is not None:
