@@ -19,13 +19,13 @@ from sorvolo.survey.objects import CLASSES
 
 
 def _read_okutama(place: Path) -> ParsedSet:
-    from sorvolo.lab.thesis.okutama import read_okutama
+    from sorvolo.lab.datasets.okutama import read_okutama
 
     return read_okutama(place)
 
 
 def _read_umcd(place: Path) -> ParsedSet:
-    from sorvolo.lab.thesis.umcd import read_umcd
+    from sorvolo.lab.datasets.umcd import read_umcd
 
     return read_umcd(place)
 

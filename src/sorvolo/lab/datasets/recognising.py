@@ -35,8 +35,8 @@ def _label_texts(folder: Path) -> list[Path]:
 
 
 def _form_of_text(path: Path) -> str | None:
-    from sorvolo.lab.thesis.okutama import looks_like_okutama
-    from sorvolo.lab.thesis.umcd import looks_like_umcd
+    from sorvolo.lab.datasets.okutama import looks_like_okutama
+    from sorvolo.lab.datasets.umcd import looks_like_umcd
 
     line = next((line for line in read_text(path).splitlines() if line.strip()), "")
     for form, looks_like in (

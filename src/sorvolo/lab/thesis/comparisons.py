@@ -12,7 +12,8 @@ from typing import Any
 
 from sorvolo.capture.source import open_sources
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Floats, ImageRGB
+from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.lab.datasets.umcd import UmcdMetadata, read_umcd_metadata
 from sorvolo.lab.evaluation.change_metrics import Counts
 from sorvolo.lab.evaluation.frame_rows import map_frames
 from sorvolo.lab.evaluation.map_quality import MapDeviation
@@ -25,7 +26,6 @@ from sorvolo.lab.evaluation.mask_folders import (
 from sorvolo.lab.thesis.changes import compare_thesis
 from sorvolo.lab.thesis.published import APPEARANCES
 from sorvolo.lab.thesis.settings import COMPARISONS, FIGURE_PX
-from sorvolo.lab.thesis.umcd import UmcdMetadata, read_umcd_metadata
 from sorvolo.lab.thesis.umcd_folder import UmcdVideo
 from sorvolo.lab.thesis.umcd_writing import placed_metadata
 from sorvolo.lab.thesis.video_input import VideoInput
@@ -52,7 +52,7 @@ def compare_video(
     title: str,
     truth: UmcdVideo,
     views_per_second: float,
-) -> tuple[dict[str, Any], dict[str, tuple[bytes, bytes]]]:
+) -> tuple[dict[str, Any], dict[str, bytes]]:
     """A row of Tables 4.3 to 4.5, and pictures of Figures 4.4 and 4.5: the map beside the frame, as JPEGs.
 
     The map stays as it is: a copy in `scratch` is compared with. Raises InputError and StoreError as `compare_flights`,
@@ -178,7 +178,7 @@ def _judged(
 
 def _examples(
     judged: Sequence[ComparedMask], later: VideoInput, site: Path, flight: str
-) -> dict[str, tuple[bytes, bytes]]:
+) -> dict[str, bytes]:
     """The best found change, and the largest false one: the map under the frame, and the frame with the outlines."""
     # the view with the most true pixels, and the one without a change that has the most false ones, if any
     wanted = {
@@ -193,25 +193,15 @@ def _examples(
     with Archive.open(site, write=False) as archive:
         rows = {row.name: row for row in map_frames(site, archive.site())[flight]}
         under = MapDeviation(archive.tiles(), archive.site_grid())
-        shown = {
-            name: each
-            for name, each in wanted.items()
-            if each.name in rows and int(each.name) in frames
-        }
-        return {
-            name: _side_by_side(frames[int(each.name)], each.path, rows[each.name].outline_m, under)
-            for name, each in shown.items()
-            if rows[each.name].has_outline
-        }
-
-
-def _side_by_side(
-    image: ImageRGB, mask: Path, outline_m: Floats, under: MapDeviation
-) -> tuple[bytes, bytes]:
-    changed, _ = read_mask(mask, may_be_unknown=True)
-    height, width = image.shape[:2]
-    shown = under.under(outline_m, width, height), with_outlines(image, changed)
-    return jpeg_from_image(shown[0], FIGURE_PX), jpeg_from_image(shown[1], FIGURE_PX)
+        shown = {}
+        for name, each in wanted.items():
+            row, image = rows.get(each.name), frames.get(int(each.name))
+            if row is not None and row.has_outline and image is not None:
+                changed, _ = read_mask(each.path, may_be_unknown=True)
+                ground = under.under(row.outline_m, *image.shape[1::-1])
+                shown[f"{name}-map"] = jpeg_from_image(ground, FIGURE_PX)
+                shown[f"{name}-frame"] = jpeg_from_image(with_outlines(image, changed), FIGURE_PX)
+        return shown
 
 
 def _frames(flight: VideoInput, wanted: set[int]) -> dict[int, ImageRGB]:

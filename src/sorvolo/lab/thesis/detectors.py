@@ -12,9 +12,9 @@ from sorvolo.capture.video import read_video_info
 from sorvolo.detection.detector import Detector
 from sorvolo.errors import InputError
 from sorvolo.lab.datasets.parsed import read_text
+from sorvolo.lab.datasets.umcd import read_umcd_metadata
 from sorvolo.lab.evaluation.detector import EvaluationSettings, evaluate_detector, read_sets
 from sorvolo.lab.thesis.settings import FIGURE_PX, DetectorSettings
-from sorvolo.lab.thesis.umcd import read_umcd_metadata
 from sorvolo.lab.thesis.umcd_folder import UmcdVideo
 from sorvolo.lab.training.settings import TrainSettings
 from sorvolo.mosaic.selection import every

@@ -84,28 +84,22 @@ class StitchedFlight:
         if fix_m is not None:
             self._fixes_m[stitched.frame_id] = fix_m
         if site_from_image is not None:
-            self._map_fixes_m[stitched.frame_id] = apply_homography(site_from_image, self._middle)[
-                0
-            ]
+            on_map_m = apply_homography(site_from_image, self._middle)[0]
+            self._map_fixes_m[stitched.frame_id] = on_map_m
 
     def anchor(self) -> None:
         """Lay the mosaic on its fixes. Raises GeometryError for fewer than two different ones.
 
         Frames that the map shows are anchored to it; the others to GPS, moved by how GPS and map differ.
         """
-        differ_m = [
-            self._map_fixes_m[each] - self._fixes_m[each]
-            for each in self._fixes_m.keys() & self._map_fixes_m.keys()
-        ]
-        offset_m = np.mean(differ_m, axis=0) if differ_m else np.zeros(2)
-        fixes_m = {
-            each: fix_m + offset_m for each, fix_m in self._fixes_m.items()
-        } | self._map_fixes_m
-        barycentres = np.array([self.stitched[each].barycentre_px for each in fixes_m]).reshape(
-            -1, 2
-        )
+        both = self._fixes_m.keys() & self._map_fixes_m.keys()
+        differ_m = [self._map_fixes_m[each] - self._fixes_m[each] for each in both]
+        offset_m = np.mean(differ_m or [np.zeros(2)], axis=0)
+        fixes_m = {each: fix_m + offset_m for each, fix_m in self._fixes_m.items()}
+        fixes_m |= self._map_fixes_m
+        barycentres = [self.stitched[each].barycentre_px for each in fixes_m]
         self.site_from_mosaic = georeference(
-            barycentres, np.array(list(fixes_m.values())).reshape(-1, 2)
+            np.reshape(barycentres, (-1, 2)), np.reshape([*fixes_m.values()], (-1, 2))
         )
 
     @property
@@ -128,8 +122,8 @@ class StitchedFlight:
 
     def exposure(self) -> Exposure:
         """The gain of each frame; no vignette."""
-        gains = self._stitcher.gains().items()
-        return Exposure({self._first_id + each: np.full(3, gain) for each, gain in gains}, {}, 0.0)
+        gains = self._stitcher.gains()
+        return Exposure({self._first_id + k: np.full(3, g) for k, g in gains.items()}, {}, 0.0)
 
     recent_exposure = exposure
 

@@ -9,7 +9,7 @@ import re
 import shutil
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -29,27 +29,19 @@ ENVIRONMENT = "NPU"
 _KEYFRAMES, _FRAMES = "trajectory.txt", "frames.txt"
 
 
-@dataclass(frozen=True)
-class NpuSequence:
-    """A sequence's video, or its folder as published, and the published mosaic of it; None where there is none."""
-
-    video: UmcdVideo
-    mosaic: Path | None
-
-
-def read_npu_folder(place: Path) -> tuple[NpuSequence, ...]:
-    """The sequences in a folder: as published, or a video each, in a folder of the sequence's name or under that name.
+def read_npu_folder(place: Path) -> dict[UmcdVideo, Path | None]:
+    """The sequences in a folder, with the published mosaic of each where there is one: as published, or a video each, in a folder of the sequence's name or under that name.
 
     The mosaic (GeoTIFF or picture) lies in the sequence's folder, or beside the video under its name. Raises InputError
     for a folder with neither.
     """
     if not place.is_dir():
         raise InputError(f"{place}: no such folder; give the folder of the NPU Drone-Map dataset")
-    found = [
-        NpuSequence(UmcdVideo(ENVIRONMENT, each.name, each), _mosaic(each, ""))
+    found = {
+        UmcdVideo(ENVIRONMENT, each.name, each): _mosaic(each, "")
         for each in sorted({place, *place.iterdir()})
         if (each / _KEYFRAMES).is_file() or (each / _FRAMES).is_file()
-    ]
+    }
     videos = videos_in(place)
     if not (videos or found):
         raise InputError(
@@ -62,8 +54,8 @@ def read_npu_folder(place: Path) -> tuple[NpuSequence, ...]:
         is_alone = folder != place and in_folder[folder] == 1
         name = folder.name if is_alone else each.name
         video = replace(each, environment=ENVIRONMENT, name=name, has_telemetry=bool(each.texts))
-        found.append(NpuSequence(video, _mosaic(folder, "" if is_alone else each.name)))
-    return tuple(found)
+        found[video] = _mosaic(folder, "" if is_alone else each.name)
+    return found
 
 
 def photos_of_sequence(folder: Path, to: Path) -> tuple[Path, Path | None]:

@@ -38,16 +38,10 @@ APPEARANCES: dict[str, tuple[int, tuple[tuple[int, int], ...]]] = {
 """Table 2.4: each change detection video's length, s, and from which second to which its objects are in view."""
 
 TABLE_4_1: tuple[dict[str, Any], ...] = tuple(
-    {
-        "sequence": name,
-        "frames": frames,
-        "keyframes": keyframes,
-        "proposed": proposed,
-        "bu_et_al": bu,
-        "pix4d": pix4d,
-        "photoscan": photoscan,
-    }
-    for name, frames, keyframes, proposed, bu, pix4d, photoscan in (
+    dict(
+        zip(("sequence", "frames", "keyframes", "proposed", "bu_et_al", "pix4d", "photoscan"), row)
+    )
+    for row in (
         ("phantom3-npu", 19983, 457, 7.2, 9.32, 140.08, 538.38),
         ("phantom3-centralPark", 12744, 471, 6.01, 8.49, 127.73, 563.57),
         ("phantom3-village", 16969, 406, 10.4, 11.31, 132.07, 360.70),
@@ -59,22 +53,13 @@ TABLE_4_1: tuple[dict[str, Any], ...] = tuple(
 SECTION_4_1_1 = {"deviation": 0.15, "correlation": 0.80, "videos": 40}
 TABLE_4_3 = {"tp": 3167, "fp": 884, "fn": 41, "tn": 9779}
 TABLE_4_4 = {"precision": 0.7818, "recall": 0.9872, "accuracy": 0.9333, "f1": 0.8726}
-TABLE_4_5: tuple[dict[str, Any], ...] = (
-    {
-        "method": "B. Wang et al. [100]",
-        "precision": 0.48,
-        "recall": 0.76,
-        "accuracy": 0.9127,
-        "f1": None,
-    },
-    {
-        "method": "Q. Wang et al. [103]",
-        "precision": 0.8366,
-        "recall": None,
-        "accuracy": None,
-        "f1": None,
-    },
-    {"method": "thesis", "precision": 0.6715, "recall": 0.9588, "accuracy": 0.9954, "f1": 0.7898},
+TABLE_4_5: tuple[dict[str, Any], ...] = tuple(
+    dict(zip(("method", "precision", "recall", "accuracy", "f1"), row))
+    for row in (
+        ("B. Wang et al. [100]", 0.48, 0.76, 0.9127, None),
+        ("Q. Wang et al. [103]", 0.8366, None, None, None),
+        ("thesis", 0.6715, 0.9588, 0.9954, 0.7898),
+    )
 )
 SECTION_4_2_2 = {"single_thread_s": 2.883, "multithread_s": 0.47}
 TABLE_4_6: dict[str, dict[str, float]] = {

@@ -2,7 +2,7 @@
 
 import os
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -59,7 +59,13 @@ def reproduction_document(
             "format": 1,
             "dataset": f"{place}" if size is None else "a simulated dataset in UMCD's layout",
             "size": _size_words(made, size),
-            "made": _made(settings),
+            "made": {  # for people
+                "program": f"sorvolo {__version__}",
+                "made at": datetime.now(UTC).isoformat(timespec="seconds"),
+                "computer": f"{platform.machine()}, {os.cpu_count() or 1} cores, {platform.system()}",
+                "views compared": f"{settings.views_per_second:g} a second",
+                "seed": str(settings.seed),
+            },
             "settings": asdict(settings),
             "simulated": None if size is None else asdict(size),
             "tables": tables_of(rows),
@@ -70,30 +76,18 @@ def reproduction_document(
     )
 
 
-def _made(settings: ReproductionSettings) -> dict[str, str]:
-    """How the tables were made, for people."""
-    return {
-        "program": f"sorvolo {__version__}",
-        "made at": datetime.now(UTC).isoformat(timespec="seconds"),
-        "computer": f"{platform.machine()}, {os.cpu_count() or 1} cores, {platform.system()}",
-        "views compared": f"{settings.views_per_second:g} a second",
-        "seed": str(settings.seed),
-    }
-
-
 def _size_words(rows: Sequence[Row], size: SimulatedSize | None) -> str:
-    mosaics = {each.values["sequence"]: each.values for each in rows if each.kind == "mosaic"}
-    frames = sum(each["frames"] for each in mosaics.values())
-    compared = _compared(rows)
+    mapped, compared = (
+        {each.values["sequence"]: each.values for each in rows if each.kind == kind}
+        for kind in ("mosaic", "comparison")
+    )
+    frames = sum(each["frames"] for each in mapped.values())
+    views = sum(each["views"] for each in compared.values())
     words = (
-        f"{counted(len(mosaics), 'video')} mapped ({counted(frames, 'frame')}), {len(compared)} compared "
-        f"({counted(sum(each['views'] for each in compared.values()), 'view')})."
+        f"{counted(len(mapped), 'video')} mapped ({counted(frames, 'frame')}), {len(compared)} compared "
+        f"({counted(views, 'view')})."
     )
     if size is None:
         return words
     length = "their whole length" if size.length_m is None else f"{size.length_m:g} m"
     return f"Simulated: paths of {length} at {size.size_px[0]} x {size.size_px[1]} px; {words}"
-
-
-def _compared(rows: Sequence[Row]) -> dict[str, Mapping[str, Any]]:
-    return {each.values["sequence"]: each.values for each in rows if each.kind == "comparison"}

@@ -1,7 +1,6 @@
 """Chapter 4 of the thesis from a dataset's folder to its tables, one row after another (`sorvolo reproduce`)."""
 
 import re
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -37,7 +36,6 @@ class ReproductionUpdate:
     is_known: bool
     done: int
     total: int
-    seconds: float
 
 
 @dataclass(frozen=True)
@@ -68,7 +66,6 @@ def reproduce(
     are such rows, too. Raises InputError for a folder that is no such dataset, StoreError on a full disk, SettingsError
     for options.
     """
-    started_s = time.monotonic()
     work = _Work(read_umcd_folder(place), out, settings)
     tasks = [
         *(work.absent() if is_whole else ()),
@@ -79,7 +76,7 @@ def reproduce(
     ]
     for number, task in enumerate(tasks, start=1):
         row, is_known = work.done(task)
-        yield ReproductionUpdate(row, is_known, number, len(tasks), time.monotonic() - started_s)
+        yield ReproductionUpdate(row, is_known, number, len(tasks))
 
 
 class _Work:
@@ -95,26 +92,25 @@ class _Work:
 
     def done(self, task: _Task) -> tuple[Row, bool]:
         """The task's row, and whether an earlier run made it."""
-        row, is_known = self._done(task)
-        if row.values.get("method") == "robust" and row.values["labels"]:
-            self._placed[row.values["sequence"]] = row.values["labels"]
-        return row, is_known
-
-    def _done(self, task: _Task) -> tuple[Row, bool]:
+        row = Row(task.id, task.kind, missing=task.missing)
         if task.make is None:
-            return Row(task.id, task.kind, missing=task.missing), False
+            return row, False
         try:
             stamp = self._stamp(task)
-            if (known := self._rows.find(task.id, stamp)) is not None:
-                return known, True
-            values, pictures = task.make()
-            named = {
-                name: self._rows.add_picture(f"{task.id}-{name}", jpeg)
-                for name, jpeg in pictures.items()
-            }
+            known = self._rows.find(task.id, stamp)
+            if known is None:
+                values, pictures = task.make()
+                named = {
+                    name: self._rows.add_picture(f"{task.id}-{name}", jpeg)
+                    for name, jpeg in pictures.items()
+                }
+                row = self._rows.put(Row(task.id, task.kind, values, named), stamp)
         except (InputError, GeometryError, StoreError) as error:
             return Row(task.id, task.kind, missing=str(error)), False
-        return self._rows.put(Row(task.id, task.kind, values, named), stamp), False
+        row = known or row
+        if row.values.get("method") == "robust" and row.values["labels"]:
+            self._placed[row.values["sequence"]] = row.values["labels"]
+        return row, known is not None
 
     def absent(self) -> Iterator[_Task]:
         """The videos of the thesis's tables that the folder lacks."""
@@ -145,12 +141,8 @@ class _Work:
             first = first or each
         if first is not None:
             for transform in ("similarity", "homography"):
-                yield self._task(
-                    "transform",
-                    f"{first.key}/{transform}",
-                    (first,),
-                    partial(self._transform, first, transform),
-                )
+                make = partial(self._transform, first, transform)
+                yield self._task("transform", f"{first.key}/{transform}", (first,), make)
             yield self._task("example", first.key, (first,), partial(self._example, first))
         for each in self._chosen(self._dataset.without_telemetry):
             yield from self._tasks_of_map(each)
@@ -158,14 +150,11 @@ class _Work:
 
     def npu_tasks(self, place: Path | None) -> Iterator[_Task]:
         """Table 4.1 on its own dataset, and the correlation with the mosaics of Bu et al."""
-        sequences = (
-            {each.video.key: each for each in read_npu_folder(place)} if place is not None else {}
-        )
-        for video in self._chosen([each.video for each in sequences.values()]):
+        mosaics_of = read_npu_folder(place) if place is not None else {}
+        for video in self._chosen([*mosaics_of]):
             yield from self._tasks_of_map(video)
-            mosaic = sequences[video.key].mosaic
             yield from self._published_tasks(
-                PUBLISHED, video.key, video, mosaic, "mosaic of Bu et al. beside it"
+                PUBLISHED, video.key, video, mosaics_of[video], "mosaic of Bu et al. beside it"
             )
 
     def _published_tasks(
@@ -191,7 +180,7 @@ class _Work:
 
     def change_tasks(self) -> Iterator[_Task]:
         """Section 4.2: Tables 4.3 to 4.5, the times, Figures 4.4 and 4.5."""
-        pairs = []
+        timed = None
         for later in self._chosen(self._dataset.change_detection):
             first = self._dataset.mosaic_of(later)
             for title in COMPARISONS:
@@ -200,19 +189,13 @@ class _Work:
                     reason = f"{later.video}: no mosaicking video of its path, so there is no map to compare it with"
                     yield _Task(f"comparison/{row_id}", "comparison", missing=reason)
                 else:
-                    yield self._task(
-                        "comparison",
-                        row_id,
-                        (first, later),
-                        partial(self._compare, first, later, title),
-                    )
-            if first is not None:
-                pairs.append((first, later))
-        if pairs:
-            first, later = pairs[0]
-            yield self._task(
-                "seconds", later.key, (first, later), partial(self._time, first, later)
-            )
+                    make = partial(self._compare, first, later, title)
+                    yield self._task("comparison", row_id, (first, later), make)
+            if first is not None and timed is None:
+                make = partial(self._time, first, later)
+                timed = self._task("seconds", later.key, (first, later), make)
+        if timed is not None:
+            yield timed
 
     def detector_tasks(self, okutama: Path | None) -> Iterator[_Task]:
         """Section 4.3: Table 4.6 and Figure 4.6."""
@@ -220,11 +203,11 @@ class _Work:
         models = ("standard", "extended") if self._settings.detector.steps else ()
         for model in (*models, "packaged"):
             yield self._task(
-                "detector", f"UMCD/{model}", tuple(videos), partial(self._detect, videos, model)
+                "detector", f"UMCD/{model}", videos, partial(self._detect, videos, model)
             )
         if okutama is not None:
             for model in (*models, "packaged"):
-                make = partial(self._detect_okutama, okutama, model)
+                make = partial(self._measured, detectors.okutama_labels(okutama), model)
                 yield _Task(f"detector/Okutama/{model}", "detector", (okutama,), make)
 
     def _chosen(self, videos: Sequence[UmcdVideo]) -> list[UmcdVideo]:
@@ -288,25 +271,23 @@ class _Work:
         if site in self._unmapped:
             raise InputError(f"the map of {each.key} could not be made: {self._unmapped[site]}")
         if not (site / "mosaic.tif").is_file():
-            self._map_into(site, each, method)
+            self._map(each, method)
         return site
-
-    def _map_into(self, site: Path, each: UmcdVideo, method: str) -> Mapping[str, Any]:
-        try:
-            return mosaics.map_video(self._input(each), site, method)
-        except (InputError, GeometryError, StoreError) as error:
-            self._unmapped[site] = str(error)
-            raise
 
     def _map(self, each: UmcdVideo, method: str) -> _Made:
         site = self._map_site(each, method)
-        values = self._map_into(site, each, method)
-        named = {
+        try:
+            values = mosaics.map_video(self._input(each), site, method)
+        except (InputError, GeometryError, StoreError) as error:
+            self._unmapped[site] = str(error)
+            raise
+        return {
             "sequence": each.key,
             "environment": each.environment,
             "has_telemetry": each.has_telemetry,
-        }
-        return {**named, "method": method, **values}, {"map": mosaics.map_jpeg(site)}
+            "method": method,
+            **values,
+        }, {"map": mosaics.map_jpeg(site)}
 
     def _correlate(self, each: UmcdVideo) -> _Made:
         one, other = (self._mapped(each, method) for method in MAP_METHODS)
@@ -329,7 +310,7 @@ class _Work:
         return {"sequence": each.key}, mosaics.example_jpegs(self._mapped(each, "thesis"))
 
     def _compare(self, first: UmcdVideo, later: UmcdVideo, title: str) -> _Made:
-        values, shown = comparisons.compare_video(
+        values, pictures = comparisons.compare_video(
             self._input(later),
             self._mapped(first, "planar"),
             self._out / "sites" / "compared",
@@ -337,17 +318,7 @@ class _Work:
             later,
             self._settings.views_per_second,
         )
-        pictures = {
-            f"{name}-{side}": jpeg
-            for name, both in shown.items()
-            for side, jpeg in zip(("map", "frame"), both)
-        }
-        return {
-            "sequence": later.key,
-            "environment": later.environment,
-            "method": title,
-            **values,
-        }, pictures
+        return {"sequence": later.key, "method": title, **values}, pictures
 
     def _time(self, first: UmcdVideo, later: UmcdVideo) -> _Made:
         before, after = (
@@ -366,9 +337,6 @@ class _Work:
             )
         return self._measured(detectors.Labels("UMCD", frames, "umcd"), model, self._places)
 
-    def _detect_okutama(self, place: Path, model: str) -> _Made:
-        return self._measured(detectors.okutama_labels(place), model)
-
     def _measured(self, labels: detectors.Labels, model: str, places: str = "") -> _Made:
         """Train the model, unless it is the packaged one, measure it on what is held out, and show it at work."""
         wanted, seed = self._settings.detector, self._settings.seed
@@ -378,10 +346,7 @@ class _Work:
             out = self._out / "models" / f"{labels.form}-{model}"
             file = detectors.train_network(labels, out, model, wanted, seed)
             trained = {
-                "preset": wanted.preset,
-                "steps": wanted.steps,
-                "schedule": wanted.schedule,
-                "side_px": wanted.side_px,
+                name: getattr(wanted, name) for name in ("preset", "steps", "schedule", "side_px")
             }
         values = {
             "dataset": labels.name,

@@ -6,15 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-_METHODS_4_1 = {
-    "proposed": "thesis",
-    "bu_et_al": "Bu et al.",
-    "pix4d": "Pix4D",
-    "photoscan": "Photoscan",
-}
-_COUNTS = ("tp", "fp", "fn", "tn")
-_RATES = ("precision", "recall", "accuracy", "f1")
-_RATE_NAMES = ("TP", "FP", "FN", "TN", "precision, %", "recall, %", "accuracy, %", "F1, %")
+from sorvolo.survey.wording import counted
 
 
 @dataclass(frozen=True)
@@ -50,7 +42,7 @@ class Sheet:
 
 
 def reproduction_sheets(tables: Mapping[str, Any]) -> list[Sheet]:
-    """The sheets of what `missions.reproduce.thesis_tables.tables_of` gives, in the order of the thesis's chapter."""
+    """The sheets of what `tables_of` gives, in the order of the thesis's chapter."""
     return [
         _distortions(tables["figure_3_12"]),
         *_times(tables["table_4_1"]),
@@ -62,9 +54,20 @@ def reproduction_sheets(tables: Mapping[str, Any]) -> list[Sheet]:
     ]
 
 
-def percent(share: float | None) -> str:
-    """A share in per cent with one decimal; "-" where there is none."""
-    return "-" if share is None else f"{100 * share:.1f}"
+def _sheet(
+    name: str, title: str, columns: str, rows: Iterable[Sequence[Any]], notes: Sequence[str] = ()
+) -> Sheet:
+    """A sheet of columns named with "; " between, and of any values: "-" for None."""
+    texts = [tuple("-" if each is None else str(each) for each in row) for row in rows]
+    return Sheet(name, title, tuple(columns.split("; ")), tuple(texts), tuple(notes))
+
+
+def _percent(share: float | None) -> str | None:
+    return None if share is None else f"{100 * share:.1f}"
+
+
+def _number(value: float | None, decimals: int) -> str | None:
+    return None if value is None else f"{value:.{decimals}f}"
 
 
 def _distortions(table: Mapping[str, Any]) -> Sheet:
@@ -75,162 +78,110 @@ def _distortions(table: Mapping[str, Any]) -> Sheet:
             f"{each['frames']} of {each['selected']}",
             _number(each["sides"], 3),
             _number(each["areas"], 3),
-            percent(each["bend"]),
+            _percent(each["bend"]),
         )
         for each in table["ours"]
     ]
-    columns = (
-        "sequence",
-        "transform",
-        "frames placed",
-        "opposite sides, largest ratio",
-        "areas, largest ratio",
-        "bend of the path, %",
-    )
-    notes = (
-        "Ratios are of the frames' outlines on the map: 1 is an undistorted frame. The bend is the path's largest "
-        "distance from the chord between its ends, over the chord; wind and drift bend it, too.",
-    )
-    return Sheet(
-        "figure_3_12", "Figure 3.12: homography and rigid transform", columns, tuple(rows), notes
+    return _sheet(
+        "figure_3_12",
+        "Figure 3.12: homography and rigid transform",
+        "sequence; transform; frames placed; opposite sides, largest ratio; areas, largest ratio; bend of the path, %",
+        rows,
+        (
+            "Ratios are of the frames' outlines on the map: 1 is an undistorted frame. The bend is the path's largest "
+            "distance from the chord between its ends, over the chord; wind and drift bend it, too.",
+        ),
     )
 
 
 def _times(table: Mapping[str, Any]) -> list[Sheet]:
     printed = [
-        (
-            each["sequence"],
-            f"{each['frames']}",
-            f"{each['keyframes']}",
-            *(f"{each[key]:g}" for key in _METHODS_4_1),
-            f"{60 * each['proposed'] / each['keyframes']:.2f}",
-        )
+        (*each.values(), f"{60 * each['proposed'] / each['keyframes']:.2f}")
         for each in table["published"]
     ]
     ours = [
         (
-            _sequence(each),
-            each["method"],
-            f"{each['frames']}",
-            f"{each['keyframes']}",
-            f"{each['matched']}",
-            _number(each["minutes"], 2),
-            _number(each["cpu_minutes"], 2),
-            _number(each["seconds_per_keyframe"], 2),
-            percent(each["deviation"]),
-            str(each["quality"] or "-"),
+            each["sequence"] + ("" if each["has_telemetry"] else " (no telemetry)"),
+            *(each[name] for name in ("method", "frames", "keyframes", "matched")),
+            *(
+                _number(each[name], 2)
+                for name in ("minutes", "cpu_minutes", "seconds_per_keyframe")
+            ),
+            _percent(each["deviation"]),
+            each["quality"],
         )
         for each in table["ours"]
     ]
     return [
-        Sheet(
+        _sheet(
             "table_4_1_printed",
             "Table 4.1 as printed: minutes",
-            ("sequence", "frames", "KFs", *_METHODS_4_1.values(), "thesis: s a KF"),
-            tuple(printed),
+            "sequence; frames; KFs; thesis; Bu et al.; Pix4D; Photoscan; thesis: s a KF",
+            printed,
         ),
-        Sheet(
+        _sheet(
             "table_4_1",
             "Table 4.1 here",
-            (
-                "sequence",
-                "method",
-                "frames",
-                "KFs",
-                "matched",
-                "minutes",
-                "processor minutes",
-                "processor s a KF",
-                "deviation, %",
-                "quality",
-            ),
-            tuple(ours),
-            tuple(table["differences"]),
+            "sequence; method; frames; KFs; matched; minutes; processor minutes; processor s a KF; deviation, %; quality",
+            ours,
+            table["differences"],
         ),
     ]
-
-
-def _sequence(each: Mapping[str, Any]) -> str:
-    return str(each["sequence"]) + ("" if each["has_telemetry"] else " (no telemetry)")
 
 
 def _deviations(table: Mapping[str, Any]) -> Sheet:
-    printed = table["published"]
-    rows = [
+    printed, ours = table["published"], table["ours"]
+    rows: list[Sequence[Any]] = [
         (
             "thesis, printed",
-            f"{printed['videos']}",
-            f"about {percent(printed['deviation'])}",
-            f"about {percent(printed['correlation'])} (4 videos)",
+            printed["videos"],
+            f"about {_percent(printed['deviation'])}",
+            f"about {_percent(printed['correlation'])} (4 videos)",
         )
     ]
-    rows += [
-        (
-            f"{each['method']} here",
-            f"{each['videos']}",
-            percent(each["deviation"]),
-            f"{percent(each['correlation'])} ({counted_videos(each['correlated'])})",
-        )
-        for each in table["ours"]
-    ]
-    rows += [
-        (
-            f"{each['method']} here, with {whose}",
-            f"{each[count]}",
-            "-",
-            f"{percent(each[share])} ({counted_videos(each[count])})",
-        )
-        for whose, share, count in (
-            ("the mosaics of [17]", "published_correlation", "published"),
-            ("the dataset's mosaics (2.4)", "benchmark_correlation", "benchmarks"),
-        )
-        for each in table["ours"]
-        if each[count]
-    ]
-    columns = (
-        "method",
-        "videos",
-        "deviation from the frames, %",
-        "correlation with another map (eq. 4.1), %",
+    for whose, share, count in (
+        ("", "correlation", "correlated"),
+        (", with the mosaics of [17]", "published_correlation", "published"),
+        (", with the dataset's mosaics (2.4)", "benchmark_correlation", "benchmarks"),
+    ):
+        for each in ours:
+            correlated = f"{_percent(each[share]) or '-'} ({counted(each[count], 'video')})"
+            deviation = None if whose else _percent(each["deviation"])
+            if each[count] or not whose:
+                videos = each[count if whose else "videos"]
+                rows.append((f"{each['method']} here{whose}", videos, deviation, correlated))
+    return _sheet(
+        "section_4_1_1",
+        "Section 4.1.1: how good the mosaics are",
+        "method; videos; deviation from the frames, %; correlation with another map (eq. 4.1), %",
+        rows,
+        table["differences"],
     )
-    title = "Section 4.1.1: how good the mosaics are"
-    return Sheet("section_4_1_1", title, columns, tuple(rows), tuple(table["differences"]))
 
 
 def _counted(table: Mapping[str, Any], name: str, title: str) -> Sheet:
     published = table["published"]
-    printed = [
-        (
-            f"{each['method']}, printed",
-            "13871 frames" if each["method"] == "thesis" else "-",
-            "-",
-            *(str(each.get(key, "-")) for key in _COUNTS),
-            *(percent(each[key]) for key in _RATES),
-        )
-        for each in ([published] if isinstance(published, Mapping) else published)
-    ]
-    ours = [
-        (
-            f"{each['method']}, here",
-            f"{each['compared']} views of {counted_videos(each['videos'])}",
-            each["judged_by"],
-            *(str(each[key]) for key in _COUNTS),
-            *(percent(each[key]) for key in _RATES),
-        )
+    printed = [published] if isinstance(published, Mapping) else published
+    shown: list[tuple[str, str, Mapping[str, Any]]] = [
+        ("printed", "13871 frames" if each["method"] == "thesis" else "-", each) for each in printed
+    ] + [
+        ("here", f"{each['compared']} views of {counted(each['videos'], 'video')}", each)
         for each in table["ours"]
     ]
-    return Sheet(
-        name,
-        title,
-        ("method", "compared", "judged by", *_RATE_NAMES),
-        (*printed, *ours),
-        tuple(table["differences"]),
+    rows = [
+        (
+            f"{each['method']}, {where}",
+            compared,
+            each.get("judged_by"),
+            *(each.get(key) for key in ("tp", "fp", "fn", "tn")),
+            *(_percent(each[key]) for key in ("precision", "recall", "accuracy", "f1")),
+        )
+        for where, compared, each in shown
+    ]
+    columns = (
+        "method; compared; judged by; TP; FP; FN; TN; precision, %; recall, %; accuracy, %; F1, %"
     )
-
-
-def counted_videos(videos: int) -> str:
-    """ "1 video", "3 videos"."""
-    return f"{videos} video{'' if videos == 1 else 's'}"
+    return _sheet(name, title, columns, rows, table["differences"])
 
 
 def _seconds(table: Mapping[str, Any]) -> Sheet:
@@ -239,61 +190,57 @@ def _seconds(table: Mapping[str, Any]) -> Sheet:
         (
             "thesis, printed",
             "not stated",
-            _number(printed["single_thread_s"], 3),
-            "-",
-            _number(printed["multithread_s"], 3),
+            printed["single_thread_s"],
+            None,
+            printed["multithread_s"],
         )
-    ]
-    rows += [
+    ] + [
         (
             f"{each['sequence']}, here",
             f"{each['width_px']} x {each['height_px']}",
             _number(each["single_thread_s"], 3),
-            f"{each['threads']}",
+            each["threads"],
             _number(each["multithread_s"], 3),
         )
         for each in table["ours"]
     ]
-    columns = ("where", "picture, px", "one thread, s", "threads", "with them, s")
-    title = "Section 4.2.2: one comparison by the thesis's method"
-    return Sheet("section_4_2_2", title, columns, tuple(rows), tuple(table["differences"]))
+    return _sheet(
+        "section_4_2_2",
+        "Section 4.2.2: one comparison by the thesis's method",
+        "where; picture, px; one thread, s; threads; with them, s",
+        rows,
+        table["differences"],
+    )
 
 
 def _precisions(table: Mapping[str, Any]) -> Sheet:
-    printed = [
+    rows = [
         (
             f"{model} Faster R-CNN, printed",
-            dataset,
+            name,
             "four steps, 2000 epochs",
-            "-",
-            percent(score),
-            "-",
+            None,
+            _percent(score),
+            None,
         )
         for model, scores in table["published"].items()
-        for dataset, score in scores.items()
-    ]
-    ours = [
+        for name, score in scores.items()
+    ] + [
         (
             f"{each['model']}, here",
             each["dataset"],
             f"{each['schedule']}, {each['steps']} steps of preset {each['preset']} at {each['side_px']} px"
             if "steps" in each
             else "as packaged",
-            f"{each['pictures']} of {counted_videos(each['videos'])}: {each['split']}",
-            percent(each["thesis_map"]),
-            percent(each["ap50"]),
+            f"{each['pictures']} of {counted(each['videos'], 'video')}: {each['split']}",
+            _percent(each["thesis_map"]),
+            _percent(each["ap50"]),
         )
         for each in table["ours"]
     ]
-    columns = ("network", "dataset", "training", "test frames", "mAP (eq. 4.4), %", "AP50, %")
-    return Sheet(
-        "table_4_6", "Table 4.6: detectors", columns, (*printed, *ours), tuple(table["differences"])
-    )
+    columns = "network; dataset; training; test frames; mAP (eq. 4.4), %; AP50, %"
+    return _sheet("table_4_6", "Table 4.6: detectors", columns, rows, table["differences"])
 
 
-def _number(value: float | None, decimals: int) -> str:
-    return "-" if value is None else f"{value:.{decimals}f}"
-
-
-def _markdown_row(cells: Iterable[str] | Sequence[str]) -> str:
+def _markdown_row(cells: Sequence[str]) -> str:
     return f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |"

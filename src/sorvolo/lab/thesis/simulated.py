@@ -3,7 +3,7 @@
 import json
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from sorvolo.lab.thesis.umcd_folder import (
 )
 from sorvolo.lab.thesis.umcd_writing import umcd_metadata
 from sorvolo.store.atomic import atomic_write_bytes, writing
-from sorvolo.store.exports.plain import json_bytes
+from sorvolo.store.exports.plain import json_bytes, plain_json
 
 MARK = "simulated.json"
 _WITH, _WITHOUT = "umcd-telemetry-", "umcd-"
@@ -80,15 +80,13 @@ def simulation_of(
 
 
 def _claim(place: Path, size: SimulatedSize, settings: ReproductionSettings) -> None:
-    wanted = json.loads(
-        json_bytes(
-            {
-                "made_by": "sorvolo reproduce --simulated",
-                "seed": settings.seed,
-                "views_per_second": settings.views_per_second,
-                **asdict(size),
-            }
-        )
+    wanted = plain_json(
+        {
+            "made_by": "sorvolo reproduce --simulated",
+            "seed": settings.seed,
+            "views_per_second": settings.views_per_second,
+            **asdict(size),
+        }
     )
     mark = place / MARK
     if mark.is_file():
@@ -144,8 +142,8 @@ def _arrange(made: Path, place: Path, path: _Path) -> None:
             if file.is_file() and ending != ".xml":
                 _move(file, place / WITH / part / environment / f"{path.name}{ending}")
     objects, boxes = (
-        _read(made / "truth" / "objects.geojson"),
-        _read(made / "truth" / "flight2" / "boxes.json"),
+        json.loads((made / "truth" / name).read_bytes())
+        for name in ("objects.geojson", "flight2/boxes.json")
     )
     fps = preset(f"{_WITH}{environment.lower()}-{path.name}").imaging.fps
     text = umcd_metadata(fps, objects["features"], boxes, flight=2)
@@ -156,7 +154,3 @@ def _arrange(made: Path, place: Path, path: _Path) -> None:
 def _move(file: Path, to: Path) -> None:
     to.parent.mkdir(parents=True, exist_ok=True)
     os.replace(file, to)
-
-
-def _read(path: Path) -> dict[str, Sequence[dict[str, object]]]:
-    return json.loads(path.read_text(encoding="utf-8"))

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sorvolo.errors import InputError
+from sorvolo.lab.datasets.umcd import looks_like_umcd
 from sorvolo.lab.evaluation.mask_folders import has_masks
-from sorvolo.lab.thesis.umcd import looks_like_umcd
 
 WITH, WITHOUT = "Videos With Telemetry", "Videos Without Telemetry"
 MOSAICKING, CHANGES = "Mosaicking", "Change Detection"

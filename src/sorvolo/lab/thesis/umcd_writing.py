@@ -5,7 +5,7 @@ from math import ceil, floor
 from typing import Any
 
 from sorvolo.lab.datasets.checking import DEFAULT_CLASSES, plain
-from sorvolo.lab.thesis.umcd import ROUNDED_S, UmcdMetadata
+from sorvolo.lab.datasets.umcd import ROUNDED_S, UmcdMetadata
 
 _FIRST_AS_BEFORE = 1  # a simulation counts flights from 1
 
