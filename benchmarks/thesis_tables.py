@@ -15,7 +15,6 @@ import os
 import tempfile
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
@@ -73,7 +72,7 @@ def main() -> None:
         "seeds": seeds,
         "simulated": asdict(size),
         "videos": options.videos,
-        "tables": without_outlines(tables),
+        "tables": tables,
         "missing": [{"id": row.id, "reason": row.missing} for row in rows if row.missing],
     }
     options.output.parent.mkdir(exist_ok=True)
@@ -94,15 +93,6 @@ def reproduced(folder: Path, settings: ReproductionSettings, size: SimulatedSize
         print(f"{update.done} of {update.total}: {update.row.id} {update.row.missing}", flush=True)
     write_reproduction(folder, rows, place, settings, size)
     return rows
-
-
-def without_outlines(tables: dict[str, Any]) -> dict[str, Any]:
-    """The tables without the outlines that only a drawing needs."""
-    figure = tables["figure_3_12"]
-    ours = [
-        {key: value for key, value in row.items() if key != "outlines_m"} for row in figure["ours"]
-    ]
-    return {**tables, "figure_3_12": {**figure, "ours": ours}}
 
 
 if __name__ == "__main__":

@@ -362,7 +362,7 @@ def test_metadata_without_times_is_judged_by_table_2_4_where_the_video_is_its(
     write_mask(masks / "550.png", np.full((4, 6), 255, np.uint8))  # at 22 s: object 2
     write_mask(masks / "375.png", np.full((4, 6), 255, np.uint8))  # at 15 s: none
     own, another = (
-        VideoInput(truth.video, None, None, 25.0, length_s, (640, 480)) for length_s in (47.2, 60.0)
+        VideoInput(truth.video, None, None, 25.0, length_s) for length_s in (47.2, 60.0)
     )
     judged_by, judged = _judged(masks, truth, _times_of(truth, own), own.fps)
     assert (judged_by, sum((each.frame for each in judged), Counts())) == (

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from sorvolo.errors import GeometryError, SettingsError
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.lab.thesis.stitching import (
-    NotStitched,
     RoiStitcher,
     RoiStitchingSettings,
     Stitched,
@@ -114,11 +113,11 @@ def test_a_lost_frame_is_named_and_the_region_stays():
     stitcher = RoiStitcher()
     stitcher.add(0, photographed(PATH[0]))
     blank = stitcher.add(1, np.full((HEIGHT, WIDTH, 3), 100, np.uint8))
-    assert isinstance(blank, NotStitched)
-    assert "features" in blank.reason
+    assert isinstance(blank, str)
+    assert "features" in blank
     elsewhere = stitcher.add(2, cv2.resize(ground(9)[:HEIGHT, :WIDTH], (WIDTH, HEIGHT)))
-    assert isinstance(elsewhere, NotStitched)
-    assert "match" in elsewhere.reason
+    assert isinstance(elsewhere, str)
+    assert "match" in elsewhere
     assert list(stitcher.gains()) == [0]
     assert isinstance(stitcher.add(3, photographed(PATH[1])), Stitched)
 
@@ -129,13 +128,13 @@ def test_the_region_is_around_the_last_frame_only():
     stitcher = RoiStitcher(settings)
     for number, x in enumerate((0, 150, 300, 450, 600)):
         assert isinstance(stitcher.add(number, photographed(pose(x, 200))), Stitched)
-    assert isinstance(stitcher.add(9, photographed(pose(0, 200))), NotStitched)
+    assert isinstance(stitcher.add(9, photographed(pose(0, 200))), str)
 
 
 def test_low_contrast_needs_the_low_threshold():
     faint = ground(3, contrast=6)
     a, b = faint[100:340, 100:420], faint[120:360, 160:480]
-    for threshold, wanted in ((8e-5, Stitched), (1e-3, NotStitched)):
+    for threshold, wanted in ((8e-5, Stitched), (1e-3, str)):
         stitcher = RoiStitcher(RoiStitchingSettings(akaze_threshold=threshold))
         stitcher.add(0, a)
         assert isinstance(stitcher.add(1, b), wanted)

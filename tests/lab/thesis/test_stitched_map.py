@@ -24,7 +24,7 @@ CAMERA = Camera.from_angle_of_view(640, 480, 60)
 
 def stitched(frame_id: int, x_px: float) -> Stitched:
     move = np.array([[1.0, 0, x_px], [0, 1, 0], [0, 0, 1]])
-    return Stitched(frame_id, move, np.array([319.5 + x_px, 239.5]), 0, 0, float("nan"))
+    return Stitched(frame_id, move, np.array([319.5 + x_px, 239.5]), 0, float("nan"))
 
 
 @pytest.mark.parametrize("has_fixes", [True, False])

@@ -116,14 +116,13 @@ def time_comparison(first: VideoInput, later: VideoInput, repeats: int) -> dict[
             compare_thesis(before, after, threads=threads)
             times.append(time.perf_counter() - started_s)
         seconds[threads] = median(times)
-    height, width = before.shape[:2]
     return {
         "single_thread_s": seconds[1],
         "multithread_s": seconds[cores],
         "threads": cores,
         "repeats": repeats,
-        "width_px": width,
-        "height_px": height,
+        "width_px": before.shape[1],
+        "height_px": before.shape[0],
     }
 
 
@@ -161,13 +160,12 @@ def _judged(
         return MASKS, list(compared_masks(masks, truth.masks))
     for judged_by, stated in times.items():
         rate_hz = stated.fps or fps
-
-        def shows_object(
-            index: int, stated: UmcdMetadata = stated, rate: float = rate_hz
-        ) -> bool | None:
-            return stated.shows_object(index / rate)
-
-        judged = list(frames_against_times(masks, shows_object))
+        judged = list(
+            frames_against_times(
+                masks,
+                lambda index, at=stated, hz=rate_hz: at.shows_object(index / hz),  # type: ignore[misc]
+            )
+        )
         if any(each.frame != Counts(unknown=1) for each in judged):
             return judged_by, judged
     raise InputError(
@@ -181,14 +179,13 @@ def _examples(
 ) -> dict[str, bytes]:
     """The best found change, and the largest false one: the map under the frame, and the frame with the outlines."""
     # the view with the most true pixels, and the one without a change that has the most false ones, if any
-    wanted = {
-        name: max(views, key=lambda each: (each.pixels.tp, -each.pixels.fp * sign))
-        for name, sign, views in (
-            ("found", 1, [each for each in judged if each.frame.tp]),
-            ("false", -1, [each for each in judged if each.frame.fp]),
-        )
-        if views
-    }
+    found = [each for each in judged if each.frame.tp]
+    false = [each for each in judged if each.frame.fp]
+    wanted = {}
+    if found:
+        wanted["found"] = max(found, key=lambda each: (each.pixels.tp, -each.pixels.fp))
+    if false:
+        wanted["false"] = max(false, key=lambda each: each.pixels.fp)
     frames = _frames(later, {int(each.name) for each in wanted.values()})
     with Archive.open(site, write=False) as archive:
         rows = {row.name: row for row in map_frames(site, archive.site())[flight]}

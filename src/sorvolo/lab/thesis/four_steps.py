@@ -19,7 +19,6 @@ from sorvolo.errors import SettingsError
 from sorvolo.lab.training.faster_rcnn import FasterRCNN, Proposed
 from sorvolo.lab.training.joint import (
     Answer,
-    Match,
     Progress,
     collate,
     draw_regions,
@@ -105,16 +104,9 @@ class FourStepTraining:
         sum(parts, zero).backward()  # type: ignore[no-untyped-call]
         self.optimiser.step()
         self.step += 1
-        values = [float(part.detach()) for part in parts]
-        return Progress(
-            self.step,
-            values[0],
-            values[1],
-            values[2],
-            values[3],
-            time.monotonic() - self._started_s,
-            self.settings.steps,
-        )
+        first, second, third, fourth = (float(part.detach()) for part in parts)
+        seconds = time.monotonic() - self._started_s
+        return Progress(self.step, first, second, third, fourth, seconds, self.settings.steps)
 
     def state(self) -> dict[str, object]:
         """All that is needed to go on: tensors, numbers and text only."""
@@ -224,14 +216,10 @@ def proposal_loss(
         )
         rows = chosen[match.positive[chosen]]
         offsets = proposed.offsets[index][rows]
-        box_losses.append(_smooth_l1(offsets, proposed.anchors[rows], match, rows, answer, sampled))
+        if len(rows):
+            goal = offsets_from_boxes(answer.boxes[match.target[rows]], proposed.anchors[rows])
+            missed = functional.smooth_l1_loss(offsets, goal, reduction="sum", beta=1 / 9)
+        else:
+            missed = offsets.sum() * 0
+        box_losses.append(missed / sampled)
     return torch.stack(score_losses).mean(), torch.stack(box_losses).mean()
-
-
-def _smooth_l1(
-    offsets: Tensor, anchors: Tensor, match: Match, rows: Tensor, answer: Answer, sampled: int
-) -> Tensor:
-    if not len(rows):
-        return offsets.sum() * 0
-    goal = offsets_from_boxes(answer.boxes[match.target[rows]], anchors)
-    return functional.smooth_l1_loss(offsets, goal, reduction="sum", beta=1 / 9) / sampled

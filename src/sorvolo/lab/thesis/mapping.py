@@ -147,13 +147,14 @@ class StitchedFlight:
         nearest = max(each for each in self.stitched if each <= ending.index)
         site_from_image = self.site_from_image(self._first_id + nearest, self._camera)
         middle = np.array([[(self._camera.width_px - 1) / 2, (self._camera.height_px - 1) / 2]])
+        gps = np.full(3, np.nan)
+        off_m = apply_homography(site_from_image, middle)[0] - prior.position_m[:2]
         if stitched is None:
             shift = np.eye(3)
-            shift[:2, 2] = prior.position_m[:2] - apply_homography(site_from_image, middle)[0]
-            site_from_image = shift @ site_from_image
-        gps = np.full(3, np.nan)
+            shift[:2, 2] = -off_m
+            site_from_image, off_m = shift @ site_from_image, np.zeros(2)
         if has_fixes and prior.knows_place:
-            gps[:2] = apply_homography(site_from_image, middle)[0] - prior.position_m[:2]
+            gps[:2] = off_m
         return PlacedFrame(
             ending.name,
             ending.index,
@@ -210,16 +211,19 @@ class ThesisRun(FlightRun):
             found = self._stitcher.add(frame.index, image)
         status, reason = Status.VISION, ""
         if isinstance(found, Stitched):
-            with self._log.stage(Stage.REGISTER):
-                self._flight.add(
-                    found,
-                    posed.prior.position_m[:2] if posed.prior.knows_place else None,
-                    self._found_on_map(posed, image),
-                )
+            on_map = None
+            if self._aligner is not None:
+                with self._log.stage(Stage.REGISTER):
+                    on_map = self._aligner.align(image, self._camera, posed.prior, frame.time_ns)
+            self._flight.add(
+                found,
+                posed.prior.position_m[:2] if posed.prior.knows_place else None,
+                on_map.site_from_image if isinstance(on_map, Aligned) else None,
+            )
         elif posed.prior.knows_place:
-            status, reason = Status.GPS_ONLY, found.reason
+            status, reason = Status.GPS_ONLY, found
         else:
-            return self.lose(frame, found.reason)
+            return self.lose(frame, found)
         self._log.end(frame.index, frame.name, frame.time_ns, status, reason)
         self._priors[frame.index] = posed.prior
         self._held[frame.index] = image
@@ -236,6 +240,13 @@ class ThesisRun(FlightRun):
         painter.settle()
         painter.finish()
         site, writer = self._archive.site(), self._begin_flight()
+        gains = [float(each[0]) for each in painter.exposure.gains.values()]
+        text = (
+            f"the brightness of the pictures changes along the flight: they were multiplied by {min(gains):.2f} to "
+            f"{max(gains):.2f} to make neighbours alike"
+        )
+        is_drift = max(gains) >= _DRIFT * min(gains)
+        drift = [Notice("brightness_drifts", len(gains), text)] if is_drift else []
         with self._log.stage(Stage.REPORT):
             placed = self._placed(painter.exposure)
             shown = picture(writer.tiles, 1600)
@@ -247,7 +258,7 @@ class ThesisRun(FlightRun):
             FlightResult(placed, self._setup.source.camera.camera),
             site,
             shown,
-            [*notices, *self._detector_notices, *_drift(painter.exposure)],
+            [*notices, *self._detector_notices, *drift],
             time.monotonic() - started_s,
         )
         self._add_search(report, search, placed)
@@ -255,13 +266,6 @@ class ThesisRun(FlightRun):
         writer.commit(placed, painter.images, report, page, crs=self._settings.crs, search=search)
 
     # ---- inside -----------------------------------------------------------------------------------------------
-
-    def _found_on_map(self, posed: PosedFrame, image: ImageRGB) -> Matrix3 | None:
-        """(3, 3) of a small undistorted picture where the site's map shows its ground."""
-        if self._aligner is None:
-            return None
-        found = self._aligner.align(image, self._camera, posed.prior, posed.frame.time_ns)
-        return found.site_from_image if isinstance(found, Aligned) else None
 
     def _is_firm(self) -> bool:
         """Whether the fixes so far lie far enough apart to show the mosaic's scale and direction."""
@@ -310,26 +314,15 @@ class ThesisRun(FlightRun):
         result = []
         for ending in self._log.endings.values():
             time_ns = self._setup.utc_ns(ending.time_ns)
-            if ending.index not in self._priors:
+            prior = self._priors.get(ending.index)
+            if prior is None:
                 camera = self._setup.source.camera.camera
+                rejected = ending.index, ending.name, time_ns, ending.reason, camera
+                result.append(PlacedFrame.rejected(*rejected))
+            else:
+                gains = exposure.gains_of(len(self._known) + ending.index)
+                has_fixes = self._setup.track is not None
                 result.append(
-                    PlacedFrame.rejected(ending.index, ending.name, time_ns, ending.reason, camera)
+                    self._flight.place(ending, time_ns, prior, gains, has_fixes=has_fixes)
                 )
-                continue
-            gains = exposure.gains_of(len(self._known) + ending.index)
-            has_fixes = self._setup.track is not None
-            prior = self._priors[ending.index]
-            result.append(self._flight.place(ending, time_ns, prior, gains, has_fixes=has_fixes))
         return result
-
-
-def _drift(exposure: Exposure) -> list[Notice]:
-    """The notice that the flight's brightness changes much; none where it does not."""
-    gains = [float(each[0]) for each in exposure.gains.values()]
-    if max(gains) < _DRIFT * min(gains):
-        return []
-    text = (
-        f"the brightness of the pictures changes along the flight: they were multiplied by {min(gains):.2f} to "
-        f"{max(gains):.2f} to make neighbours alike"
-    )
-    return [Notice("brightness_drifts", len(gains), text)]

@@ -19,7 +19,7 @@ from sorvolo.lab.evaluation.map_quality import MapDeviation, correlation
 from sorvolo.lab.evaluation.mosaic import evaluate_mosaic
 from sorvolo.lab.thesis.mapping import ThesisMapping
 from sorvolo.lab.thesis.settings import FIGURE_PX
-from sorvolo.lab.thesis.stitching import NotStitched, RoiStitcher, RoiStitchingSettings
+from sorvolo.lab.thesis.stitching import RoiStitcher, RoiStitchingSettings
 from sorvolo.lab.thesis.video_input import VideoInput
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
@@ -154,8 +154,8 @@ def _correlation_with_picture(site: Path, mosaic: Path) -> dict[str, Any]:
     stitcher = RoiStitcher(RoiStitchingSettings(ransac_px=10.0))
     stitcher.add(0, other)
     found = stitcher.add(1, np.ascontiguousarray(own.rgba[..., :3]))
-    if isinstance(found, NotStitched):
-        raise InputError(f"{mosaic}: was not found on the map ({found.reason})")
+    if isinstance(found, str):
+        raise InputError(f"{mosaic}: was not found on the map ({found})")
     gray = gray_from_rgb(other)
     under = np.asarray(
         cv2.warpPerspective(own.rgba, found.mosaic_from_image, gray.shape[::-1]), np.uint8

@@ -36,15 +36,10 @@ class RowStore:
         try:
             content = json.loads(self._path(row_id).read_text(encoding="utf-8"))
             row = Row(**content["row"])
-            if content["stamp"] != stamp:
-                return None
         except (OSError, ValueError, KeyError, TypeError):
             return None
-        return (
-            row
-            if all((self.picture_path(each)).is_file() for each in row.pictures.values())
-            else None
-        )
+        is_whole = all(self.picture_path(each).is_file() for each in row.pictures.values())
+        return row if is_whole and content.get("stamp") == stamp else None
 
     def put(self, row: Row, stamp: str) -> Row:
         """Keep a row; its values come back as JSON holds them. Raises StoreError on a full disk."""

@@ -136,7 +136,9 @@ class _Work:
         first = None
         for each in self._chosen(self._dataset.mosaicking):
             yield from self._tasks_of_map(each)
-            yield self._task("correlation", each.key, (each,), partial(self._correlate, each))
+            yield self._task(
+                "correlation", each.key, (each,), partial(self._correlate, each, "thesis")
+            )
             yield from self._benchmark_tasks(each)
             first = first or each
         if first is not None:
@@ -166,7 +168,7 @@ class _Work:
             if mosaic is None:
                 yield _Task(row_id, kind, missing=f"{video.video}: no {wanted}")
             else:
-                make = partial(self._correlate_published, video, mosaic, method)
+                make = partial(self._correlate, video, method, mosaic)
                 yield _Task(row_id, kind, (*_files_of(video), mosaic), make)
 
     def _benchmark_tasks(self, video: UmcdVideo) -> Iterator[_Task]:
@@ -232,8 +234,7 @@ class _Work:
     def _stamp(self, task: _Task) -> str:
         try:
             files = [
-                (self._name(path), path.stat().st_size, path.stat().st_mtime_ns)
-                for path in task.files
+                (path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in task.files
             ]
         except OSError as error:
             raise InputError(f"{error.filename}: cannot be read ({error.strerror})") from error
@@ -247,11 +248,6 @@ class _Work:
             ),
         }
         return content_sha256(build(), task.id, files, of_kind.get(task.kind, ()))
-
-    def _name(self, path: Path) -> str:
-        """A file's place within the dataset, which may be moved as a whole."""
-        place = self._dataset.place
-        return str(path.relative_to(place) if path.is_relative_to(place) else path)
 
     def _look_into(self, each: UmcdVideo) -> VideoInput:
         camera = (
@@ -289,13 +285,12 @@ class _Work:
             **values,
         }, {"map": mosaics.map_jpeg(site)}
 
-    def _correlate(self, each: UmcdVideo) -> _Made:
-        one, other = (self._mapped(each, method) for method in MAP_METHODS)
-        return {"sequence": each.key, **mosaics.correlation_of(one, other / "mosaic.tif")}, {}
-
-    def _correlate_published(self, each: UmcdVideo, mosaic: Path, method: str) -> _Made:
+    def _correlate(self, each: UmcdVideo, method: str, mosaic: Path | None = None) -> _Made:
+        """Eq. 4.1 of a method's map with a published mosaic, without one with the map by planar."""
+        site = self._mapped(each, method)
+        other = mosaic or self._mapped(each, "planar") / "mosaic.tif"
         named = {"sequence": each.key, "method": method}
-        return {**named, **mosaics.correlation_of(self._mapped(each, method), mosaic)}, {}
+        return {**named, **mosaics.correlation_of(site, other)}, {}
 
     def _transform(self, each: UmcdVideo, transform: mosaics.Transform) -> _Made:
         if transform == "similarity":

@@ -53,10 +53,6 @@ class SimulatedSize:
     bare_videos: int = 1  # without telemetry, of each environment that has such
     environments: tuple[str, ...] = ENVIRONMENTS
 
-    def __post_init__(self) -> None:
-        if self.length_m is not None and not 4 <= self.length_m <= 1000:
-            raise SettingsError(f"length_m must lie in 4 to 1000 m, got {self.length_m:g}")
-
 
 @dataclass(frozen=True)
 class ReproductionSettings:
@@ -71,10 +67,6 @@ class ReproductionSettings:
     def __post_init__(self) -> None:
         if self.videos is not None and self.videos < 1:
             raise SettingsError(f"--videos must be 1 or more, got {self.videos}")
-        if not 0.05 <= self.views_per_second <= 240:
-            raise SettingsError(
-                f"views_per_second must lie in 0.05 to 240, got {self.views_per_second:g}"
-            )
 
 
 def quick(

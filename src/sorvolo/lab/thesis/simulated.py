@@ -4,7 +4,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from sorvolo.errors import SettingsError
@@ -38,14 +38,13 @@ def simulated_dataset(
     """
     _claim(place, size, settings)
     for name in chosen_presets(size, settings.videos):
-        path = _path_of(name)
-        if (place / path.last_file).exists():
+        if (place / _places_of(name)[2]).exists():
             continue
         scratch = place / ".partial"
         for step in simulate_site(scratch, simulation_of(name, size, settings)):
             yield name, step
         with writing(place):
-            _arrange(scratch, place, path)
+            _arrange(scratch, place, name)
             shutil.rmtree(scratch)
 
 
@@ -104,51 +103,39 @@ def _claim(place: Path, size: SimulatedSize, settings: ReproductionSettings) -> 
     atomic_write_bytes(mark, json_bytes(wanted))
 
 
-@dataclass(frozen=True)
-class _Path:
-    """A path that was flown over: once for a map, and where it has telemetry again for the changes."""
+def _places_of(preset_name: str) -> tuple[str, str, Path]:
+    """Environment, path, and what is moved to its place last: where it is, the whole path is.
 
-    environment: str
-    name: str
-    has_telemetry: bool
-
-    @property
-    def last_file(self) -> Path:
-        """What is moved to its place in the dataset last: where it is, the whole path is."""
-        if self.has_telemetry:
-            return Path(WITH, CHANGES, self.environment, f"{self.name}{MASKS_ENDING}")
-        return Path(WITHOUT, MOSAICKING, self.environment, f"{self.name}.mp4")
-
-
-def _path_of(preset_name: str) -> _Path:
-    """Urban, path1, with telemetry: of "umcd-telemetry-urban-path1"."""
+    Urban, path1 and its masks of "umcd-telemetry-urban-path1"; the video where there is no telemetry.
+    """
     has_telemetry = preset_name.startswith(_WITH)
-    environment, _, name = preset_name.removeprefix(_WITH if has_telemetry else _WITHOUT).partition(
-        "-"
-    )
-    return _Path(environment.capitalize(), name, has_telemetry)
+    bare = preset_name.removeprefix(_WITH if has_telemetry else _WITHOUT)
+    environment, _, name = bare.partition("-")
+    environment = environment.capitalize()
+    masks = Path(WITH, CHANGES, environment, f"{name}{MASKS_ENDING}")
+    video = Path(WITHOUT, MOSAICKING, environment, f"{name}.mp4")
+    return environment, name, masks if has_telemetry else video
 
 
-def _arrange(made: Path, place: Path, path: _Path) -> None:
+def _arrange(made: Path, place: Path, preset_name: str) -> None:
     """Move a simulation's files to their places in the dataset."""
-    environment = path.environment
+    environment, name, last = _places_of(preset_name)
     _move(made / "camera.xml", place / CALIBRATION / "camera.xml")
-    if not path.has_telemetry:
-        _move(made / "flight1" / "flight1.mp4", place / path.last_file)
+    if not preset_name.startswith(_WITH):
+        _move(made / "flight1" / "flight1.mp4", place / last)
         return
     for part, flight in ((MOSAICKING, "flight1"), (CHANGES, "flight2")):
         for file in sorted((made / flight).iterdir()):
             ending = _NMEA_ENDING.get(file.suffix, file.suffix)
             if file.is_file() and ending != ".xml":
-                _move(file, place / WITH / part / environment / f"{path.name}{ending}")
+                _move(file, place / WITH / part / environment / f"{name}{ending}")
     objects, boxes = (
-        json.loads((made / "truth" / name).read_bytes())
-        for name in ("objects.geojson", "flight2/boxes.json")
+        json.loads((made / "truth" / file).read_bytes())
+        for file in ("objects.geojson", "flight2/boxes.json")
     )
-    fps = preset(f"{_WITH}{environment.lower()}-{path.name}").imaging.fps
-    text = umcd_metadata(fps, objects["features"], boxes, flight=2)
-    atomic_write_bytes(place / WITH / CHANGES / environment / f"{path.name}.txt", text.encode())
-    _move(made / "truth" / "flight2" / "changes", place / path.last_file)
+    text = umcd_metadata(preset(preset_name).imaging.fps, objects["features"], boxes, flight=2)
+    atomic_write_bytes(place / WITH / CHANGES / environment / f"{name}.txt", text.encode())
+    _move(made / "truth" / "flight2" / "changes", place / last)
 
 
 def _move(file: Path, to: Path) -> None:

@@ -80,20 +80,12 @@ class Stitched:
     frame_id: int
     mosaic_from_image: Matrix3
     barycentre_px: Floats
-    matches: int
     inliers: int
     residual_px: float
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "mosaic_from_image", frozen(self.mosaic_from_image))
         object.__setattr__(self, "barycentre_px", frozen(self.barycentre_px))
-
-
-@dataclass(frozen=True)
-class NotStitched:
-    """A frame that was not placed, and why, in words. The region stays where it was."""
-
-    reason: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,21 +113,19 @@ class RoiStitcher:
             threshold=settings.akaze_threshold, max_points=settings.max_features
         )
 
-    def add(self, frame_id: int, image: ImageRGB) -> Stitched | NotStitched:
-        """Place one undistorted frame on top; the first frame defines the mosaic's pixels."""
+    def add(self, frame_id: int, image: ImageRGB) -> Stitched | str:
+        """Place one undistorted frame on top; the first one defines the mosaic's pixels. Why not, in words: it changes nothing."""
         gray = gray_from_rgb(image)
         height, width = gray.shape
         if not self._pasted:
-            placed = Stitched(frame_id, np.eye(3), _barycentre(np.eye(3), width, height), 0, 0, 0.0)
-        elif isinstance(
-            found := self._register(frame_id, gray, self._pasted[-1].placed), NotStitched
-        ):
+            placed = Stitched(frame_id, np.eye(3), _barycentre(np.eye(3), width, height), 0, 0.0)
+        elif isinstance(found := self._register(frame_id, gray, self._pasted[-1].placed), str):
             return found
         else:
             placed = found
         outline = apply_homography(placed.mosaic_from_image, _corners(width, height))
         if reason := _misplaced(outline, width * height):
-            return NotStitched(reason)
+            return reason
         small = cv2.resize(
             gray, (width // _SHRINK, height // _SHRINK), interpolation=cv2.INTER_AREA
         ).astype(np.float64)
@@ -178,30 +168,35 @@ class RoiStitcher:
                 float(new.small[both].mean()),
             )
 
-    def _register(self, frame_id: int, gray: ImageGray, last: Stitched) -> Stitched | NotStitched:
+    def _register(self, frame_id: int, gray: ImageGray, last: Stitched) -> Stitched | str:
         height, width = gray.shape
         roi, mask, origin = self._roi(last.barycentre_px, width, height)
         in_mosaic = self._features(roi, mask)
         in_frame = self._features(gray, None)
         if min(len(in_mosaic[0]), len(in_frame[0])) < self._settings.min_inliers:
-            return NotStitched(
-                f"too few features: {len(in_frame[0])} in the frame, {len(in_mosaic[0])} in the mosaic",
-            )
+            return f"too few features: {len(in_frame[0])} in the frame, {len(in_mosaic[0])} in the mosaic"
         # "identical patterns", each with one partner: two pictures have none, but mutually nearest ones
         found = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(in_frame[1], in_mosaic[1])
         pairs = np.array([(m.trainIdx, m.queryIdx) for m in found], dtype=np.int64).reshape(-1, 2)
         if len(pairs) < self._settings.min_inliers:
-            return NotStitched(f"only {len(pairs)} matches with the mosaic around the last frame")
+            return f"only {len(pairs)} matches with the mosaic around the last frame"
         mosaic_px, frame_px = in_mosaic[0][pairs[:, 0]] + origin, in_frame[0][pairs[:, 1]]
-        mosaic_from_image, inliers = self._fit(mosaic_px, frame_px)
-        if mosaic_from_image is None or inliers.sum() < self._settings.min_inliers:
-            return NotStitched(f"only {int(inliers.sum())} of {len(pairs)} matches agree")
+        # both estimators seed their own generator, so the same points give the same answer
+        method, limits = (cv2.RANSAC, self._settings.ransac_px), (5000, 0.999)
+        if self._settings.transform == "similarity":
+            matrix, kept = cv2.estimateAffinePartial2D(frame_px, mosaic_px, None, *method, *limits)
+            matrix = None if matrix is None else np.vstack([matrix, [0.0, 0.0, 1.0]])
+        else:
+            matrix, kept = cv2.findHomography(frame_px, mosaic_px, *method, None, *limits)
+        inliers = np.zeros(0, bool) if matrix is None else kept.ravel().astype(bool)
+        if inliers.sum() < self._settings.min_inliers:
+            return f"only {int(inliers.sum())} of {len(pairs)} matches agree"
+        mosaic_from_image = np.asarray(matrix, np.float64)
         miss = apply_homography(mosaic_from_image, frame_px[inliers]) - mosaic_px[inliers]
         return Stitched(
             frame_id,
             mosaic_from_image,
             _barycentre(mosaic_from_image, width, height),
-            len(pairs),
             int(inliers.sum()),
             float(np.sqrt((miss**2).sum(axis=1).mean())),
         )
@@ -236,23 +231,6 @@ class RoiStitcher:
         if descriptors is None or not len(keypoints):
             return np.zeros((0, 2)), np.zeros((0, 61), np.uint8)
         return np.array([keypoint.pt for keypoint in keypoints]), descriptors
-
-    def _fit(
-        self, mosaic_px: PointsPx, frame_px: PointsPx
-    ) -> tuple[Matrix3 | None, NDArray[np.bool_]]:
-        # both estimators seed their own generator, so the same points give the same answer
-        limits: dict[str, Any] = {"maxIters": 5000, "confidence": 0.999}
-        reach = self._settings.ransac_px
-        if self._settings.transform == "similarity":
-            matrix, inliers = cv2.estimateAffinePartial2D(
-                frame_px, mosaic_px, method=cv2.RANSAC, ransacReprojThreshold=reach, **limits
-            )
-            matrix = None if matrix is None else np.vstack([matrix, [0.0, 0.0, 1.0]])
-        else:
-            matrix, inliers = cv2.findHomography(frame_px, mosaic_px, cv2.RANSAC, reach, **limits)
-        if matrix is None or inliers is None:
-            return None, np.zeros(len(frame_px), dtype=bool)
-        return np.asarray(matrix, np.float64), inliers.ravel().astype(bool)
 
 
 def _misplaced(outline: PointsPx, frame_px: int) -> str:

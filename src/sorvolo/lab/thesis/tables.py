@@ -59,31 +59,20 @@ def tables_of(rows: Sequence[Row]) -> dict[str, Any]:
 def _deviations(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """By method: the mean deviation over its videos of UMCD; the correlation of the methods' maps with each other, and
     with the published mosaics of the NPU Drone-Map dataset, over those that have one."""
-    alike = _values(rows, "correlation", "correlation")
     found = []
     for method in MAP_METHODS:
         own = [row for row in rows if row.values.get("method") == method]
-        shares = _values(
-            [row for row in own if row.values.get("environment") != ENVIRONMENT],
-            "mosaic",
-            "deviation",
-        )
-        published = _values(own, PUBLISHED, "correlation")
-        benchmarks = _values(own, BENCHMARK, "correlation")
-        if shares or published:
-            found.append(
-                {
-                    "method": method,
-                    "videos": len(shares),
-                    "deviation": _mean(shares),
-                    "correlation": _mean(alike),
-                    "correlated": len(alike),
-                    "published_correlation": _mean(published),
-                    "published": len(published),
-                    "benchmark_correlation": _mean(benchmarks),
-                    "benchmarks": len(benchmarks),
-                }
-            )
+        umcd = [row for row in own if row.values.get("environment") != ENVIRONMENT]
+        result: dict[str, Any] = {"method": method}
+        for name, count, values in (
+            ("deviation", "videos", _values(umcd, "mosaic", "deviation")),
+            ("correlation", "correlated", _values(rows, "correlation", "correlation")),
+            ("published_correlation", "published", _values(own, PUBLISHED, "correlation")),
+            ("benchmark_correlation", "benchmarks", _values(own, BENCHMARK, "correlation")),
+        ):
+            result |= {name: _mean(values), count: len(values)}
+        if result["videos"] or result["published"]:
+            found.append(result)
     return found
 
 

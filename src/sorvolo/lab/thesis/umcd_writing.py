@@ -7,8 +7,6 @@ from typing import Any
 from sorvolo.lab.datasets.checking import DEFAULT_CLASSES, plain
 from sorvolo.lab.datasets.umcd import ROUNDED_S, UmcdMetadata
 
-_FIRST_AS_BEFORE = 1  # a simulation counts flights from 1
-
 
 def umcd_metadata(
     fps: float, objects: Iterable[Mapping[str, Any]], boxes: Mapping[str, Any], flight: int
@@ -21,7 +19,7 @@ def umcd_metadata(
     came = {
         each["properties"]["id"]: each["properties"]
         for each in objects
-        if _came(each["properties"], flight)
+        if flight in each["properties"]["flights"] and 1 not in each["properties"]["flights"]
     }
     seen: dict[int, list[tuple[int, list[float]]]] = {}
     for row in boxes["annotations"]:
@@ -52,10 +50,6 @@ def placed_metadata(
     return "\n".join(lines)
 
 
-def _came(properties: Mapping[str, Any], flight: int) -> bool:
-    return flight in properties["flights"] and _FIRST_AS_BEFORE not in properties["flights"]
-
-
 def _block(
     number: int, properties: Mapping[str, Any], views: list[tuple[int, list[float]]], fps: float
 ) -> list[str]:
@@ -66,19 +60,15 @@ def _block(
     )
     sizes_cm = (round(100 * properties[f"{side}_m"]) for side in ("length", "width", "height"))
     frames = [frame for frame, _ in views]
+    is_square = properties["length_m"] == properties["width_m"]
+    shape = "square" if is_square else "rectangular"
     return [
         f"Object {number}",
         f"Type: {name}",
-        f"Shape: {_shape(properties)}",
+        f"Shape: {'person' if properties['class'] == 'person' else shape}",
         f"Dimension: {' x '.join(map(str, sizes_cm))}",
         "Color: not stated",
         f"Movement: {'moving' if properties['moving'] else 'static'}",
         f"Appearance: {floor(min(frames) / fps):02d} to {ceil(max(frames) / fps):02d}",
         *(f"Box: {frame} {' '.join(f'{edge:g}' for edge in box)}" for frame, box in views),
     ]
-
-
-def _shape(properties: Mapping[str, Any]) -> str:
-    if properties["class"] == "person":
-        return "person"
-    return "square" if properties["length_m"] == properties["width_m"] else "rectangular"

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 from sorvolo.capture.calibration import camera_from_option
-from sorvolo.capture.photo_metadata import read_photo_metadata
 from sorvolo.capture.telemetry import is_telemetry
 from sorvolo.capture.video import read_video_info
 from sorvolo.errors import InputError
@@ -22,7 +21,6 @@ class VideoInput:
     camera: Path | None
     fps: float
     length_s: float
-    size_px: tuple[int, int]
 
     @property
     def options(self) -> dict[str, Any]:
@@ -39,8 +37,7 @@ def video_input(each: UmcdVideo, camera: Path | None, scratch: Path) -> VideoInp
     """
     if each.video.is_dir():
         photos, own_camera = photos_of_sequence(each.video, scratch)
-        first = read_photo_metadata(min(photos.glob("0*")))
-        return VideoInput(photos, None, own_camera, 1.0, 0.0, (first.width_px, first.height_px))
+        return VideoInput(photos, None, own_camera, 1.0, 0.0)
     info = read_video_info(each.video)
     telemetry = next((path for path in each.texts if is_telemetry(path)), None)
     if each.has_telemetry and telemetry is None:
@@ -48,21 +45,9 @@ def video_input(each: UmcdVideo, camera: Path | None, scratch: Path) -> VideoInp
         raise InputError(
             f"{each.video}: no telemetry beside it (found: {beside}); add the table or the NMEA log under its name"
         )
-    return VideoInput(
-        each.video,
-        telemetry,
-        _fitting(camera, info.width_px, info.height_px),
-        info.frame_rate_hz,
-        info.duration_s,
-        (info.width_px, info.height_px),
-    )
-
-
-def _fitting(camera: Path | None, width_px: int, height_px: int) -> Path | None:
-    if camera is None:
-        return None
     try:
-        camera_from_option(str(camera), width_px, height_px)
+        if camera is not None:
+            camera_from_option(str(camera), info.width_px, info.height_px)
     except InputError:
-        return None
-    return camera
+        camera = None
+    return VideoInput(each.video, telemetry, camera, info.frame_rate_hz, info.duration_s)
