@@ -309,8 +309,7 @@ class ThesisComparison:
     threads: int = 1
 
     def __post_init__(self) -> None:
-        whole = isinstance(self.threads, int) and not isinstance(self.threads, bool)
-        if not whole or not 1 <= self.threads <= _MOST_THREADS:
+        if type(self.threads) is not int or not 1 <= self.threads <= _MOST_THREADS:
             raise SettingsError(
                 f"threads is {self.threads!r}; give a whole number from 1 to {_MOST_THREADS}"
             )

@@ -6,8 +6,10 @@ import shutil
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from statistics import median
+from timeit import repeat
 from typing import Any
 
 from sorvolo.capture.source import open_sources
@@ -82,14 +84,11 @@ def compare_video(
         "cpu_seconds_per_view": cpu_s / max(1, updates[-1].views),
         "frames": asdict(sum((each.frame for each in judged), Counts())),
         "pixels": asdict(sum((each.pixels for each in judged), Counts())),
-        "labels": next(
-            (
-                placed_metadata(each, each.fps or later.fps, boxes)
-                for each in times.values()
-                if each.has_times
-            ),
-            None,
-        ),
+        "labels": [
+            placed_metadata(each, each.fps or later.fps, boxes)
+            for each in times.values()
+            if each.has_times
+        ][:1],
     }
     pictures = _examples(judged, later, scratch, masks.parent.name)
     with writing(scratch):
@@ -108,17 +107,14 @@ def time_comparison(first: VideoInput, later: VideoInput, repeats: int) -> dict[
             f"{first.video} and {later.video} differ in size; give videos of one camera"
         )
     cores = os.cpu_count() or 1
-    seconds = {}
-    for threads in (1, cores):
-        times = []
-        for _ in range(repeats):
-            started_s = time.perf_counter()
-            compare_thesis(before, after, threads=threads)
-            times.append(time.perf_counter() - started_s)
-        seconds[threads] = median(times)
+
+    def seconds(threads: int) -> float:
+        timed = partial(compare_thesis, before, after, threads=threads)
+        return median(repeat(timed, repeat=repeats, number=1))
+
     return {
-        "single_thread_s": seconds[1],
-        "multithread_s": seconds[cores],
+        "single_thread_s": seconds(1),
+        "multithread_s": seconds(cores),
         "threads": cores,
         "repeats": repeats,
         "width_px": before.shape[1],
@@ -128,9 +124,11 @@ def time_comparison(first: VideoInput, later: VideoInput, repeats: int) -> dict[
 
 def rates(counts: Counts) -> dict[str, float | None]:
     """The rates of section 4.2.1; None where nothing was to divide by, all but the accuracy where nothing was there."""
-    names = ("precision", "recall", "accuracy", "f1") if counts.tp + counts.fn else ("accuracy",)
-    return dict.fromkeys(("precision", "recall", "accuracy", "f1")) | {
-        name: rounded(getattr(counts, name), 4) for name in names
+    return {
+        name: rounded(getattr(counts, name), 4)
+        if counts.tp + counts.fn or name == "accuracy"
+        else None
+        for name in ("precision", "recall", "accuracy", "f1")
     }
 
 

@@ -2,8 +2,6 @@
 
 import shutil
 import time
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,7 +10,6 @@ import numpy as np
 
 from sorvolo.capture.photos import read_picture
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Floats
 from sorvolo.geometry.polygons import signed_area
 from sorvolo.lab.evaluation.frame_rows import map_frames
 from sorvolo.lab.evaluation.map_quality import MapDeviation, correlation
@@ -31,43 +28,6 @@ from sorvolo.store.images import jpeg_from_image, jpeg_from_rgba
 from sorvolo.store.site.archive import Archive
 
 _LAID_OVER_PX = 2048  # longer side at which mosaics without coordinates are compared
-
-
-@dataclass(frozen=True)
-class OutlineDistortion:
-    """Over all frames: the largest ratio of two opposite sides (1: none is a trapezium), the largest area over the
-    smallest, and how far the path bends: its largest distance from the chord of its ends, over the chord.
-    """
-
-    sides: float
-    areas: float
-    bend: float
-    frames: int
-
-
-def outline_distortion(outlines_m: Sequence[Floats]) -> OutlineDistortion:
-    """Measure the outlines of the frames that lie on the map, (4, 2) metres each, in the order of the flight.
-
-    NaN where there is no frame; the bend where the ends are closer to each other than half a frame is wide.
-    """
-    known = [each for each in outlines_m if np.isfinite(each).all()]
-    if not known:
-        return OutlineDistortion(np.nan, np.nan, np.nan, 0)
-    corners = np.array(known)
-    lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
-    pairs = np.stack([lengths[:, :2], lengths[:, 2:]])
-    areas = np.abs([signed_area(each) for each in corners])
-    away = corners.mean(axis=1) - corners[0].mean(axis=0)
-    chord = away[-1]
-    length2 = float(chord @ chord)
-    return OutlineDistortion(
-        float((pairs.max(axis=0) / pairs.min(axis=0)).max()),
-        float(areas.max() / areas.min()),
-        np.nan
-        if length2 < areas[0] / 4
-        else float(np.abs(away @ [chord[1], -chord[0]]).max() / length2),
-        len(known),
-    )
 
 
 Transform = Literal["similarity", "homography"]
@@ -124,12 +84,32 @@ def example_jpegs(site: Path) -> dict[str, bytes]:
 
 
 def distortion_of(site: Path) -> dict[str, Any]:
-    """Figure 3.12 in numbers: how far the frames of a mapped flight are distorted."""
+    """Figure 3.12 in numbers, over the frames that lie on the map.
+
+    `sides` is the largest ratio of two opposite sides (1: none is a trapezium), `areas` the largest area over the
+    smallest, `bend` the path's largest distance from the chord of its ends, over the chord: NaN where the ends are
+    closer than half a frame is wide. All are NaN where there is no frame.
+    """
     with Archive.open(site, write=False) as archive:
         described = archive.site()
     (rows,) = map_frames(site, described).values()
-    outlines = [row.outline_m for row in rows if row.has_outline]
-    return {**asdict(outline_distortion(outlines)), "selected": len(rows)}
+    corners = np.array([row.outline_m for row in rows if row.has_outline])
+    counts = {"frames": len(corners), "selected": len(rows)}
+    if not len(corners):
+        return {**counts, "sides": np.nan, "areas": np.nan, "bend": np.nan}
+    lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
+    pairs = np.stack([lengths[:, :2], lengths[:, 2:]])
+    areas = np.abs([signed_area(each) for each in corners])
+    away = corners.mean(axis=1) - corners[0].mean(axis=0)
+    chord = away[-1]
+    length2 = float(chord @ chord)
+    bend = np.abs(away @ [chord[1], -chord[0]]).max() / max(length2, 1e-9)
+    return {
+        **counts,
+        "sides": float((pairs.max(axis=0) / pairs.min(axis=0)).max()),
+        "areas": float(areas.max() / areas.min()),
+        "bend": float(bend) if length2 >= areas[0] / 4 else np.nan,
+    }
 
 
 def correlation_of(site: Path, mosaic: Path) -> dict[str, Any]:

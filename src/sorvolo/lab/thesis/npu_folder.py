@@ -143,8 +143,8 @@ def _is_number(word: str) -> bool:
 
 def _mosaic(folder: Path, start: str) -> Path | None:
     files = (
-        path
-        for path in sorted(folder.iterdir())
-        if path.suffix.lower() in PICTURE_ENDINGS and path.is_file()
+        each
+        for each in sorted(folder.iterdir())
+        if each.suffix.lower() in PICTURE_ENDINGS and each.stem.lower().startswith(start.lower())
     )
-    return next((path for path in files if path.stem.lower().startswith(start.lower())), None)
+    return next(files, None)

@@ -109,27 +109,21 @@ class _Work:
             return Row(task.id, task.kind, missing=str(error)), False
         row = known or row
         if row.values.get("method") == "robust" and row.values["labels"]:
-            self._placed[row.values["sequence"]] = row.values["labels"]
+            self._placed[row.values["sequence"]] = row.values["labels"][0]
         return row, known is not None
 
     def absent(self) -> Iterator[_Task]:
         """The videos of the thesis's tables that the folder lacks."""
-        lists = (
-            self._dataset.without_telemetry,
-            self._dataset.mosaicking,
-            self._dataset.change_detection,
-        )
+        folder = self._dataset
+        lists = folder.without_telemetry, folder.mosaicking, folder.change_detection
         for (part, wanted), found in zip(VIDEOS.items(), lists):
             there = {_plain(each.key) for each in found}
             for environment, names in wanted.items():
                 for name in names[: self._settings.videos]:
                     if _plain(f"{environment}/{name}") not in there:
                         where = f"{part}/{environment}/{name}.mp4"
-                        yield _Task(
-                            f"video/{where}",
-                            "video",
-                            missing=f"{where} is not in {self._dataset.place}",
-                        )
+                        reason = f"{where} is not in {folder.place}"
+                        yield _Task(f"video/{where}", "video", missing=reason)
 
     def mosaic_tasks(self) -> Iterator[_Task]:
         """Section 4.1: Table 4.1 and its text, Figures 3.12 and 4.1 to 4.3."""
@@ -182,7 +176,7 @@ class _Work:
 
     def change_tasks(self) -> Iterator[_Task]:
         """Section 4.2: Tables 4.3 to 4.5, the times, Figures 4.4 and 4.5."""
-        timed = None
+        timed: list[_Task] = []
         for later in self._chosen(self._dataset.change_detection):
             first = self._dataset.mosaic_of(later)
             for title in COMPARISONS:
@@ -193,11 +187,10 @@ class _Work:
                 else:
                     make = partial(self._compare, first, later, title)
                     yield self._task("comparison", row_id, (first, later), make)
-            if first is not None and timed is None:
+            if first is not None:
                 make = partial(self._time, first, later)
-                timed = self._task("seconds", later.key, (first, later), make)
-        if timed is not None:
-            yield timed
+                timed.append(self._task("seconds", later.key, (first, later), make))
+        yield from timed[:1]
 
     def detector_tasks(self, okutama: Path | None) -> Iterator[_Task]:
         """Section 4.3: Table 4.6 and Figure 4.6."""
@@ -238,16 +231,13 @@ class _Work:
             ]
         except OSError as error:
             raise InputError(f"{error.filename}: cannot be read ({error.strerror})") from error
+        wanted = self._settings
         of_kind = {
-            "comparison": (self._settings.views_per_second,),
-            "seconds": (self._settings.repeats,),
-            "detector": (
-                self._settings.detector,
-                self._settings.views_per_second,
-                self._settings.seed,
-            ),
+            "comparison": wanted.views_per_second,
+            "seconds": wanted.repeats,
+            "detector": (wanted.detector, wanted.views_per_second, wanted.seed),
         }
-        return content_sha256(build(), task.id, files, of_kind.get(task.kind, ()))
+        return content_sha256(build(), task.id, files, of_kind.get(task.kind))
 
     def _look_into(self, each: UmcdVideo) -> VideoInput:
         camera = (
@@ -289,8 +279,8 @@ class _Work:
         """Eq. 4.1 of a method's map with a published mosaic, without one with the map by planar."""
         site = self._mapped(each, method)
         other = mosaic or self._mapped(each, "planar") / "mosaic.tif"
-        named = {"sequence": each.key, "method": method}
-        return {**named, **mosaics.correlation_of(site, other)}, {}
+        measured = mosaics.correlation_of(site, other)
+        return {"sequence": each.key, "method": method, **measured}, {}
 
     def _transform(self, each: UmcdVideo, transform: mosaics.Transform) -> _Made:
         if transform == "similarity":
@@ -298,8 +288,8 @@ class _Work:
         else:
             site = self._site(each, "homography")
             mosaics.map_video(self._input(each), site, "thesis", transform)
-        named = {"sequence": each.key, "transform": transform}
-        return {**named, **mosaics.distortion_of(site)}, {"map": mosaics.map_jpeg(site)}
+        measured = {"sequence": each.key, "transform": transform, **mosaics.distortion_of(site)}
+        return measured, {"map": mosaics.map_jpeg(site)}
 
     def _example(self, each: UmcdVideo) -> _Made:
         return {"sequence": each.key}, mosaics.example_jpegs(self._mapped(each, "thesis"))

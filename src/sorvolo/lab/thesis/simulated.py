@@ -26,7 +26,6 @@ from sorvolo.store.exports.plain import json_bytes, plain_json
 
 MARK = "simulated.json"
 _WITH, _WITHOUT = "umcd-telemetry-", "umcd-"
-_NMEA_ENDING = {".nmea": ".log"}  # the thesis (2): a text file, such as CSV or LOG
 
 
 def simulated_dataset(
@@ -88,15 +87,11 @@ def _claim(place: Path, size: SimulatedSize, settings: ReproductionSettings) -> 
         }
     )
     mark = place / MARK
-    if mark.is_file():
-        if json.loads(mark.read_text(encoding="utf-8")) != wanted:
-            raise SettingsError(
-                f"{place}: holds a simulated dataset of another size or seed; choose another --out"
-            )
+    if mark.is_file() and json.loads(mark.read_bytes()) == wanted:
         return
     if place.exists() and any(place.iterdir()):
         raise SettingsError(
-            f"{place}: is not empty and holds no simulated dataset; choose another --out"
+            f"{place}: holds other files, or a simulated dataset of another size or seed; choose another --out"
         )
     with writing(place):
         place.mkdir(parents=True, exist_ok=True)
@@ -126,7 +121,8 @@ def _arrange(made: Path, place: Path, preset_name: str) -> None:
         return
     for part, flight in ((MOSAICKING, "flight1"), (CHANGES, "flight2")):
         for file in sorted((made / flight).iterdir()):
-            ending = _NMEA_ENDING.get(file.suffix, file.suffix)
+            # the thesis (2): a text file, such as CSV or LOG
+            ending = file.suffix.replace(".nmea", ".log")
             if file.is_file() and ending != ".xml":
                 _move(file, place / WITH / part / environment / f"{name}{ending}")
     objects, boxes = (

@@ -59,7 +59,6 @@ class RoiStitchingSettings:
             ("side_px", 256),
             ("akaze_threshold", 1e-9),
             ("max_features", 1),
-            ("ransac_px", 0.1),
             ("min_inliers", 4),
             ("roi_frames", 1),
         ):
