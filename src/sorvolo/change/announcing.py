@@ -159,17 +159,11 @@ def _objection(tally: Tally) -> Objection | None:
     score, look = sureness(tally), tally.look
     if score < LEAST_SCORE:
         return Objection.UNSURE
-    return None if look is None else _objection_to_look(look, score, tally)
-
-
-def _objection_to_look(look: Look, score: float, tally: Tally) -> Objection | None:
-    """The first rule that what its pictures and outline show fails."""
-    may_be_a_wall = (
-        look.area_m2 >= _LARGE_M2 and look.length_m < tally.flying_height_m
-    )  # snow is longer
-    if may_be_a_wall and score < _LARGE_SCORE and not tally.is_from_one_place():
-        return Objection.LARGE_AND_UNSURE
-    return None
+    if look is None or score >= _LARGE_SCORE or tally.is_from_one_place():
+        return None
+    # a wall that leans is large; snow is longer than the flying height
+    may_be_a_wall = look.area_m2 >= _LARGE_M2 and look.length_m < tally.flying_height_m
+    return Objection.LARGE_AND_UNSURE if may_be_a_wall else None
 
 
 def _three(values: Floats) -> tuple[float, float, float]:

@@ -13,13 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sorvolo.change.ground import GroundSums
-from sorvolo.change.light import BLACK_LEVEL
+from sorvolo.change.light import OCTAVES
 from sorvolo.change.outlines import measures, outline_of, place_sigma_m
 from sorvolo.geometry.arrays import Bytes, Floats32, ImageRGB, Mask, Matrix3
 from sorvolo.geometry.homography import resized
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView
 
-_OCTAVES = np.log2(np.arange(256, dtype=np.float32) + np.float32(BLACK_LEVEL))  # of each grey level
 _SKY = np.array(
     [0.7, -0.7], np.float32
 )  # blue and red over green, by which light from the sky differs from the sun's
@@ -175,7 +174,7 @@ def _colour(octaves: Signs) -> Signs:
 
 def _octaves(image: Bytes, size: tuple[int, int]) -> Signs:
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    return np.asarray(cv2.LUT(small, _OCTAVES), np.float32)
+    return np.asarray(cv2.LUT(small, OCTAVES), np.float32)
 
 
 def _level(octaves: Signs) -> Signs:

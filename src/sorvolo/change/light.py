@@ -197,7 +197,7 @@ STEPS_PER_OCTAVE = 48.0  # of local gains in a byte
 GAIN_ONE, CURVE_ONE = 4096, 16  # fixed point of the kernel `relight`
 
 _LOG = (np.log2(np.arange(256) + BLACK_LEVEL) * STEPS_PER_OCTAVE).astype(np.float32)
-_OCTAVES = np.log2(np.arange(256, dtype=np.float32) + np.float32(BLACK_LEVEL))
+OCTAVES = np.log2(np.arange(256, dtype=np.float32) + np.float32(BLACK_LEVEL))  # of each grey level
 
 
 # How the light is fitted. Lengths in px of the half size pictures, or in cells.
@@ -341,7 +341,7 @@ def _spread(values: Floats32, weights: Floats32, reaches: Sequence[tuple[int, fl
 
 
 def _logarithm(image: Bytes) -> Floats32:
-    return np.asarray(cv2.LUT(image, _OCTAVES), np.float32)
+    return np.asarray(cv2.LUT(image, OCTAVES), np.float32)
 
 
 def _smaller(image: NDArray[Any], size: tuple[int, int]) -> Bytes:

@@ -121,7 +121,7 @@ FEATURES = (
     "regions",
 )
 
-_LOG = np.clip(np.rint(np.log2((np.arange(256) + 8) / 8) * 50), 0, 255).astype(np.uint8)
+LOGARITHMS = np.clip(np.rint(np.log2((np.arange(256) + 8) / 8) * 50), 0, 255).astype(np.uint8)
 Image = NDArray[np.uint8]
 """uint8, (h, w) or (h, w, 3)."""
 
@@ -249,7 +249,7 @@ def find_regions(
             labels, boxes, np.zeros((0, len(FEATURES))), smooth, weak, noise, known, np.zeros(0)
         )
     # a shadow takes from all colours alike: red over blue stays
-    colour = tint(reference, query, _LOG, boxes, _RING_PX, scratch.take("tint", size))
+    colour = tint(reference, query, LOGARITHMS, boxes, _RING_PX, scratch.take("tint", size))
     channels = [difference, chroma, activity, light_before, light_after, came, went, colour]
     frame = np.array([noise, rest_px, unevenness, np.log1p(len(boxes))])
     green = (
@@ -291,8 +291,8 @@ def _measured(
         sharp,
         steep,
     ) = planes.reshape(-1)[: 10 * labels.size].reshape(10, height, width)
-    cv2.LUT(light_before, _LOG, dst=log_before)
-    cv2.LUT(level, _LOG, dst=log_after)
+    cv2.LUT(light_before, LOGARITHMS, dst=log_before)
+    cv2.LUT(level, LOGARITHMS, dst=log_after)
     _details(log_before, detail_before, _DETAIL_PX)
     _details(log_after, detail_after, _DETAIL_PX)
     window = np.ones((3, 3), np.uint8)

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from cv2.typing import MatLike
 
+from sorvolo.change.regions import LOGARITHMS
 from sorvolo.geometry.arrays import Bytes, Floats, Mask, Matrix3
 from sorvolo.kernels import fit_moves, flow_on_grid
 
@@ -18,7 +19,6 @@ _RIDGE = 1e-4 * np.array(
 _LEAST_FLOW_PX = (
     32  # OpenCV's flow crashes on pictures that are wide and less high than four of its patches
 )
-_LOG = np.clip(np.rint(np.log2((np.arange(256) + 8) / 8) * 50), 0, 255).astype(np.uint8)
 
 
 # Which displacements are taken out: those of the pictures' corners, in their own pixels.
@@ -78,7 +78,7 @@ def settle(reference: Bytes, query: Bytes, known: Mask | None = None) -> Settlin
 
 def _details(gray: MatLike) -> Bytes:
     """What is finer than clouds, in logarithms: light falls out of it."""
-    logarithm = cv2.LUT(gray, _LOG)
+    logarithm = cv2.LUT(gray, LOGARITHMS)
     return np.asarray(
         cv2.addWeighted(logarithm, 2, cv2.blur(logarithm, (15, 15)), -2, 128), np.uint8
     )
