@@ -19,6 +19,7 @@ from blob_world import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import sorvolo.change.candidate as candidates
 from sorvolo.change.announcing import Objection
 from sorvolo.change.candidate import Candidate, KeptView
 from sorvolo.change.earlier_pictures import EarlierPicture, EarlierPictures, with_known_pixels
@@ -437,10 +438,14 @@ def seldom(thing: Thing, others: int) -> list:
     ]
 
 
-def test_a_thing_that_two_early_photos_show_is_not_forgotten_for_many_uncertain_ones_after_it():
+def test_a_thing_that_two_early_photos_show_is_not_forgotten_for_many_uncertain_ones_after_it(
+    monkeypatch,
+):
     views = seldom(Thing(2, 0), 6)
+    monkeypatch.setattr(candidates, "_MOST_SEEDS", 3)
     for most_px, ids in ((8_000_000, ["f-1"]), (0, [])):
-        evidence, reported = collect(views, most_seeds=3, most_seeds_px=most_px)
+        monkeypatch.setattr(candidates, "_MOST_SEEDS_PX", most_px)
+        evidence, reported = collect(views)
         assert not reported and [each.id for each in evidence.conclude()] == ids
 
 

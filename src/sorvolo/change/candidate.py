@@ -391,6 +391,10 @@ class Candidate:
         return self
 
 
+_MOST_SEEDS = 256  # uncertain candidates that are kept in any case ...
+_MOST_SEEDS_PX = 8_000_000  # ... and while their pictures have no more pixels (110 MB)
+
+
 class Seeds:
     """The uncertain candidates of the last views, the oldest first. `keep` changes them.
 
@@ -404,10 +408,7 @@ class Seeds:
         gap: int,
         least_cells: float,
         m_per_px: float,
-        most_seeds: int,
-        most_seeds_px: int,
     ) -> None:
-        self._most_seeds, self._most_seeds_px = most_seeds, most_seeds_px
         self._grid, self._cell_m, self._gap, self._least_cells = grid, cell_m, gap, least_cells
         self._m_per_px = m_per_px
         self._seeds: list[Candidate] = []
@@ -443,7 +444,7 @@ class Seeds:
         # Let the oldest go where there are too many: a large site has hundreds that only its
         # first photos show.
         sizes = [each.pictures.size_px for each in self._seeds]
-        while len(sizes) > self._most_seeds and sum(sizes) > self._most_seeds_px:
+        while len(sizes) > _MOST_SEEDS and sum(sizes) > _MOST_SEEDS_PX:
             del sizes[0], self._seeds[0]
 
     def _ask(self, seed: Candidate, view: ComparedView, kept_view: KeptView) -> None:

@@ -77,8 +77,6 @@ class EvidenceSettings:
 
     k: int = 3  # views that must show it ...
     n: int = 5  # ... of the last ones that saw its ground
-    most_seeds: int = 256  # uncertain candidates that are kept in any case ...
-    most_seeds_px: int = 8_000_000  # ... and while their pictures have no more pixels (110 MB)
 
     def __post_init__(self) -> None:
         if not 1 <= self.k <= self.n <= 8:
@@ -125,8 +123,6 @@ class EvidenceMap:
             self._gap,
             self._least_cells,
             m_per_px,
-            settings.most_seeds,
-            settings.most_seeds_px,
         )
         self._recent: deque[KeptView] = deque(maxlen=settings.n)
         self._number = 0
