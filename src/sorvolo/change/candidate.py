@@ -9,6 +9,7 @@ import numpy as np
 from sorvolo.change.announcing import Tally
 from sorvolo.change.ground import (
     CellEvidence,
+    CellReport,
     CellWindow,
     EvidenceGrid,
     LaidView,
@@ -281,7 +282,7 @@ class KeptView:
 class Candidate:
     """All that views reported of one possible change.
 
-    `see` and `miss` take views in; `extend`, `recount` and `joined` follow its ground, the window
+    `recall`, `see`, `ask` and `miss` take views in; `extend`, `recount` and `joined` follow its ground, the window
     `cells`. `tally` is what the views reported so far; a seed has the number 0.
     """
 
@@ -304,9 +305,20 @@ class Candidate:
         """It reaches into this window, too."""
         self.cells = self.cells.joined(window)
 
+    def recall(self, view: KeptView, cells: Mask, cell_m: float) -> None:
+        """Count a view from before the candidate was found, whose `cells` lie in its window, and its mask."""
+        report = view.laid.report(self.cells, cells, cell_m)
+        if report.seen < _SEEN:
+            return
+        if report.flagged < _SHOWS * report.seen:
+            self.miss()
+            return
+        self._count(view, report, residual_m=0.0, knows_place=True)
+        self.pictures.vote(view.site_from_image, view.changed, view.valid)
+
     def see(self, view: KeptView, cells: Mask, cell_m: float) -> bool:
-        """Count this view, of now or of before it was found; whether it shows the candidate. One that sees less than
-        half of it does not count, unless the candidate is as large as the view."""
+        """Count this view; whether it shows the candidate. One that sees less than half of it does not count, unless
+        the candidate is as large as the view."""
         report = view.laid.report(self.cells, cells, cell_m)
         is_large = max(self.cells.shape) > 0.5 * max(view.laid.window.shape)
         if report.seen < _SEEN and not (is_large and report.flagged > 0):
@@ -314,22 +326,21 @@ class Candidate:
         if report.flagged < _SHOWS * report.seen:
             self.miss()
             return False
-        self.tally = self.tally.with_view(
-            view.time_ns, report.score, view.residual_m, view.camera_m
-        )
-        if not view.laid.part_of(view.laid.cut_off, self.cells, cells).any():
-            self.tally = replace(self.tally, whole=self.tally.whole + 1)
-        self._cameras.append(view.camera_m)
-        if len(self._cameras) > _MOST_CAMERAS:
-            del self._cameras[1::2]
-        if report.seen > _ALL_SEEN and len(self._places) < _MOST_PLACES:
-            self._places.append(report.place_m)
+        self._count(view, report, view.residual_m, knows_place=report.seen > _ALL_SEEN)
+        self._note_rim(view, cells)
         return True
 
-    def see_with_mask(self, view: KeptView, cells: Mask, cell_m: float) -> None:
-        """Count this view, and its mask where it shows the candidate."""
-        if self.see(view, cells, cell_m):
+    def ask(self, view: KeptView, cells: Mask, cell_m: float) -> bool:
+        """Count this view as for a seed: whatever shows some of it shows it; and its mask. Whether it does."""
+        report = view.laid.report(self.cells, cells, cell_m)
+        if report.flagged >= max(_SHOWS * report.seen, 1e-9):
+            self._count(view, report, view.residual_m, knows_place=report.seen > _ALL_SEEN)
             self.pictures.vote(view.site_from_image, view.changed, view.valid)
+            self._note_rim(view, cells)
+            return True
+        if report.seen >= _SEEN:
+            self.miss()
+        return False
 
     def miss(self, times: int = 1) -> None:
         """One more view that could have shown it, or several, do not."""
@@ -390,6 +401,26 @@ class Candidate:
         self.extend(other.cells)
         return self
 
+    def _count(
+        self,
+        view: KeptView,
+        report: CellReport,
+        residual_m: float,
+        *,
+        knows_place: bool,
+    ) -> None:
+        """Count a view that shows it."""
+        self.tally = self.tally.with_view(view.time_ns, report.score, residual_m, view.camera_m)
+        self._cameras.append(view.camera_m)
+        if len(self._cameras) > _MOST_CAMERAS:
+            del self._cameras[1::2]
+        if knows_place and len(self._places) < _MOST_PLACES:
+            self._places.append(report.place_m)
+
+    def _note_rim(self, view: KeptView, cells: Mask) -> None:
+        if not view.laid.part_of(view.laid.cut_off, self.cells, cells).any():
+            self.tally = replace(self.tally, whole=self.tally.whole + 1)
+
 
 _MOST_SEEDS = 256  # uncertain candidates that are kept in any case ...
 _MOST_SEEDS_PX = 8_000_000  # ... and while their pictures have no more pixels (110 MB)
@@ -448,7 +479,7 @@ class Seeds:
             del sizes[0], self._seeds[0]
 
     def _ask(self, seed: Candidate, view: ComparedView, kept_view: KeptView) -> None:
-        seed.see_with_mask(kept_view, self._grid.read(seed.cells).changed > 0, self._cell_m)
+        seed.ask(kept_view, self._grid.read(seed.cells).changed > 0, self._cell_m)
 
     def _new(self, laid: LaidView, weak: Mask) -> list[CellWindow]:
         """The windows of large enough `weak` pieces, the surest first."""

@@ -338,7 +338,7 @@ class EvidenceMap:
         self._found[candidate.number] = candidate
         candidate.pictures.show(view, *window.box_m(self._cell_m), self._m_per_px)
         for each in earlier:
-            candidate.see_with_mask(each, cells, self._cell_m)
+            candidate.recall(each, cells, self._cell_m)
         return candidate.number
 
     def _merge(self, number: int, gone: int) -> None:
