@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 
 from sorvolo.findings.importance import between, ordered
 from sorvolo.findings.register import (
-    Look,
+    KnownBy,
     MissionSighting,
-    Origin,
     Presence,
     Register,
+    SearchedDate,
     associate,
 )
 from sorvolo.survey.map_objects import SearchedFrames
@@ -39,7 +39,7 @@ def sighting(
         day,
         f"{mission}{day}",
         f"{mission}{day}-{east_m:.3f}",
-        Origin.DETECTED,
+        KnownBy.DETECTED,
         label,
         0.8,
         np.array([east_m, north_m]),
@@ -51,9 +51,9 @@ def sighting(
     return replace(plain, **others)
 
 
-def look(day: int) -> Look:
+def look(day: int) -> SearchedDate:
     """Two frames of a day's flight that show everything."""
-    return Look(f"flight{day}", day, EVERYWHERE)
+    return SearchedDate(f"flight{day}", day, EVERYWHERE)
 
 
 def shown(register: Register) -> list[tuple[object, ...]]:
@@ -93,7 +93,7 @@ def test_silence_is_no_absence() -> None:
     seen = [sighting(0, "map", 0.0), sighting(1, "map", 60.0)]
     (first, _) = associate(seen, Register()).findings
     assert first.presence("flight1") is Presence.NOT_LOOKED and not first.gone
-    left = sighting(0, "left", 0.1, gone="flight1", origin=Origin.CHANGED)
+    left = sighting(0, "left", 0.1, gone="flight1", origin=KnownBy.CHANGED)
     (first, _) = associate([*seen, left], Register()).findings
     assert first.gone == "flight1" and len(first.sightings) == 2
 

@@ -1526,13 +1526,15 @@ def test_what_a_watch_found_is_judged_with_the_keyboard(opened: Watched, served:
     results, page = watch_run(served.station, "run-7"), opened.page
     try:
         announce(served, "site.changed", {"versions": 2})
+        found = served.ask("/api/sites/field/collections/findings/items")["features"]
+        person = found[0]["id"]
         page.locator("[data-panel=review]").click()
         page.get_by_role("button", name="Objects (2)").click()
-        page.locator(".strip button[data-id='run-7:1']").click()
+        page.locator(f".strip button[data-id='{person}']").click()
         page.keyboard.press("c")
-        page.locator(".strip button.confirmed[data-id='run-7:1']").wait_for()
-        (given,) = served.ask("/api/sites/field/reviews?kind=finding")
-        assert (given["id"], given["verdict"]) == ("run-7:1", "confirmed")
+        page.locator(f".strip button.confirmed[data-id='{person}']").wait_for()
+        (given,) = served.ask("/api/sites/field/reviews?kind=object")
+        assert (given["id"], given["verdict"]) == (person, "confirmed")
     finally:
         (results / "tracks.geojson").unlink()
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sorvolo.findings.register import Finding, Look, Origin, Presence, Register
+from sorvolo.findings.register import GroundFinding, KnownBy, Presence, Register, SearchedDate
 from sorvolo.survey.map_objects import looked_at
 from sorvolo.survey.objects import PERSON
 from sorvolo.survey.wording import counted
@@ -14,10 +14,10 @@ from sorvolo.survey.wording import counted
 VEHICLES = frozenset({"car", "truck", "bus", "van", "motorcycle", "bicycle", "boat", "tractor"})
 
 
-def ordered(findings: Sequence[Finding]) -> list[Finding]:
+def ordered(findings: Sequence[GroundFinding]) -> list[GroundFinding]:
     """People first, then vehicles, then the rest; in each group what is still there, then large, sure and new first."""
 
-    def key(found: Finding) -> tuple[object, ...]:
+    def key(found: GroundFinding) -> tuple[object, ...]:
         newest, label = found.newest, found.label
         group = 0 if label == PERSON else 1 if label in VEHICLES else 2
         length_m = 0.0 if math.isnan(newest.length_m) else newest.length_m
@@ -46,9 +46,9 @@ def between(register: Register, before: str, after: str) -> str:
     return "; ".join(parts) or "nothing known came or left"
 
 
-def _was_looked_for(found: Finding, date: str, looks: dict[str, Look]) -> bool:
+def _was_looked_for(found: GroundFinding, date: str, looks: dict[str, SearchedDate]) -> bool:
     """Whether a thing's own comparison saw it come, or a date's frames were searched for its class where it is."""
-    if any(each.origin is Origin.CHANGED and not each.gone for each in found.sightings):
+    if any(each.origin is KnownBy.CHANGED and not each.gone for each in found.sightings):
         return True
     searched = [looks[date].frames] if date in looks else []
     return bool(looked_at(np.array([found.position_m]), [found.label], searched)[0])

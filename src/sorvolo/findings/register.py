@@ -25,7 +25,7 @@ _LIKE_CLASS = 0.1  # classes' shares that agree less are two classes
 _FAR = 1e3  # the cost of a pair that cannot be one thing: more than all that can
 
 
-class Origin(StrEnum):
+class KnownBy(StrEnum):
     """How a thing came to be known."""
 
     DETECTED = "detected"
@@ -55,7 +55,7 @@ class MissionSighting:
     order: float
     mission: str
     id: str
-    origin: Origin
+    origin: KnownBy
     label: str
     score: float
     position_m: Floats
@@ -73,7 +73,7 @@ class MissionSighting:
 
 
 @dataclass(frozen=True)
-class Look:
+class SearchedDate:
     """The frames of a date that a detector searched."""
 
     date: str
@@ -82,7 +82,7 @@ class Look:
 
 
 @dataclass(frozen=True, eq=False)
-class Finding:
+class GroundFinding:
     """One thing on the ground, by all its sightings in order of date.
 
     `id` follows from the first sighting's content. `gone` is the first date that looked there and did not find it, ""
@@ -112,7 +112,7 @@ class Finding:
         """The surest sighting of the newest date that saw it, a detector's own before a change's."""
         return max(
             _of_last_date(self.sightings),
-            key=lambda each: (each.origin is Origin.DETECTED, each.score, each.mission, each.id),
+            key=lambda each: (each.origin is KnownBy.DETECTED, each.score, each.mission, each.id),
         )
 
     @cached_property
@@ -141,8 +141,8 @@ class Finding:
 class Register:
     """All findings of a site, the missions that they are of, and the looks that ended some of them."""
 
-    findings: tuple[Finding, ...] = ()
-    looks: tuple[Look, ...] = ()
+    findings: tuple[GroundFinding, ...] = ()
+    looks: tuple[SearchedDate, ...] = ()
     missions: frozenset[str] = frozenset()
 
     @cached_property
@@ -158,11 +158,11 @@ class Register:
         return max((-1, *sightings, *(each.order for each in self.looks)))
 
     @property
-    def present(self) -> list[Finding]:
+    def present(self) -> list[GroundFinding]:
         """What is there by the newest look at each place."""
         return [each for each in self.findings if not each.gone]
 
-    def present_at(self, date: str) -> list[Finding]:
+    def present_at(self, date: str) -> list[GroundFinding]:
         """What a date's missions saw."""
         return [each for each in self.findings if each.presence(date) is Presence.SEEN]
 
@@ -179,7 +179,7 @@ class Register:
 
 
 def associate(
-    sightings: Sequence[MissionSighting], register: Register, looks: Sequence[Look] = ()
+    sightings: Sequence[MissionSighting], register: Register, looks: Sequence[SearchedDate] = ()
 ) -> Register:
     """The register with what missions saw added, each thing one finding; the same whatever the missions' order.
 
@@ -187,7 +187,7 @@ def associate(
     where the new ones are not the newest, what is known is put together again. Two sightings of one mission are never
     one finding. What a date looked at and did not find is gone; the next thing there is another finding.
     """
-    steps: list[MissionSighting | Look] = [*sightings, *looks]
+    steps: list[MissionSighting | SearchedDate] = [*sightings, *looks]
     orders = [each.order for each in steps]
     missions = register.missions | {each.mission for each in sightings}
     again = {each.mission for each in sightings} & register.missions
@@ -208,12 +208,12 @@ def associate(
         seen = [each for each in taken if isinstance(each, MissionSighting)]
         for _, mission in groupby(seen, key=lambda each: each.mission):
             working.take(list(mission))
-        working.end(date, [each.frames for each in taken if isinstance(each, Look)])
+        working.end(date, [each.frames for each in taken if isinstance(each, SearchedDate)])
     return Register(working.findings(), (*register.looks, *looks), missions)
 
 
-def _order(each: MissionSighting | Look) -> tuple[float, str, str, int, str]:
-    if isinstance(each, Look):
+def _order(each: MissionSighting | SearchedDate) -> tuple[float, str, str, int, str]:
+    if isinstance(each, SearchedDate):
         return each.order, each.date, "", -1, ""
     return each.order, each.date, each.mission, each.first_ns, each.id
 
@@ -221,7 +221,7 @@ def _order(each: MissionSighting | Look) -> tuple[float, str, str, int, str]:
 class _Thing:
     """A finding while missions are added."""
 
-    def __init__(self, found: Finding) -> None:
+    def __init__(self, found: GroundFinding) -> None:
         self.id, self.gone = found.id, found.gone
         self.sightings = list(found.sightings)
         self.of_date = _of_last_date(found.sightings)
@@ -249,8 +249,8 @@ class _Thing:
         """The date whose comparison saw that it had left; "" where it was seen since."""
         return next((each.gone for each in self.of_date if each.gone), "")
 
-    def finding(self) -> Finding:
-        return Finding(
+    def finding(self) -> GroundFinding:
+        return GroundFinding(
             self.id,
             tuple(self.sightings),
             frozen(self.place_m),
@@ -273,7 +273,7 @@ class _Working:
         self._stands[: self._count] = [not each.gone for each in self._known]
         self._seen: set[int] = set()  # on the date that is added
 
-    def findings(self) -> tuple[Finding, ...]:
+    def findings(self) -> tuple[GroundFinding, ...]:
         """All findings, those that were not touched as they were."""
         result = list(self._known)
         for number, thing in sorted(self._things.items()):
@@ -297,7 +297,9 @@ class _Working:
         for row, sighting in enumerate(mission):
             if (number := joined.get(row)) is None:
                 number, self._count = self._count, self._count + 1
-                empty = Finding(self._id(sighting), (), sighting.position_m, sighting.sigma_m, {})
+                empty = GroundFinding(
+                    self._id(sighting), (), sighting.position_m, sighting.sigma_m, {}
+                )
                 self._things[number] = _Thing(empty)
                 self._stands[number] = True
             self._seen.add(number)

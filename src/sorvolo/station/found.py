@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from sorvolo.findings.importance import ordered
-from sorvolo.findings.register import Finding, MissionSighting, Origin, Register, associate
+from sorvolo.findings.register import GroundFinding, KnownBy, MissionSighting, Register, associate
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.store.exports.change_files import objects_geojson
 from sorvolo.store.exports.places import place_deg
@@ -66,7 +66,7 @@ def _sightings_of(
             *dates[each["run"]],
             each["run"],
             each["id"],
-            Origin.DETECTED,
+            KnownBy.DETECTED,
             each["class"],
             each["score"],
             place_m[:2],
@@ -98,7 +98,7 @@ def _date_of(
 
 
 def _feature(
-    found: Finding,
+    found: GroundFinding,
     site: Site,
     objects: Mapping[str, StoredObject],
     watched: Mapping[str, Track],

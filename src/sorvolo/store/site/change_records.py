@@ -9,7 +9,7 @@ import numpy as np
 from sqlalchemy import Connection, Row, delete, func, select
 
 from sorvolo.errors import StoreError
-from sorvolo.findings.register import Finding
+from sorvolo.findings.register import GroundFinding
 from sorvolo.geometry.arrays import Floats, PointsM, frozen
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.site import schema
@@ -292,7 +292,7 @@ class StoredObject:
     flight_id: str
     rank: int
     thing: MapObject
-    finding: Finding | None = None
+    finding: GroundFinding | None = None
 
 
 def add_search(connection: Connection, run_id: int, search: ObjectSearch) -> None:

@@ -4,7 +4,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 from sqlalchemy import Connection, select
 
-from sorvolo.findings.register import Look, MissionSighting, Origin, Register, associate
+from sorvolo.findings.register import KnownBy, MissionSighting, Register, SearchedDate, associate
 from sorvolo.store.site import schema
 from sorvolo.store.site.catalogue import list_versions
 from sorvolo.store.site.change_records import (
@@ -34,7 +34,7 @@ def site_register(
     for change in load_changes(connection):
         if _is_of(change.flight_id, flights) and change.verdict is not Verdict.REJECTED:
             sightings += _of_change(change, before.get(change.flight_id, ""), dates)
-    looks = [Look(each.flight_id, float(each.rank), each.frames) for each in searches]
+    looks = [SearchedDate(each.flight_id, float(each.rank), each.frames) for each in searches]
     return associate([*sightings, *watched], Register(), looks)
 
 
@@ -70,7 +70,7 @@ def sighting_of(stored: StoredObject) -> MissionSighting:
         float(stored.rank),
         f"{stored.flight_id} objects",
         thing.id,
-        Origin.DETECTED,
+        KnownBy.DETECTED,
         thing.label,
         thing.score,
         thing.position_m,
@@ -108,7 +108,7 @@ def _of_change(
                 rank,
                 f"{change.flight_id} changes",
                 change.id,
-                Origin.CHANGED,
+                KnownBy.CHANGED,
                 label,
                 change.score,
                 change.centre_m,
