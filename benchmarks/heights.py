@@ -44,7 +44,7 @@ from sorvolo.lab.simulation.truth import ground_heights, surface_heights
 from sorvolo.lab.simulation.world import Relief, orthophoto
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.heights.measure import read_field
-from sorvolo.missions.heights.run import HeightSettings, make_heights
+from sorvolo.missions.heights.run import make_heights
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.search.drawing.objects import ThingLabel
 from sorvolo.search.drawing.view import map_view
@@ -102,7 +102,7 @@ def simulated(seed: int, relief_m: float = 0.0) -> dict[str, Any]:
             pass
         photos, site = folder / "made" / "flight1" / "photos", folder / "site"
         list(map_flights([photos], site, MapSettings(model="none", heights=False)))
-        list(make_heights(site, HeightSettings()))
+        list(make_heights(site))
         flown = next(iter(simulate_flights(settings)))
         day = flown.day
         with Archive.open(folder / "site", write=False) as archive:

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from sorvolo.missions.flight.request import AlreadyDone
     from sorvolo.missions.flight.settings import CompareSettings, MapSettings
     from sorvolo.missions.heights.measure import measure_profile, measure_volume, write_contours
-    from sorvolo.missions.heights.run import HeightSettings, HeightsUpdate, make_heights
+    from sorvolo.missions.heights.run import HeightsUpdate, make_heights
     from sorvolo.missions.inspect import inspect_input
     from sorvolo.missions.map.flights import map_flights
     from sorvolo.missions.plan_flight import (
@@ -100,7 +100,6 @@ __all__ = [
     "FindsObjects",
     "Frame",
     "GeometryError",
-    "HeightSettings",
     "HeightsUpdate",
     "InputError",
     "LiveSettings",
@@ -229,7 +228,7 @@ _HOMES = {
     ),
     "missions.compare.flights": ("compare_flights",),
     "missions.flight.settings": ("CompareSettings", "MapSettings"),
-    "missions.heights.run": ("HeightsUpdate", "HeightSettings", "make_heights"),
+    "missions.heights.run": ("HeightsUpdate", "make_heights"),
     "missions.inspect": ("inspect_input",),
     "missions.map.flights": ("map_flights",),
     "missions.plan_flight": (

@@ -35,7 +35,7 @@ from sorvolo.missions.heights.measure import (
     read_field,
     write_contours,
 )
-from sorvolo.missions.heights.run import HeightSettings, make_heights
+from sorvolo.missions.heights.run import make_heights
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.map.ground import shape_of
 from sorvolo.missions.search.prepare import heights_for
@@ -163,12 +163,12 @@ def test_heights_name_what_is_missing(mapped: Path, tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="no site"):
         list(make_heights(tmp_path / "none"))
     with pytest.raises(SettingsError, match="--cell"):
-        HeightSettings(cell_m=0.0)
+        next(make_heights(mapped, 0.0))
 
 
 def test_more_cells_than_can_be_handled_are_refused_before_the_work_begins(mapped: Path) -> None:
     with pytest.raises(GeometryError, match="give cells larger than"):
-        next(make_heights(mapped, HeightSettings(cell_m=0.001)))
+        next(make_heights(mapped, 0.001))
 
 
 def test_a_flight_without_gps_has_no_heights(tmp_path: Path) -> None:

@@ -147,14 +147,13 @@ def make_and_read(
     catalogues: "Catalogues | None" = None,
 ) -> Mapping[str, Any]:
     """Make a flight's heights with progress on stderr; return their report."""
-    from sorvolo.missions.heights.run import HeightSettings, make_heights
+    from sorvolo.missions.heights.run import make_heights
     from sorvolo.store.site.files import HeightFile
 
     flight_id = ""
-    settings = HeightSettings(cell_m=cell_m)
     with ProgressReport(Console(stderr=True)) as progress:
         progress.show("heights")
-        for update in make_heights(site, settings, flight=flight or None, catalogues=catalogues):
+        for update in make_heights(site, cell_m, flight=flight or None, catalogues=catalogues):
             flight_id = update.flight_id
             progress.show(f"heights: {update.stage}, percent", round(100 * update.share), 100)
     return read_json(site / "flights" / flight_id / HeightFile.REPORT)

@@ -29,19 +29,18 @@ from sorvolo.heights.views import View, overlaps
 from sorvolo.registration.features import FeatureSettings, normalise_contrast, sift_features
 from sorvolo.survey.mosaic import Features
 
+FEATURES_SIDE_PX = 1600
+"""Longest side of the pictures that features are found in."""
 
-@dataclass(frozen=True)
-class TrackSettings:
-    """How features are found and matched."""
-
-    side_px: int = 1600  # longest side of the pictures that features are found in
-    features: int = 2500  # a picture
-    ratio: float = 0.8  # Lowe's
-    inlier_px: float = 1.5  # about the epipolar line
-    least_inliers: int = 20  # matches of two photos; by choice
-    least_overlap: float = 0.15  # of two views that are matched
-    neighbours: int = 14  # views matched with each at most
-    margin: float = 0.2  # of a picture: features so far beside what two views share on level ground may be shared too
+_FEATURES = 2500  # a picture
+_RATIO = 0.8  # Lowe's
+_INLIER_PX = 1.5  # about the epipolar line
+_LEAST_INLIERS = 20  # matches of two photos; by choice
+_LEAST_OVERLAP = 0.15  # of two views that are matched
+_NEIGHBOURS = 14  # views matched with each at most
+_MARGIN = 0.2  # of a picture: features so far beside what two views share on level ground may be shared too
+_REJECTED_PX = (8.0, 3.0)  # observations farther off are dropped, round by round
+_LEAST_SIGMA_M = 0.02  # of a fix
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,15 +54,13 @@ class Tracks:
     count: int
 
 
-def find_tracks(
-    views: Sequence[View], gray: Callable[[int], ImageGray], settings: TrackSettings
-) -> Tracks:
+def find_tracks(views: Sequence[View], gray: Callable[[int], ImageGray]) -> Tracks:
     """The points that pictures have in common; `gray(i)` is the picture of view i at any size."""
-    found = [_features(gray(number), view, settings) for number, view in enumerate(views)]
+    found = [_features(gray(number), view) for number, view in enumerate(views)]
     starts = np.concatenate([[0], np.cumsum([len(each.rays) for each in found])])
     left, right, pairs = [], [], []
-    for i, j in _pairs(views, settings):
-        matched = _shared(found[i], found[j], settings)
+    for i, j in _pairs(views):
+        matched = _shared(found[i], found[j])
         if len(matched):
             left.append(starts[i] + matched[:, 0])
             right.append(starts[j] + matched[:, 1])
@@ -82,49 +79,47 @@ class _Found:
     ground_m: PointsM
 
 
-def _features(gray: ImageGray, view: View, settings: TrackSettings) -> _Found:
-    scale = min(1.0, settings.side_px / max(gray.shape))
+def _features(gray: ImageGray, view: View) -> _Found:
+    scale = min(1.0, FEATURES_SIDE_PX / max(gray.shape))
     if scale < 1.0:
         size = (round(gray.shape[1] * scale), round(gray.shape[0] * scale))
         gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
-    found = sift_features(normalise_contrast(gray), FeatureSettings(sift_count=settings.features))
+    found = sift_features(normalise_contrast(gray), FeatureSettings(sift_count=_FEATURES))
     rays = view.camera.resized(gray.shape[1], gray.shape[0]).rays_from_pixels(found.points_px)[
         :, :2
     ]
     return _Found(view, found, gray.shape[1], rays, _on_ground(rays, view))
 
 
-def _pairs(views: Sequence[View], settings: TrackSettings) -> Iterator[tuple[int, int]]:
+def _pairs(views: Sequence[View]) -> Iterator[tuple[int, int]]:
     """The pairs of views that overlap, each with its best neighbours."""
     shared = overlaps(list(views))
     shared = np.maximum(shared, shared.T)
-    order = np.argsort(-shared, axis=1, kind="stable")[:, : settings.neighbours]
+    order = np.argsort(-shared, axis=1, kind="stable")[:, :_NEIGHBOURS]
     chosen = {
         (min(i, int(j)), max(i, int(j)))
         for i in range(len(views))
         for j in order[i]
-        if shared[i, j] > settings.least_overlap
+        if shared[i, j] > _LEAST_OVERLAP
     }
     yield from sorted(chosen)
 
 
-def _shared(left: _Found, right: _Found, settings: TrackSettings) -> Rows:
+def _shared(left: _Found, right: _Found) -> Rows:
     """(N, 2) the features that two views share; none where they are too few to trust.
 
     They are sought among those that the map puts near each other, else among all: the map may have a view elsewhere.
     """
     every = np.arange(len(left.rays)), np.arange(len(right.rays))
     near = (
-        _near(left.ground_m, right.view, settings.margin),
-        _near(right.ground_m, left.view, settings.margin),
+        _near(left.ground_m, right.view, _MARGIN),
+        _near(right.ground_m, left.view, _MARGIN),
     )
-    threshold = (
-        settings.inlier_px * left.view.camera.width_px / left.width_px / left.view.camera.fx_px
-    )
+    threshold = _INLIER_PX * left.view.camera.width_px / left.width_px / left.view.camera.fx_px
     for rows in (near, every):
-        matched = _matched(left.features, right.features, rows, settings.ratio)
+        matched = _matched(left.features, right.features, rows, _RATIO)
         good = _agreeing(left.rays[matched[:, 0]], right.rays[matched[:, 1]], threshold)
-        if good.sum() >= settings.least_inliers:
+        if good.sum() >= _LEAST_INLIERS:
             return matched[good]
     return matched[:0]
 
@@ -203,19 +198,6 @@ def _joined(
     )
 
 
-@dataclass(frozen=True)
-class CameraSettings:
-    """How the cameras in 3D are solved."""
-
-    tracks: TrackSettings = field(default_factory=TrackSettings)
-    adjustment: AdjustmentSettings = field(default_factory=AdjustmentSettings)
-    rejected_px: tuple[float, ...] = (
-        8.0,
-        3.0,
-    )  # observations farther off are dropped, round by round
-    least_sigma_m: float = 0.02  # of a fix
-
-
 @dataclass(frozen=True, eq=False)
 class Cameras3D:
     """The views where they stand in 3D (those that tracks hold), and the points that they see.
@@ -246,28 +228,25 @@ class Cameras3D:
 def solve_cameras(
     views: Sequence[View],
     gray: Callable[[int], ImageGray],
-    settings: CameraSettings = CameraSettings(),
 ) -> Cameras3D:
     """The cameras of a flight in 3D. Raises InputError where photos share too little for it."""
-    tracks = find_tracks(views, gray, settings.tracks)
-    held = np.bincount(tracks.view, minlength=len(views)) >= settings.tracks.least_inliers
+    tracks = find_tracks(views, gray)
+    held = np.bincount(tracks.view, minlength=len(views)) >= _LEAST_INLIERS
     if held.sum() < 3:
         raise InputError(
             f"only {int(held.sum())} of {len(views)} photos share enough points for heights, 3 were needed; "
             "fly with at least 70 % overlap along and 60 % across the strips"
         )
     # the attitudes lean alike on a slope: N of them know no more of its tilt than one
-    alike_deg = settings.adjustment.attitude_sigma_deg * float(np.sqrt(len(views)))
-    settings = replace(
-        settings, adjustment=replace(settings.adjustment, attitude_sigma_deg=alike_deg)
-    )
-    priors = _priors(views, settings)
+    alike_deg = AdjustmentSettings().attitude_sigma_deg * float(np.sqrt(len(views)))
+    settings = AdjustmentSettings(attitude_sigma_deg=alike_deg)
+    priors = _priors(views)
     scene = _first(views, tracks)
-    for limit_px in (*settings.rejected_px, None):
-        scene = adjust(scene, priors, settings.adjustment)
+    for limit_px in (*_REJECTED_PX, None):
+        scene = adjust(scene, priors, settings)
         if limit_px is not None:
             scene = scene.keeping(_fitting(scene, limit_px))
-            priors = _reweighed(scene, priors, settings)
+            priors = _reweighed(scene, priors)
     return _solved(views, scene, priors, held, settings)
 
 
@@ -297,7 +276,7 @@ def _fitting(scene: Scene, limit_px: float) -> Mask:
         return np.asarray(np.linalg.norm(scene.residuals_px(), axis=1) < limit_px)
 
 
-def _priors(views: Sequence[View], settings: CameraSettings) -> Priors:
+def _priors(views: Sequence[View]) -> Priors:
     """Fixes weighed by how they scatter about the map's cameras; the map's own height is kept in the mean."""
     fixes = np.array([each.fix_m for each in views])
     centres = np.array([each.site_from_camera.translation_m for each in views])
@@ -306,10 +285,10 @@ def _priors(views: Sequence[View], settings: CameraSettings) -> Priors:
     if not np.isfinite(miss).any():
         return Priors(centres, np.full_like(centres, 0.5), rotations)
     middle = np.nanmedian(miss, axis=0)
-    return Priors(fixes + middle, _sigmas_m(miss - middle, len(fixes), 1.0, settings), rotations)
+    return Priors(fixes + middle, _sigmas_m(miss - middle, len(fixes), 1.0), rotations)
 
 
-def _reweighed(scene: Scene, priors: Priors, settings: CameraSettings) -> Priors:
+def _reweighed(scene: Scene, priors: Priors) -> Priors:
     """The fixes weighed by how they scatter about the cameras in space, what these may lean or stretch left out.
 
     The map's own cameras, which `_priors` begins with, are off in height where the ground is not level.
@@ -322,18 +301,18 @@ def _reweighed(scene: Scene, priors: Priors, settings: CameraSettings) -> Priors
     terms[:, :2] -= terms[:, :2].mean(axis=0)
     left = miss[known] - terms @ np.linalg.lstsq(terms, miss[known], rcond=None)[0]
     freedom = len(left) / (len(left) - 3)
-    return replace(priors, sigmas_m=_sigmas_m(left, len(miss), freedom, settings))
+    return replace(priors, sigmas_m=_sigmas_m(left, len(miss), freedom))
 
 
-def _sigmas_m(scatter_m: Floats, count: int, freedom: float, settings: CameraSettings) -> Floats:
+def _sigmas_m(scatter_m: Floats, count: int, freedom: float) -> Floats:
     """(count, 3) the sigma of each fix from how known ones scatter, (N, 3), by its median; `freedom` is N over what is
     left of it."""
     spread = SIGMA_PER_MEDIAN_DEVIATION * np.nanmedian(np.abs(scatter_m), axis=0) * np.sqrt(freedom)
-    return np.asarray(np.broadcast_to(np.maximum(spread, settings.least_sigma_m), (count, 3)))
+    return np.asarray(np.broadcast_to(np.maximum(spread, _LEAST_SIGMA_M), (count, 3)))
 
 
 def _solved(
-    views: Sequence[View], scene: Scene, priors: Priors, held: Mask, settings: CameraSettings
+    views: Sequence[View], scene: Scene, priors: Priors, held: Mask, settings: AdjustmentSettings
 ) -> Cameras3D:
     scale = float(np.exp(scene.shared[0]))
     moved = tuple(
@@ -357,7 +336,7 @@ def _solved(
     # The pictures weighed as they fit (their residuals' median), which is better than the
     # settings assume.
     fit_px = SIGMA_PER_MEDIAN_DEVIATION * float(np.nanmedian(np.abs(residual)))
-    weighed = replace(settings.adjustment, sigma_px=max(fit_px, LEAST_SIGMA_PX))
+    weighed = replace(settings, sigma_px=max(fit_px, LEAST_SIGMA_PX))
     sigma = SmoothSigma.fitted(scene.points_m[:, :2], height_deviations(scene, priors, weighed))
     return Cameras3D(
         moved,

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from sorvolo.geometry.arrays import Floats, Floats32, ImageRGBA, Mask
-from sorvolo.heights.cameras import Cameras3D, TrackSettings
+from sorvolo.heights.cameras import FEATURES_SIDE_PX, Cameras3D
 from sorvolo.heights.field import HeightField
 from sorvolo.heights.surface import Surface
 
@@ -97,7 +97,7 @@ _WARN_MOST_HOLES = 0.1  # share of the ground that two photos see
 _WARN_BAD_FIT_PX = (
     0.45  # rms, of pictures no larger than `fit_side_px`: level and hilly flights have 0.1 to 0.3
 )
-_WARN_FIT_SIDE_PX = TrackSettings.side_px  # larger ones are matched at this size
+_WARN_FIT_SIDE_PX = FEATURES_SIDE_PX  # larger ones are matched at this size
 
 
 def camera_figures(solved: Cameras3D) -> Mapping[str, Any]:

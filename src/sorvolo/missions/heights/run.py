@@ -2,9 +2,8 @@
 
 import json
 import time
-from collections import OrderedDict
 from collections.abc import Generator, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +12,8 @@ import numpy as np
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import Floats32, ImageGray, ImageRGB, ImageRGBA
 from sorvolo.geometry.grid import SiteGrid, TileIndex
-from sorvolo.heights.cameras import Cameras3D, CameraSettings, solve_cameras
+from sorvolo.heights.cameras import Cameras3D, solve_cameras
 from sorvolo.heights.figures import (
-    OwnPointSettings,
     camera_figures,
     camera_warnings,
     judged_by_points,
@@ -26,7 +24,7 @@ from sorvolo.heights.figures import (
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.orthophoto import Part, paint_orthophoto
 from sorvolo.heights.surface import Surface, SurfaceSettings, sweep_surface
-from sorvolo.heights.terrain import TerrainSettings, terrain
+from sorvolo.heights.terrain import terrain
 from sorvolo.heights.views import View, fix_from_residual, ground_outlines_m, pixels_wide
 from sorvolo.missions.flight.headline import contradicts_itself
 from sorvolo.missions.flight.report import peak_memory_mb
@@ -163,39 +161,15 @@ class SmallPictures:
         sizes_m: Sequence[float],
     ) -> None:
         self._pictures, self._views, self._sizes_m = pictures, views, sizes_m
-        self._bytes = 0
-        self._kept: OrderedDict[int, dict[int, ImageGray]] = OrderedDict()
+        self._kept = BytesCache[int, dict[int, ImageGray]](
+            _SMALL_BYTES, lambda sizes: sum(each.nbytes for each in sizes.values())
+        )
 
     def gray(self, number: int, size_m: float) -> ImageGray:
         """View `number`'s picture, its pixels covering `size_m`, one of the sizes."""
-        if number not in self._kept:
-            widths = sorted({pixels_wide(self._views[number], each) for each in self._sizes_m})
-            self._kept[number] = self._pictures.grays(number, widths)
-            self._bytes += _bytes(self._kept[number])
-            while self._bytes > _SMALL_BYTES and len(self._kept) > 1:
-                self._bytes -= _bytes(self._kept.popitem(last=False)[1])
-        self._kept.move_to_end(number)
-        return self._kept[number][pixels_wide(self._views[number], size_m)]
-
-
-def _bytes(pictures: dict[int, ImageGray]) -> int:
-    return sum(each.nbytes for each in pictures.values())
-
-
-@dataclass(frozen=True)
-class HeightSettings:
-    """What a person may choose, and the settings of the stages."""
-
-    cell_m: float | None = None  # of the height model; None: by the photos' pixels
-    has_orthophoto: bool = True
-    cameras: CameraSettings = field(default_factory=CameraSettings)
-    surface: SurfaceSettings = field(default_factory=SurfaceSettings)
-    own_points: OwnPointSettings = field(default_factory=OwnPointSettings)
-    terrain: TerrainSettings = field(default_factory=TerrainSettings)
-
-    def __post_init__(self) -> None:
-        if self.cell_m is not None and not 0.001 <= self.cell_m <= 100:
-            raise SettingsError(f"--cell {self.cell_m}: give metres, 0.001 to 100")
+        widths = {pixels_wide(self._views[number], each) for each in self._sizes_m}
+        sizes = self._kept.get(number, lambda: self._pictures.grays(number, sorted(widths)))
+        return sizes[pixels_wide(self._views[number], size_m)]
 
 
 @dataclass(frozen=True)
@@ -222,16 +196,19 @@ class GroundModel:
 
 def make_heights(
     site: AnyPath,
-    settings: HeightSettings = HeightSettings(),
+    cell_m: float | None = None,
     *,
     flight: str | None = None,
     catalogues: Catalogues | None = None,
 ) -> Generator[HeightsUpdate]:
     """Make the heights of one mapped flight (None: the newest) as files in its folder, yielding progress.
 
-    `catalogues` has the site's; None: that of the environment. Raises InputError for a flight that has no heights to
-    give (no GPS, too few photos that overlap), StoreError for a folder that is no site.
+    `cell_m` is the side of the height model's cells (None: by the photos' pixels), `catalogues` has the site's (None:
+    that of the environment). Raises InputError for a flight that has no heights to give (no GPS, too few photos that
+    overlap), StoreError for a folder that is no site, SettingsError for impossible cells.
     """
+    if cell_m is not None and not 0.001 <= cell_m <= 100:
+        raise SettingsError(f"--cell {cell_m}: give metres, 0.001 to 100")
     site = Path(site)
     Archive.open(
         site, write=False, catalogues=catalogues
@@ -243,16 +220,15 @@ def make_heights(
         ]
         started_s = time.monotonic()
         views = flight_views(archive, flight_id, keyframes)
-        model = yield from model_ground(archive, views, keyframes, settings)
+        model = yield from model_ground(archive, views, keyframes, cell_m)
         folder = archive.flight_folder(flight_id)
         with archive.replacing(*(f"flights/{flight_id}/{file}" for file in HeightFile)):
-            if settings.has_orthophoto:
-                with scratch_folder(folder) as scratch:
-                    tiles = TileFolder(scratch)
-                    for index, rgba, share in ground_tiles(model, archive.site_grid()):
-                        tiles.save(index, rgba)
-                        yield HeightsUpdate(flight_id, "orthophoto", share)
-                    write_cog(tiles, archive.site_grid(), folder / HeightFile.ORTHOPHOTO)
+            with scratch_folder(folder) as scratch:
+                tiles = TileFolder(scratch)
+                for index, rgba, share in ground_tiles(model, archive.site_grid()):
+                    tiles.save(index, rgba)
+                    yield HeightsUpdate(flight_id, "orthophoto", share)
+                write_cog(tiles, archive.site_grid(), folder / HeightFile.ORTHOPHOTO)
             write_heights(
                 archive,
                 model,
@@ -269,7 +245,7 @@ def model_ground(
     archive: Archive,
     views: Sequence[View],
     keyframes: Sequence[StoredKeyframe],
-    settings: HeightSettings = HeightSettings(),
+    cell_m: float | None = None,
 ) -> Generator[HeightsUpdate, None, GroundModel]:
     """The ground that views, each of one keyframe, see in space, yielding progress.
 
@@ -277,17 +253,17 @@ def model_ground(
     """
     flight_id, site = keyframes[0].flight_id, archive.site()
     started_s = time.monotonic()
-    _lattice(site, views, settings)  # too many cells end here, before minutes of work
+    _lattice(site, views, cell_m)  # too many cells end here, before minutes of work
     yield HeightsUpdate(flight_id, "cameras", 0.0)
-    solved = solve_cameras(views, FlightPictures(archive, keyframes).gray, settings.cameras)
+    solved = solve_cameras(views, FlightPictures(archive, keyframes).gray)
     kept = [each for each in keyframes if each.name not in set(solved.lost)]
     pictures = FlightPictures(archive, kept, solved.radial)
     cameras_s = time.monotonic() - started_s
     give_back()
-    swept = yield from _sweep(site, solved, pictures, settings, flight_id)
-    surface, judgement = judged_by_points(swept, solved, settings.own_points)
+    swept = yield from _sweep(site, solved, pictures, cell_m, flight_id)
+    surface, judgement = judged_by_points(swept, solved)
     yield HeightsUpdate(flight_id, "ground", 0.0)
-    bare_m, shows_ground = terrain(surface.lattice, surface.up_m, settings.terrain)
+    bare_m, shows_ground = terrain(surface.lattice, surface.up_m)
     give_back()
     return GroundModel(
         solved,
@@ -333,15 +309,15 @@ def _sweep(
     site: Site,
     solved: Cameras3D,
     pictures: FlightPictures,
-    settings: HeightSettings,
+    cell_m: float | None,
     flight_id: str,
 ) -> Generator[HeightsUpdate, None, Surface]:
     low_m = min(0.0, float(np.percentile(solved.points_m[:, 2], 0.5)))  # low ground is seen farther
-    lattice = _lattice(site, solved.views, settings, low_m)
+    lattice = _lattice(site, solved.views, cell_m, low_m)
 
-    small = SmallPictures(pictures, solved.views, settings.surface.sizes_m(lattice.cell_m))
+    small = SmallPictures(pictures, solved.views, SurfaceSettings().sizes_m(lattice.cell_m))
     for each in sweep_surface(
-        lattice, solved.views, small.gray, solved.points_m, solved.height_sigma, settings.surface
+        lattice, solved.views, small.gray, solved.points_m, solved.height_sigma
     ):
         if isinstance(each, Surface):
             return each
@@ -350,14 +326,14 @@ def _sweep(
 
 
 def _lattice(
-    site: Site, views: Sequence[View], settings: HeightSettings, low_m: float = 0.0
+    site: Site, views: Sequence[View], cell_m: float | None, low_m: float = 0.0
 ) -> Lattice:
     """The cells over the ground, `low_m` at its lowest, that the views show.
 
     Raises GeometryError for more of them than can be handled.
     """
     outlines_m = ground_outlines_m(views)
-    cell_m = settings.cell_m or Lattice.cell_for(outlines_m, site.m_per_px)
+    cell_m = cell_m or Lattice.cell_for(outlines_m, site.m_per_px)
     outlines_m = np.concatenate([outlines_m, ground_outlines_m(views, low_m)])
     return Lattice.over(outlines_m, height_grid(site, cell_m))
 
