@@ -46,6 +46,10 @@ RULES: dict[str, dict[str, Any]] = {
         "evidence:_is_passing": _no,
         "evidence:_passing_cells": lambda _, own: np.zeros_like(own),
     },
+    "movers take views back": {
+        "announcing:Tally.less": lambda tally, _: tally,
+        "evidence:EvidenceMap._named": lambda evidence, _: (evidence._next_number(), None),
+    },
     "rigid blobs": {"motion:is_rigid": _no},
     "floating blobs": {"motion:floats": _no},
     "what may move must stand": {"evidence:EvidenceMap._stands": lambda *_: True},

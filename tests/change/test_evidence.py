@@ -99,6 +99,7 @@ def candidate(number: int, shown: int, missed: int) -> Candidate:
             np.ones((5, 5), bool),
             np.full((5, 5), 230, np.uint8),
             *(np.zeros((5, 5), bool),) * 2,
+            np.zeros((5, 5), np.int32),
         )
         view = KeptView(
             START_NS + each,

@@ -112,6 +112,22 @@ def test_a_walker_seen_now_with_the_shadow_and_now_without_is_one():
     assert len(announced) == len(final) == 1 and final[0].kind == ChangeKind.MOVING
 
 
+def test_a_walker_in_a_long_shadow_is_one_event_though_the_shadow_seems_to_stay():
+    walks = [
+        Thing(2, 1, (0.5, 0.5), velocity_m_s=(0.6, 0)),
+        Thing(
+            0.25, 1, (3, 0.4), colour=(50, 50, 55), velocity_m_s=(0.6, 0)
+        ),  # low sun, along the way
+    ]
+    announced, final = events(flight(walks, seconds=6, speed_m_s=1.5, start_m=(-3, 0)))
+    assert [each.kind for each in final] == [ChangeKind.MOVING]
+    assert (
+        len(announced) == 1
+        and final[0].id == announced[0].id
+        and final[0].announced_ns == announced[0].announced_ns
+    )
+
+
 def test_a_mover_seen_again_for_one_view_stays_where_it_was_seen_to_move():
     walks, last = Thing(-3, -2, (0.5, 0.5), velocity_m_s=(0.9, 0.3)), 20
     shown = {*range(last), 45}

@@ -106,8 +106,8 @@ def test_rasters_move_between_windows_without_loss():
 
 def laid_of(flags, seen, window):
     nothing = np.zeros_like(flags)
-    score = np.full(flags.shape, 200, np.uint8)
-    return LaidView(window, flags & seen, seen, score, nothing, nothing)
+    score, legs = np.full(flags.shape, 200, np.uint8), np.zeros(flags.shape, np.int32)
+    return LaidView(window, flags & seen, seen, score, nothing, nothing, legs)
 
 
 def test_a_piece_that_only_its_shadow_leaves_is_whole():
@@ -168,6 +168,7 @@ def test_an_oblique_view_sees_no_ground_behind_its_horizon():
         0.15,
         np.zeros(0, bool),
         np.zeros(0, bool),
+        np.zeros(0, int),
     )
     assert max(laid.window.shape) <= 2 * 5 * CAMERA_HEIGHT_M / 0.15 + 2
     rows = np.nonzero(laid.seen.any(axis=1))[0]

@@ -1,5 +1,6 @@
 """When a change is announced: what the views reported of a candidate, and the one function that decides on it."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -14,6 +15,7 @@ class Objection(StrEnum):
     TOO_FEW_VIEWS = "too few views show it"
     UNSURE = "its score is too low"
     LARGE_AND_UNSURE = "it is large and its score is low, like a wall that leans"
+    MOVES = "most views that show it show something that moves"
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,7 @@ class Tally:
     camera_low_m: tuple[float, float, float] = (np.inf, np.inf, np.inf)
     camera_high_m: tuple[float, float, float] = (-np.inf, -np.inf, -np.inf)
     restless: float = 0.0  # false-alarm rate nearby
+    moved: int = 0  # views that were taken out, since what moves shows in them
     look: Look | None = None
 
     def with_view(self, time_ns: int, score: float, residual_m: float, camera_m: Floats) -> "Tally":
@@ -91,6 +94,25 @@ class Tally:
             last_seen_ns=max(self.last_seen_ns, time_ns),
             camera_low_m=_three(np.minimum(self.camera_low_m, camera_m)),
             camera_high_m=_three(np.maximum(self.camera_high_m, camera_m)),
+        )
+
+    def less(self, others: Iterable["Tally"]) -> "Tally":
+        """Without the views that others hold, which are a part of these."""
+        taken = list(others)
+        if not taken:
+            return self
+        views, whole = (sum(getattr(each, name) for each in taken) for name in ("views", "whole"))
+        left = max(self.views - views, 0)
+        return replace(
+            self,
+            views=left,
+            asked=max(self.asked - views, left),
+            whole=min(max(self.whole - whole, 0), left),
+            score_sum=max(self.score_sum - sum(each.score_sum for each in taken), 0.0),
+            residual_m_sum=max(
+                self.residual_m_sum - sum(each.residual_m_sum for each in taken), 0.0
+            ),
+            moved=self.views - left,
         )
 
     def without_view(self, times: int = 1) -> "Tally":
@@ -158,7 +180,7 @@ def _objection(tally: Tally) -> Objection | None:
     """The first rule that a candidate fails."""
     score, look = sureness(tally), tally.look
     if score < LEAST_SCORE:
-        return Objection.UNSURE
+        return Objection.MOVES if tally.moved > tally.views else Objection.UNSURE
     if look is None or score >= _LARGE_SCORE or tally.is_from_one_place():
         return None
     # a wall that leans is large; snow is longer than the flying height

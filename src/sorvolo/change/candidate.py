@@ -263,6 +263,7 @@ _SEEN = 0.5  # a view that sees less is not asked
 _ALL_SEEN = 0.99  # a view that sees more knows its place
 _MOST_PLACES = 64  # of views, for the spread of its place
 _MOST_CAMERAS = 256  # of views that show it; of more every second one is kept
+_MOST_LEGS = 64  # of followed blobs that showed it; the oldest are forgotten
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,8 +294,15 @@ class Candidate:
         self.tally = Tally(first_seen_ns, first_seen_ns)
         self._places: list[Floats] = []
         self._cameras: list[Floats] = []
+        self._shown_by: dict[
+            int, Tally
+        ] = {}  # the views in which a followed blob showed it, by its leg
         self._kind: ChangeKind | None = None
         self._kind_outline: PointsM | None = None
+
+    def shown_by(self, which: Callable[[int], bool]) -> list[Tally]:
+        """The views in which blobs showed it that were followed, on `which` legs: one tally for each of these."""
+        return [each for leg, each in self._shown_by.items() if which(leg)]
 
     @property
     def cameras_m(self) -> PointsM:
@@ -313,7 +321,7 @@ class Candidate:
         if report.flagged < _SHOWS * report.seen:
             self.miss()
             return
-        self._count(view, report, residual_m=0.0, knows_place=True)
+        self._count(view, report, cells, residual_m=0.0, knows_place=True)
         self.pictures.vote(view.site_from_image, view.changed, view.valid)
 
     def see(self, view: KeptView, cells: Mask, cell_m: float) -> bool:
@@ -326,17 +334,23 @@ class Candidate:
         if report.flagged < _SHOWS * report.seen:
             self.miss()
             return False
-        self._count(view, report, view.residual_m, knows_place=report.seen > _ALL_SEEN)
-        self._note_rim(view, cells)
+        leg = self._count(view, report, cells, view.residual_m, knows_place=report.seen > _ALL_SEEN)
+        self._note_rim(view, cells, leg)
         return True
 
     def ask(self, view: KeptView, cells: Mask, cell_m: float) -> bool:
         """Count this view as for a seed: whatever shows some of it shows it; and its mask. Whether it does."""
         report = view.laid.report(self.cells, cells, cell_m)
         if report.flagged >= max(_SHOWS * report.seen, 1e-9):
-            self._count(view, report, view.residual_m, knows_place=report.seen > _ALL_SEEN)
+            leg = self._count(
+                view,
+                report,
+                cells,
+                view.residual_m,
+                knows_place=report.seen > _ALL_SEEN,
+            )
             self.pictures.vote(view.site_from_image, view.changed, view.valid)
-            self._note_rim(view, cells)
+            self._note_rim(view, cells, leg)
             return True
         if report.seen >= _SEEN:
             self.miss()
@@ -349,6 +363,7 @@ class Candidate:
     def recount(self, views: int, asked: int) -> None:
         """Count anew what views reported: `views` of `asked` flagged what is left of it."""
         self.tally = self.tally.recounted(views, asked)
+        self._shown_by.clear()
 
     def note_restlessness(self, restless: float) -> None:
         """The share of the views of the ground around that flag it for nothing, as measured last."""
@@ -405,21 +420,33 @@ class Candidate:
         self,
         view: KeptView,
         report: CellReport,
+        cells: Mask,
         residual_m: float,
         *,
         knows_place: bool,
-    ) -> None:
-        """Count a view that shows it."""
-        self.tally = self.tally.with_view(view.time_ns, report.score, residual_m, view.camera_m)
+    ) -> int:
+        """Count a view that shows it; the leg of the followed blob that shows it there, 0 for none."""
+        seen = view.time_ns, report.score, residual_m, view.camera_m
+        self.tally = self.tally.with_view(*seen)
+        leg = view.laid.leg_of(self.cells, cells)
+        if leg:
+            known = self._shown_by.get(leg, Tally(view.time_ns, view.time_ns))
+            self._shown_by[leg] = known.with_view(*seen)
+            if len(self._shown_by) > _MOST_LEGS:
+                del self._shown_by[next(iter(self._shown_by))]
         self._cameras.append(view.camera_m)
         if len(self._cameras) > _MOST_CAMERAS:
             del self._cameras[1::2]
         if knows_place and len(self._places) < _MOST_PLACES:
             self._places.append(report.place_m)
+        return leg
 
-    def _note_rim(self, view: KeptView, cells: Mask) -> None:
-        if not view.laid.part_of(view.laid.cut_off, self.cells, cells).any():
-            self.tally = replace(self.tally, whole=self.tally.whole + 1)
+    def _note_rim(self, view: KeptView, cells: Mask, leg: int) -> None:
+        if view.laid.part_of(view.laid.cut_off, self.cells, cells).any():
+            return
+        self.tally = replace(self.tally, whole=self.tally.whole + 1)
+        if leg in self._shown_by:
+            self._shown_by[leg] = replace(self._shown_by[leg], whole=self._shown_by[leg].whole + 1)
 
 
 _MOST_SEEDS = 256  # uncertain candidates that are kept in any case ...

@@ -17,6 +17,7 @@ from sorvolo.change.announcing import (
     Announce,
     Look,
     Objection,
+    Tally,
     Verdict,
     judge,
     sureness,
@@ -149,7 +150,7 @@ class EvidenceMap:
             view, kept_view, evidence.owner, new, most_pictures - len(begun)
         )
         announced = [change for each in shown for change in self._announce(each, view.time_ns)]
-        announced += self._movers.see(view, moving, self._next_number)
+        announced += self._movers.see(view, moving, self._named)
         self._seeds.keep(view, kept_view, evidence, most_pictures - len(begun) - pictures)
         return tuple(announced)
 
@@ -232,7 +233,8 @@ class EvidenceMap:
         )
         nothing = np.zeros(len(view.boxes), bool)
         moving, held = (followed.is_moving, followed.may_move) if may_follow else (nothing, nothing)
-        laid = lay(view, self._cell_m, moving, held)
+        legs = followed.legs if may_follow else np.zeros(len(view.boxes), np.int64)
+        laid = lay(view, self._cell_m, moving, held, legs)
         residual_m = view.residual_px * view.m_per_px if np.isfinite(view.residual_px) else 0.0
         kept_view = KeptView(
             view.time_ns,
@@ -472,9 +474,9 @@ class EvidenceMap:
 
     def _judged(self, candidate: Candidate, *, is_over: bool) -> tuple[Verdict, Change | None]:
         """Whether a candidate is a change, and its record if its views alone make it one."""
-        is_worth_it = views_score(candidate.tally) >= LEAST_SCORE
+        is_worth_it = views_score(self._tally_of(candidate)) >= LEAST_SCORE
         candidate.note_restlessness(self._restlessness(candidate) if is_worth_it else 0.0)
-        tally = candidate.tally
+        tally = self._tally_of(candidate)
         verdict = judge(tally, is_over=is_over)
         whole = self._record(candidate) if isinstance(verdict, Announce) else None
         if whole is None:
@@ -520,7 +522,7 @@ class EvidenceMap:
         own &= evidence.owner == candidate.number
         if own.any() and np.median(evidence.seen[own]) > 1:
             return thing
-        once = replace(candidate.tally.recounted(1, 1), whole=1)
+        once = replace(self._tally_of(candidate).recounted(1, 1), whole=1)
         return replace(thing, views=1, score=sureness(once))
 
     def _record(self, candidate: Candidate) -> Change | None:
@@ -535,7 +537,25 @@ class EvidenceMap:
         )
 
     def _score(self, candidate: Candidate) -> float:
-        return sureness(candidate.tally)
+        return sureness(self._tally_of(candidate))
+
+    def _tally_of(self, candidate: Candidate) -> Tally:
+        """What the views reported of a candidate, less those in which something shows it that moves: where that was
+        before it was seen to move, nothing stands."""
+        return candidate.tally.less(candidate.shown_by(self._movers.knows))
+
+    def _named(self, leg: int) -> tuple[int, int | None]:
+        """The number of the change that a blob becomes which was seen to move, and when that was announced: those of a
+        change that it was taken for while it was not known to move, else a new one and None."""
+        for number, announced_ns in self._announced_ns.items():
+            candidate, parts = self._found[number], self._parts.get(number)
+            shown = sum(each.views for each in candidate.shown_by(lambda each: each == leg))
+            if 2 * shown > candidate.tally.views and (parts is None or len(parts.things) < 2):
+                self._grid.own(candidate.cells, self._cells_of(candidate), 0)
+                del self._found[number], self._announced_ns[number]
+                self._parts.pop(number, None)
+                return number, announced_ns
+        return self._next_number(), None
 
     def _cells_of(self, candidate: Candidate) -> Mask:
         return self._grid.read(candidate.cells).owner == candidate.number

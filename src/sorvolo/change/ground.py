@@ -17,6 +17,7 @@ from sorvolo.geometry.arrays import (
     Floats32,
     ImageGray,
     Ints32,
+    Labels,
     Mask,
     Matrix3,
     PointsM,
@@ -133,7 +134,8 @@ class LaidView:
     """One view as cells of a window: `flagged` where it shows a change, `seen` where it knows the ground.
 
     `score` is 255 times the sureness of the change there; `held` marks cells under things that may move. `shaded` is
-    where one date is no brighter than the other, all colours alike: where a shadow may lie.
+    where one date is no brighter than the other, all colours alike: where a shadow may lie. `legs` has the leg of
+    the followed blob that shows the change there, 0 where none does.
     """
 
     window: CellWindow
@@ -142,6 +144,7 @@ class LaidView:
     score: ImageGray
     held: Mask
     shaded: Mask
+    legs: Ints32
 
     @cached_property
     def at_rim(self) -> Mask:
@@ -172,6 +175,11 @@ class LaidView:
         found = np.unique(self._labels[reach & self.flagged])
         return np.isin(self._labels, found) if len(found) else np.zeros_like(self.flagged)
 
+    def leg_of(self, window: CellWindow, cells: Mask) -> int:
+        """The leg of the followed blob that shows most of what is flagged of some `cells` of a window; or 0."""
+        legs = self.legs[window.within(self.window)][self.part_of(self.flagged, window, cells)]
+        return int(np.bincount(legs).argmax()) if len(legs) else 0
+
     def report(self, window: CellWindow, cells: Mask, cell_m: float) -> "CellReport":
         """What the view reports of some `cells` of a window."""
         inner = window.overlap(self.window)
@@ -196,11 +204,12 @@ class LaidView:
         return marked[window.within(self.window)] & cells[self.window.within(window)]
 
 
-def lay(view: ComparedView, cell_m: float, ignored: Mask, held: Mask) -> LaidView:
+def lay(view: ComparedView, cell_m: float, ignored: Mask, held: Mask, legs: Labels) -> LaidView:
     """The view as cells of the ground.
 
     `ignored` and `held`, (number of boxes,), choose boxes: what lies in ignored ones is taken for unknown ground.
-    A cell is flagged where most of it is changed, and seen where the map and the frame know all of it.
+    `legs`, (number of boxes,), are those of the blobs followed in them, 0 for none. A cell is flagged where
+    most of it is changed, and seen where the map and the frame know all of it.
     """
     height, width = view.changed.shape
     m_per_px = view.m_per_px
@@ -215,11 +224,13 @@ def lay(view: ComparedView, cell_m: float, ignored: Mask, held: Mask) -> LaidVie
 
     changed = small(view.changed)
     valid = small(view.valid.view(np.uint8) * np.uint8(255))
-    score, in_held = (np.zeros((rows, columns), np.uint8) for _ in range(2))
+    score, in_held, followed = (np.zeros((rows, columns), np.uint8) for _ in range(3))
+    numbers = np.unique(np.append(legs, 0))[:256]
     for index in np.argsort(view.scores, kind="stable"):
         x, y, w, h = view.boxes[index]
         part = np.s_[y // shrink : -(-(y + h) // shrink), x // shrink : -(-(x + w) // shrink)]
         score[part] = round(255 * float(np.clip(view.scores[index], 0, 1)))
+        followed[part] = np.searchsorted(numbers, legs[index]) % len(numbers)
         if ignored[index]:
             valid = valid if valid.flags.writeable else valid.copy()
             valid[part][changed[part] > 0] = 0
@@ -247,6 +258,7 @@ def lay(view: ComparedView, cell_m: float, ignored: Mask, held: Mask) -> LaidVie
         np.where(flagged, laid(score, cv2.INTER_NEAREST), 0),
         may_move,
         laid(in_shade, cv2.INTER_NEAREST) > 0,
+        numbers[laid(followed, cv2.INTER_NEAREST)].astype(np.int32),
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from sorvolo.change.blobs import Blob, blobs_of, standing_outline_m
 from sorvolo.change.outlines import aside_of, measures, place_sigma_m
 from sorvolo.change.patches import PatchWindow, cut, patch_of
-from sorvolo.geometry.arrays import Floats, Mask
+from sorvolo.geometry.arrays import Floats, Labels, Mask
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView
 from sorvolo.survey.objects import Sighting
 from sorvolo.tracking.tracker import Tracker, TrackerSettings
@@ -170,6 +170,7 @@ _POINTS = 12  # of a track are judged, the last ones
 class BlobTrack:
     """One blob over time, by its number: its first point, the last few, how many, and the sum of their scores.
 
+    `leg` numbers how often anything came into view: this track and others.
     `moves` as soon as it was once seen to, `moves_now` on this leg.
     """
 
@@ -178,6 +179,7 @@ class BlobTrack:
     points: tuple[TrackPoint, ...]
     count: int
     score_sum: float
+    leg: int = 0
     moves: bool = False
     moves_now: bool = False
 
@@ -211,6 +213,7 @@ class BlobTrack:
             last.points,
             first.count + last.count,
             first.score_sum + last.score_sum,
+            last.leg,
             self.moves or gone.moves,
             last.moves_now,
         )
@@ -219,12 +222,13 @@ class BlobTrack:
 @dataclass(frozen=True, eq=False)
 class MovingBlobs:
     """What moves in one view. For each box of the view: whether it shows something that moves, and whether
-    it may (so that nobody should call it a change of the ground yet), `movers`
+    it may (so that nobody should call it a change of the ground yet), and the leg of its track, 0 for none. `movers`
     are the tracks that moved in this view, `merged` numbers that turned out to be an earlier track's, with that one's.
     """
 
     is_moving: Mask
     may_move: Mask
+    legs: Labels
     movers: tuple[BlobTrack, ...]
     merged: Mapping[int, int]
 
@@ -235,6 +239,7 @@ class BlobTracker:
     def __init__(self) -> None:
         self._tracker = Tracker(_TRACKER)
         self._tracks: dict[int, BlobTrack] = {}
+        self._legs = 0
         self._times_ns: deque[int] = deque(maxlen=_FORGET_VIEWS + 1)  # of the last views
 
     def follow(self, view: ComparedView) -> MovingBlobs:
@@ -259,6 +264,7 @@ class BlobTracker:
                     replace(younger, number=kept) if older is None else older.joined(younger)
                 )
         is_moving, held = np.zeros(len(view.boxes), bool), np.zeros(len(view.boxes), bool)
+        legs = np.zeros(len(view.boxes), np.int64)
         shown: dict[int, BlobTrack] = {}
         for blob, number in zip(blobs, update.track_ids):
             if number not in shown:  # else it is a part of a surer blob
@@ -266,21 +272,28 @@ class BlobTracker:
                     number, TrackPoint(now_ns, blob, camera_m), oldest_ns
                 )
             track = shown[number]
+            legs[blob.box] = track.leg
             held[blob.box] = may_move(track.points)
             is_moving[blob.box] = track.moves and held[blob.box]
         self._tracks.update(shown)
         self._forget(oldest_ns)
         movers = tuple(each for each in shown.values() if each.moves_now)
-        return MovingBlobs(is_moving, held, movers, update.merged)
+        return MovingBlobs(is_moving, held, legs, movers, update.merged)
 
     def _prolonged(self, number: int, point: TrackPoint, oldest_ns: int) -> BlobTrack:
         """The track with one more point, judged anew."""
         known = self._tracks.get(number)
         if known is None:
-            return BlobTrack(number, point, (point,), 1, point.blob.score)
+            return BlobTrack(number, point, (point,), 1, point.blob.score, self._next_leg())
         track = known.with_point(point, oldest_ns)
+        if len(track.points) == 1:
+            return replace(track, leg=self._next_leg())
         moves_now = track.moves_now or self._moves(track.points, self._are_photos(track))
         return replace(track, moves=track.moves or moves_now, moves_now=moves_now)
+
+    def _next_leg(self) -> int:
+        self._legs += 1
+        return self._legs
 
     def _forget(self, oldest_ns: int) -> None:
         """Only movers are remembered for longer: what stands is judged anew when it comes back into view."""
@@ -353,26 +366,40 @@ class Movers:
     def __init__(self, id_prefix: str, m_per_px: float, cell_m: float) -> None:
         self._prefix, self._m_per_px, self._cell_m = id_prefix, m_per_px, cell_m
         self._known: dict[int, Change] = {}  # by the tracker's number
+        self._legs: set[int] = set()
 
     @property
     def changes(self) -> tuple[Change, ...]:
         """All of them as they were seen last."""
         return tuple(self._known.values())
 
+    def knows(self, leg: int) -> bool:
+        """Whether something was seen to move on a leg of its track."""
+        return leg in self._legs
+
     def see(
-        self, view: ComparedView, moving: MovingBlobs, next_number: Callable[[], int]
+        self,
+        view: ComparedView,
+        moving: MovingBlobs,
+        named: Callable[[int], tuple[int, int | None]],
     ) -> list[Change]:
-        """Bring what moves in this view up to date; those announced first, under the `next_number`."""
+        """Bring what moves in this view up to date; those announced first. `named` gives the number of the change that
+        a leg of a track becomes, and when that was announced already; None if it was not."""
         announced = []
         for gone, kept in moving.merged.items():
             twice = self._known.pop(gone, None)
             if twice is not None:
                 self._known.setdefault(kept, twice)
         for track in moving.movers:
+            self._legs.add(track.leg)
             known = self._known.get(track.number)
             if known is None:
-                change = self._change(view, track, f"{self._prefix}-{next_number()}")
-                announced.append(change)
+                number, announced_ns = named(track.leg)
+                change = self._change(view, track, f"{self._prefix}-{number}")
+                if announced_ns is None:
+                    announced.append(change)
+                else:
+                    change = replace(change, announced_ns=announced_ns)
             else:
                 change = self._change(view, track, known.id)
                 change = replace(
