@@ -4,6 +4,7 @@ import os
 import signal
 import socket
 import threading
+import time
 import urllib.request
 from collections.abc import Iterator
 from contextlib import closing
@@ -12,6 +13,7 @@ from typing import Any
 
 import pytest
 import uvicorn
+from fastapi import FastAPI
 from starlette.testclient import TestClient, WebSocketDenialResponse
 from starlette.websockets import WebSocketDisconnect
 from typer.testing import CliRunner
@@ -222,6 +224,35 @@ def test_connections_that_ask_nothing_keep_nobody_out(root: Path) -> None:
             each.close()
         thread.join()
         app.state.station.close()
+
+
+def test_a_long_answer_over_a_slow_link_comes_whole(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is on its way long after the station has written it."""
+    length = 12_000_000
+
+    async def answers(_scope: Any, _receive: Any, send: Any) -> None:
+        head = [(b"content-length", b"%d" % length)]
+        await send({"type": "http.response.start", "status": 200, "headers": head})
+        await send({"type": "http.response.body", "body": bytes(length)})
+
+    config = server_config(FastAPI(), StationSettings(root))
+    monkeypatch.setattr(config.http, "_SILENT_S", 0.1)
+    config = uvicorn.Config(answers, http=config.http, lifespan="off", log_config=None)
+    server, listening = uvicorn.Server(config), socket.create_server(("127.0.0.1", 0))
+    thread = threading.Thread(target=server.run, args=([listening],))
+    thread.start()
+    try:
+        wait_for(lambda: server.started)
+        with urllib.request.urlopen(
+            f"http://127.0.0.1:{listening.getsockname()[1]}", timeout=5
+        ) as got:
+            time.sleep(1.5)
+            assert len(got.read()) == length
+    finally:
+        server.should_exit = True
+        thread.join()
 
 
 @pytest.mark.parametrize(

@@ -468,9 +468,14 @@ class _Connection(H11Protocol):
         if self.cycle is not None and not self.cycle.response_complete:
             self._since_s = self.loop.time()
 
+    def on_response_complete(self) -> None:
+        self._since_s = self.loop.time()
+        super().on_response_complete()
+
     def _is_silent(self) -> bool:
-        """Whether a request is waited for, or more of one; not whether its answer is."""
-        return self.cycle is None or self.cycle.response_complete or self.cycle.more_body
+        """Whether a request is waited for, or more of one; not while its answer is on its way."""
+        waits = self.cycle is None or self.cycle.response_complete or self.cycle.more_body
+        return waits and not self.transport.get_write_buffer_size()
 
     def _look(self) -> None:
         if self not in self.connections:  # closed, or a WebSocket
