@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import pytest
 from fake_flights import SITE, map_flight
 from starlette.testclient import TestClient
 from watch_runs import PICTURE, watch_run
@@ -240,3 +241,29 @@ def test_a_watch_needs_no_site_and_others_see_nothing_of_it(client: TestClient) 
     assert client.get("/api/sites/nothing/collections/findings/items").status_code == 404
     (results / "tracks.geojson").write_text("broken")
     assert client.get("/api/sites/field/collections/findings/items").json()["features"] == []
+
+
+def test_a_vote_on_what_a_watch_found_stays_when_the_flight_is_mapped(
+    client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its finding has another id then; and another watch, listed first, moves nothing."""
+    watch_run(client.app.state.station, "run-1", site="new")
+    wish = {"kind": "object", "id": "run-1:1", "verdict": "confirmed"}
+    assert client.post("/api/sites/new/reviews", json=wish).status_code == 201
+    watch_run(client.app.state.station, "run-2", site="new", place=(11.01, 46.0))
+    assert _confirmed(client, "new") == ["run-1:1"]
+    watch_run(client.app.state.station, "run-3")
+    before = client.post(REVIEWS, json={**wish, "id": "run-3:1"}).json()
+    flown_ns = 1_777_629_600 * 10**9  # 2026-05-01T10:00
+    flown = [("a", 0, flown_ns, flown_ns + 10**12)]
+    monkeypatch.setattr(Archive, "flown", lambda _: flown)
+    client.app.state.station.collections._kept.clear()
+    assert _confirmed(client, "field") == ["run-3:1"]
+    given = client.get(REVIEWS, params={"kind": "object", "id": "run-3:1"}).json()
+    assert len(given) == 1 and given[0]["id"] != before["id"]
+
+
+def _confirmed(client: TestClient, site: str) -> list[str]:
+    items = f"/api/sites/{site}/collections/findings/items?review=confirmed"
+    found = client.get(items).json()["features"]
+    return [each for feature in found for each in feature["properties"]["sightings"]]

@@ -341,15 +341,19 @@ class _Working:
         return self._things[number]
 
     def _id(self, first: MissionSighting) -> str:
-        """By flight, time and place to 0.1 m: the same when the mission is run again, another for another thing."""
-        place = np.round(first.position_m, 1) + 0.0
-        content, attempt = f"{first.date} {first.first_ns} {place[0]:.1f} {place[1]:.1f}", 0
-        while (
-            digest := hashlib.sha256(f"{content} {attempt}".encode()).hexdigest()[:12]
-        ) in self._ids:
+        attempt = 0
+        while (found := id_by(first, attempt)) in self._ids:
             attempt += 1
-        self._ids.add(digest)
-        return digest
+        self._ids.add(found)
+        return found
+
+
+def id_by(first: MissionSighting, attempt: int = 0) -> str:
+    """A finding's id by the flight, time and place (to 0.1 m) of its first sighting: the same when the mission is run
+    again, another for another thing."""
+    place = np.round(first.position_m, 1) + 0.0
+    content = f"{first.date} {first.first_ns} {place[0]:.1f} {place[1]:.1f} {attempt}"
+    return hashlib.sha256(content.encode()).hexdigest()[:12]
 
 
 def _odds(sighting: MissionSighting) -> Mapping[str, float]:

@@ -233,8 +233,7 @@ class SiteCollections:
             if not tracks:
                 raise
             archive = None
-        watches = [(each["id"], each["last_seen"], each["lonlat"]) for each in tracks]
-        content = (archive and _content(archive), watches)
+        content = (archive and _content(archive), tracks)
         with self._lock:
             known = self._kept.get((site_id, name))
         if known is None or known.content != content:

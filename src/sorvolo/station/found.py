@@ -8,7 +8,14 @@ from typing import Any
 import numpy as np
 
 from sorvolo.findings.importance import ordered
-from sorvolo.findings.register import GroundFinding, KnownBy, MissionSighting, Register, associate
+from sorvolo.findings.register import (
+    GroundFinding,
+    KnownBy,
+    MissionSighting,
+    Register,
+    associate,
+    id_by,
+)
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.store.exports.change_files import objects_geojson
 from sorvolo.store.exports.places import place_deg
@@ -103,7 +110,11 @@ def _feature(
     objects: Mapping[str, StoredObject],
     watched: Mapping[str, Track],
 ) -> Feature:
-    """A finding with what the mission states that saw it best: a map, else a watch, else a comparison."""
+    """A finding with what the mission states that saw it best: a map, else a watch, else a comparison.
+
+    Votes are kept under `voted_as`, and found again by `known_as`: another sighting may come to be the first, and a
+    watch's flight be mapped.
+    """
     ids = [each.id for each in reversed(found.sightings)]
     of_map = next((objects[each] for each in ids if each in objects), None)
     of_watch = next((watched[each] for each in ids if each in watched), None)
@@ -118,6 +129,7 @@ def _feature(
         crop = ("finding", of_watch["id"]) if of_watch.get("crop") else None
     longitude_deg, latitude_deg = place_deg(found.position_m, site)
     first, last = utc_text(found.first_ns), utc_text(found.last_ns)
+    begun = found.sightings[0].id
     values = values | {
         "id": found.id,
         "class": found.label,
@@ -131,6 +143,8 @@ def _feature(
         "missions": sorted({each.mission for each in found.sightings}),
         "origins": sorted({each.origin.value for each in found.sightings}),
         "sightings": list(dict.fromkeys(ids)),
+        "voted_as": begun if begun in watched else found.id,
+        "known_as": [id_by(each) for each in found.sightings],
         "first_seen": first,
         "last_seen": last,
         "datetime": first,

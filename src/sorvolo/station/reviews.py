@@ -82,7 +82,7 @@ class Reviews:
         votes: dict[str, list[Review]] = {}
         ids = self._ids(site_id, kind) if kind == "object" else {}
         for row in reversed(self.history(site_id, kind)):
-            votes.setdefault(ids.get(row.id, row.id), []).append(row)
+            votes.setdefault(row.id, []).append(row)
         found = {thing: _standing(thing, given) for thing, given in votes.items()}
         if kind == "change":
             elsewhere = self._from_site(site_id, found)
@@ -93,14 +93,19 @@ class Reviews:
         return found | {each: found[thing] for each, thing in ids.items() if thing in found}
 
     def history(self, site_id: str, kind: str = "", thing_id: str = "") -> list[Review]:
-        """All votes of a site, newest first; of one thing."""
+        """All votes of a site, newest first; of one thing. Those on an object have its finding's id."""
         rows = self._state.rows(
-            f"SELECT {_COLUMNS} FROM reviews "
-            "WHERE site = ? AND made_utc IN (?, ?) AND (? = '' OR kind = ?) AND (? = '' OR id = ?) "
-            "ORDER BY number DESC LIMIT 5000",
-            (*self._key(site_id), _OF_WATCHES, kind, kind, thing_id, thing_id),
+            f"SELECT {_COLUMNS} FROM reviews WHERE site = ? AND made_utc IN (?, ?) AND (? = '' OR kind = ?) "
+            "ORDER BY number DESC",
+            (*self._key(site_id), _OF_WATCHES, kind, kind),
         )
-        return [Review(**dict(row)) for row in rows]
+        ids = {} if kind == "change" else self._ids(site_id, "object")
+        votes = [Review(**dict(row)) for row in rows]
+        votes = [
+            replace(each, id=ids.get(each.id, each.id)) if each.kind == "object" else each
+            for each in votes
+        ]
+        return [each for each in votes if thing_id in ("", each.id) or each.id == ids.get(thing_id)]
 
     def give(self, site_id: str, wish: ReviewWish, who: str) -> Review:
         """Add a vote; how all stand then. Raises Problem (404) for an unknown thing."""
@@ -113,7 +118,7 @@ class Reviews:
         made = Review(
             wish.kind,
             thing,
-            votes[-1].revision + 1 if votes else 1,
+            max((each.revision for each in votes), default=0) + 1,
             wish.verdict,
             wish.label,
             wish.note,
@@ -121,13 +126,13 @@ class Reviews:
             utc_now(),
         )
         standing = _standing(thing, [*votes, made])
-        key = self._key(site_id)
+        key, kept = self._key(site_id), self._kept_as(site_id, made)
         event = NewEvent("review.changed", asdict(standing), site_id)
         try:
             with self._events.appending([event]) as connection:
                 for vote in (*votes[-1:], made):
                     if vote is made or vote.who == _ELSEWHERE:
-                        _keep(connection, key, vote)
+                        _keep(connection, key, replace(vote, id=kept))
         except sqlite3.IntegrityError:  # another vote was quicker: this one is the next
             return self.give(site_id, wish, who)
         if wish.kind == "change":
@@ -201,16 +206,24 @@ class Reviews:
         return found
 
     def _ids(self, site_id: str, kind: str) -> dict[str, str]:
-        """The ids under which things can be named, with the one under which votes are kept."""
+        """The ids under which things can be named, with the one that they have now."""
         if kind == "change":
             return {each.id: each.id for each in self._shelf.open(site_id).changes()}
         found = self._collections.get(site_id, FINDINGS).features
         aliases = {
             str(alias): str(each["id"])
             for each in found
-            for alias in each["properties"]["sightings"]
+            for name in ("sightings", "known_as")
+            for alias in each["properties"][name]
         }
         return aliases | {str(each["id"]): str(each["id"]) for each in found}
+
+    def _kept_as(self, site_id: str, vote: Review) -> str:
+        """The id under which a vote is kept."""
+        found = self._collections.get(site_id, FINDINGS).features if vote.kind == "object" else []
+        return next(
+            (each["properties"]["voted_as"] for each in found if each["id"] == vote.id), vote.id
+        )
 
 
 def _standing(thing: str, votes: Sequence[Review]) -> Review:
@@ -238,7 +251,7 @@ def review_routes(reviews: Reviews, shelf: SiteShelf) -> APIRouter:
         id: str = Query("", max_length=400),
     ) -> list[dict[str, Any]]:
         """Every vote of the site with who gave it and when, newest first."""
-        return [asdict(each) for each in reviews.history(site, kind, id)]
+        return [asdict(each) for each in reviews.history(site, kind, id)[:5000]]
 
     @router.post("", status_code=201)
     def give(site: str, wish: ReviewWish, holder: Holder = needs(Role.REVIEW)) -> dict[str, Any]:
