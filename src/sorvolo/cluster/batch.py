@@ -27,7 +27,7 @@ from sorvolo.cluster.flights import (
 from sorvolo.errors import SettingsError, StoreError
 from sorvolo.missions.flight.request import software
 from sorvolo.missions.worker import Order
-from sorvolo.store.atomic import atomic_write_bytes, take_lock, writing
+from sorvolo.store.atomic import atomic_write_bytes, make_folder, take_lock, writing
 from sorvolo.store.exports.detection_files import REPORT, find_watched
 from sorvolo.store.site.catalogue import utc_now
 from sorvolo.store.site.catalogue_place import is_site
@@ -149,8 +149,7 @@ class BatchTable:
                 f"{root} is a site itself; a batch makes several: name the folder above it, or a new one"
             )
         try:
-            with writing(root):
-                root.mkdir(parents=True, exist_ok=True)
+            make_folder(root)
         except (FileExistsError, NotADirectoryError) as error:
             raise StoreError(
                 f"{root} is a file, a folder was needed; choose another name"

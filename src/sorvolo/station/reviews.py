@@ -22,7 +22,7 @@ from sorvolo.station.settings import StationSettings
 from sorvolo.station.sites import SiteShelf
 from sorvolo.station.state import StationState, compact_json, utc_now
 from sorvolo.station.tokens import Holder, Role
-from sorvolo.store.atomic import atomic_write_bytes, writing
+from sorvolo.store.atomic import atomic_write_bytes, make_folder
 from sorvolo.survey.findings import Verdict
 
 NO_VERDICT = "none"
@@ -353,8 +353,7 @@ class Drawings:
                 )
             kept = {"revision": now + 1, "features": [each.model_dump() for each in wish.features]}
             path = self._path(site_id)
-            with writing(path):
-                path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(path.parent)
             atomic_write_bytes(path, compact_json({**kept, "made_utc": made_utc}).encode())
         self._events.append(NewEvent("drawings.changed", {"revision": kept["revision"]}, site_id))
         return {"type": "FeatureCollection", **kept}

@@ -84,6 +84,12 @@ def writing(path: Path) -> Iterator[None]:
         raise
 
 
+def make_folder(folder: Path) -> None:
+    """Make the folder and those above it, where there is none. Raises StoreError as `writing` does."""
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+
+
 def sync_file(path: Path) -> None:
     """Wait until a file's bytes, or a folder's names, are on the disk."""
     descriptor = os.open(path, os.O_RDONLY)

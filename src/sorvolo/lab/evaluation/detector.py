@@ -29,7 +29,7 @@ from sorvolo.lab.evaluation.detection_scores import (
 )
 from sorvolo.lab.evaluation.detector_page import detector_page
 from sorvolo.paths import AnyPath, Inputs, listed
-from sorvolo.store.atomic import atomic_write_bytes, writing
+from sorvolo.store.atomic import atomic_write_bytes, make_folder
 from sorvolo.store.exports.plain import json_bytes
 from sorvolo.survey.flight import Notice
 from sorvolo.survey.labels import LabelledSet
@@ -291,8 +291,7 @@ def write_evaluation(
     Raises StoreError on a full disk.
     """
     folder = Path(folder)
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     write_found(folder / FOUND, evaluation.found)
     atomic_write_bytes(folder / NUMBERS, json_bytes(evaluation_numbers(evaluation, description)))
     page = detector_page(

@@ -35,7 +35,7 @@ from sorvolo.lab.simulation.truth import (
 from sorvolo.lab.simulation.world import orthophoto
 from sorvolo.paths import AnyPath, as_path
 from sorvolo.store.ahead import in_order
-from sorvolo.store.atomic import writing
+from sorvolo.store.atomic import make_folder, writing
 from sorvolo.store.rasters.geotiff import write_cog
 
 _CRF = 20  # x264's quality, lower is better; by choice
@@ -113,8 +113,7 @@ def _write_flight(flight: SimulatedFlight, folder: Path) -> Iterator[int]:
             continue
         is_primary = format_name == formats[0] and not flight.settings.output.photos
         place = folder if is_primary else folder / "other"
-        with writing(place):
-            place.mkdir(exist_ok=True)
+        make_folder(place)
         telemetry = observation.telemetry
         path = place / f"{flight.name}{_SUFFIXES[format_name]}"
         write_telemetry(path, telemetry, observation.corrupt, GEOID_HEIGHT_M)

@@ -18,7 +18,7 @@ from sorvolo.lab.thesis.settings import FIGURE_PX, DetectorSettings
 from sorvolo.lab.thesis.umcd_folder import UmcdVideo
 from sorvolo.lab.training.settings import TrainSettings
 from sorvolo.mosaic.selection import every
-from sorvolo.store.atomic import atomic_write_bytes, writing
+from sorvolo.store.atomic import atomic_write_bytes, make_folder, writing
 from sorvolo.store.exports.annotated import annotated
 from sorvolo.store.images import jpeg_from_image
 from sorvolo.survey.flight import Frame
@@ -185,8 +185,7 @@ def _extract(video: UmcdVideo, text: str, folder: Path, views_per_second: float)
     if not stated.boxed:
         listed.unlink()
         return 0
-    with writing(folder):
-        place.mkdir(exist_ok=True)
+    make_folder(place)
     rate_hz = stated.fps or read_video_info(video.video).frame_rate_hz
     steady = every(1 / views_per_second)
     (source,) = open_sources([video.video])

@@ -15,7 +15,7 @@ from sorvolo.lab.thesis.rows import Row, RowStore
 from sorvolo.lab.thesis.settings import ReproductionSettings, SimulatedSize
 from sorvolo.lab.thesis.sheets import reproduction_sheets
 from sorvolo.lab.thesis.tables import tables_of
-from sorvolo.store.atomic import atomic_write_bytes, writing
+from sorvolo.store.atomic import atomic_write_bytes, make_folder
 from sorvolo.store.exports.plain import json_bytes, plain_json
 from sorvolo.survey.wording import counted
 
@@ -37,8 +37,7 @@ def write_reproduction(
     sheets = reproduction_sheets(document["tables"])
     store = RowStore(out)
     page = reproduction_page(document, sheets, lambda file: store.picture_path(file).read_bytes())
-    with writing(out):
-        (out / "tables").mkdir(parents=True, exist_ok=True)
+    make_folder(out / "tables")
     for each in sheets:
         atomic_write_bytes(out / "tables" / f"{each.name}.csv", each.csv)
     text = "\n".join([document["size"], "", *(each.markdown for each in sheets)])

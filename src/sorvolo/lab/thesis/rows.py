@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sorvolo.store.atomic import atomic_write_bytes, writing
+from sorvolo.store.atomic import atomic_write_bytes, make_folder
 from sorvolo.store.exports.plain import json_bytes, plain_json
 
 
@@ -44,15 +44,13 @@ class RowStore:
     def put(self, row: Row, stamp: str) -> Row:
         """Keep a row; its values come back as JSON holds them. Raises StoreError on a full disk."""
         plain = Row(row.id, row.kind, plain_json(row.values), dict(row.pictures))
-        with writing(self._folder):
-            (self._folder / "rows").mkdir(parents=True, exist_ok=True)
+        make_folder(self._folder / "rows")
         atomic_write_bytes(self._path(row.id), json_bytes({"stamp": stamp, "row": asdict(plain)}))
         return plain
 
     def add_picture(self, name: str, jpeg: bytes) -> str:
         """Keep a picture under this name; what a row names it by. Raises StoreError on a full disk."""
-        with writing(self._folder):
-            (self._folder / "pictures").mkdir(parents=True, exist_ok=True)
+        make_folder(self._folder / "pictures")
         file = f"{_plain_name(name)}.jpg"
         atomic_write_bytes(self.picture_path(file), jpeg, durable=False)
         return file

@@ -21,7 +21,7 @@ from sorvolo.lab.thesis.umcd_folder import (
     WITHOUT,
 )
 from sorvolo.lab.thesis.umcd_writing import umcd_metadata
-from sorvolo.store.atomic import atomic_write_bytes, writing
+from sorvolo.store.atomic import atomic_write_bytes, make_folder, writing
 from sorvolo.store.exports.plain import json_bytes, plain_json
 
 MARK = "simulated.json"
@@ -93,8 +93,7 @@ def _claim(place: Path, size: SimulatedSize, settings: ReproductionSettings) -> 
         raise SettingsError(
             f"{place}: holds other files, or a simulated dataset of another size or seed; choose another --out"
         )
-    with writing(place):
-        place.mkdir(parents=True, exist_ok=True)
+    make_folder(place)
     atomic_write_bytes(mark, json_bytes(wanted))
 
 

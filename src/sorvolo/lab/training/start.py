@@ -30,7 +30,7 @@ from sorvolo.lab.training.progress import Learner
 from sorvolo.lab.training.samples import TrainingSample
 from sorvolo.lab.training.weights import SOURCES, ImageNetWeights, Net, read_weights
 from sorvolo.missions.fetched_files import copy_by_hash
-from sorvolo.store.atomic import atomic_path, writing
+from sorvolo.store.atomic import atomic_path, make_folder
 
 
 def load_start(choice: str, preset: Preset) -> ImageNetWeights | ExportedModel | None:
@@ -59,8 +59,7 @@ def fetch_weights(net: Net) -> Path:
     place = folder / source.name
     if place.is_file() and sha256(place.read_bytes()).hexdigest() == source.sha256:
         return place
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     offline = f"put that file at {place}, or name it with --weights FILE; --weights none starts from nothing"
     with atomic_path(place) as temporary:
         copy_by_hash(source.url, temporary, source.sha256, offline=offline)

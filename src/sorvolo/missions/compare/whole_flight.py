@@ -1,7 +1,6 @@
 """Photos that are not found on the map by themselves, placed there with all others of their flight."""
 
 from collections.abc import Mapping
-from types import TracebackType
 from typing import Self
 
 from sorvolo.change.alignment import FlightPlace
@@ -54,12 +53,7 @@ class WholeFlight:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._spill.close()
 
     def add(self, posed: PosedFrame) -> None:

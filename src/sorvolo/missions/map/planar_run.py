@@ -5,7 +5,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
-from types import TracebackType
 from typing import Any, Self
 
 from sorvolo.capture.clock_offset import OffsetEstimate, shared_motion_m_s
@@ -84,9 +83,9 @@ class FlightRun(ABC):
 
     def __exit__(
         self,
-        kind: type[BaseException] | None,
+        kind: object,
         error: BaseException | None,
-        trace: TracebackType | None,
+        trace: object,
     ) -> None:
         if self._finder is not None:
             self._finder.close()
@@ -265,9 +264,9 @@ class PlanarRun(FlightRun):
 
     def __exit__(
         self,
-        kind: type[BaseException] | None,
+        kind: object,
         error: BaseException | None,
-        trace: TracebackType | None,
+        trace: object,
     ) -> None:
         self._spill.close()
         super().__exit__(kind, error, trace)

@@ -27,7 +27,7 @@ from sorvolo.missions.search.report import Searched, write_search
 from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
 from sorvolo.paths import AnyPath
 from sorvolo.search.cells import Cells, cells_of
-from sorvolo.store.atomic import writing
+from sorvolo.store.atomic import make_folder
 from sorvolo.store.site.archive import Archive
 
 
@@ -92,7 +92,6 @@ def _measured(
         measured.append(flight)
         if earlier is None:
             known[name] = basis, flight.searched
-            with writing(folder):
-                folder.mkdir(parents=True, exist_ok=True)
+            make_folder(folder)
             write_plants(folder, site, known)
     return measured

@@ -37,7 +37,7 @@ from sorvolo.search.recall import (
     segment,
     together,
 )
-from sorvolo.store.atomic import atomic_write_bytes, writing
+from sorvolo.store.atomic import atomic_write_bytes, make_folder
 from sorvolo.store.exports.map_pictures import picture
 from sorvolo.store.exports.plain import feature_collection, geojson_bytes, json_bytes, plain_json
 from sorvolo.store.exports.pod_files import (
@@ -408,8 +408,7 @@ def write_search(
     """
     site, cells = searched.site, searched.cells
     grid = CellGrid(cells.outer_corner_m(), cells.cell_m, site.crs, site.origin.longitude_deg)
-    with writing(outputs.folder):
-        outputs.folder.mkdir(parents=True, exist_ok=True)
+    make_folder(outputs.folder)
     bands, features, pictures = {}, [], {}
     shown = picture(tiles, PICTURE_PX)
     for label in searched.labels:

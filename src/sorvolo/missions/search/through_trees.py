@@ -16,7 +16,7 @@ from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.views import View, ground_outlines_m
 from sorvolo.missions.heights.run import FlightPictures, flight_views, height_grid, newest_flight
 from sorvolo.paths import AnyPath
-from sorvolo.store.atomic import atomic_write_bytes, writing
+from sorvolo.store.atomic import atomic_write_bytes, make_folder
 from sorvolo.store.exports.places import place_deg
 from sorvolo.store.exports.plain import feature_collection, geojson_bytes, json_bytes
 from sorvolo.store.images import ImageCache
@@ -85,8 +85,7 @@ def search_under_trees(
             views, ImageCache(load, _PICTURES_BYTES).get, lattice, *floor_m
         )
     zero_m = site.origin.height_m
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     bands = under.mean, under.anomaly, under.views.astype(np.float32), under.floor_m + zero_m
     names = "mean", "anomaly, sigmas", "views", f"floor, {site.height_reference}"
     write_height_cog(bands, names, lattice.first, grid.grid, folder / "under_trees.tif")

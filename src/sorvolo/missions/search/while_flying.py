@@ -7,7 +7,6 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from types import TracebackType
 from typing import Self
 
 from sorvolo.errors import SorvoloError, SorvoloWarning
@@ -96,12 +95,7 @@ class SearchWhileFlying:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, *_: object) -> None:
         self.land(State.LANDED if kind is None else State.STOPPED)
 
     def take(self, run: FlightRun, archive: Archive, index: int) -> None:

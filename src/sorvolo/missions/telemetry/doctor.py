@@ -28,7 +28,7 @@ from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup, prepare
 from sorvolo.missions.watch.cot_sender import CotPlace, CotTls, send_all
 from sorvolo.paths import AnyPath, as_path
-from sorvolo.store.atomic import atomic_path, atomic_write_bytes, writing
+from sorvolo.store.atomic import atomic_path, atomic_write_bytes, make_folder
 from sorvolo.store.exports.places import longitude_latitude
 from sorvolo.store.exports.plain import json_bytes, plain_json
 from sorvolo.store.exports.telemetry_files import (
@@ -375,8 +375,7 @@ def _written(
             f"the date of {name} is not known, and Cursor on Target events need one: map the flight with a log that "
             "has a date (`sorvolo map --telemetry FILE`), or leave --cot out"
         )
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     if "cot.xml" not in texts:
         (folder / "cot.xml").unlink(missing_ok=True)  # an earlier version's, with invented dates
     for file, text in texts.items():

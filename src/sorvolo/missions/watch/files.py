@@ -8,13 +8,12 @@ from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.missions.watch.announced import SightingKey, sighting_key
 from sorvolo.missions.watch.settings import WatchOutputs
-from sorvolo.store.atomic import atomic_write_bytes, writing
+from sorvolo.store.atomic import atomic_write_bytes, make_folder
 from sorvolo.store.exports.annotated import AnnotatedVideo, annotated, write_annotated
 from sorvolo.store.exports.detection_files import (
     ANNOTATED_PICTURES,
@@ -93,12 +92,7 @@ class WatchFiles:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def add(self, seen: SeenFrame) -> None:
@@ -213,8 +207,7 @@ class WatchFiles:
         images = self.folder / LABELS / "images"
         name = f"{self._site.name}_{_file_name(seen.frame)}.jpg"
         if seen.frame.image.size:
-            with writing(images):
-                images.mkdir(parents=True, exist_ok=True)
+            make_folder(images)
             atomic_write_bytes(images / name, jpeg_from_image(seen.frame.image), durable=False)
         elif not (images / name).is_file():
             return

@@ -20,6 +20,7 @@ from sorvolo.store.atomic import (
     TEMPORARY_PREFIX,
     atomic_path,
     atomic_write_bytes,
+    make_folder,
     remove_leftovers,
     scratch_folder,
     sync_file,
@@ -354,8 +355,7 @@ class FolderEnd:
     def put(self, file: SiteFile, stream: BinaryIO) -> bool:
         """Write a file whole or not at all; True. Raises DamagedError for bytes of another SHA-256."""
         path = self.folder / file.path
-        with writing(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         with atomic_path(path) as temporary:
             descriptor = os.open(
                 temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 import av
@@ -11,7 +10,13 @@ import cv2
 import numpy as np
 
 from sorvolo.geometry.arrays import BoxesPx, ImageRGB, Mask
-from sorvolo.store.atomic import TEMPORARY_PREFIX, atomic_write_bytes, sync_file, writing
+from sorvolo.store.atomic import (
+    TEMPORARY_PREFIX,
+    atomic_write_bytes,
+    make_folder,
+    sync_file,
+    writing,
+)
 from sorvolo.store.images import jpeg_from_image
 
 _COLOURS = (
@@ -75,8 +80,7 @@ def with_outlines(image: ImageRGB, mask: Mask) -> ImageRGB:
 
 def write_annotated(folder: Path, name: str, picture: ImageRGB) -> None:
     """Write an annotated picture `<name>.jpg` into the folder, which is made. Raises StoreError on a full disk."""
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     atomic_write_bytes(folder / f"{name}.jpg", jpeg_from_image(picture), durable=False)
 
 
@@ -97,12 +101,7 @@ class AnnotatedVideo:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def add(self, picture: ImageRGB, time_ns: int) -> None:

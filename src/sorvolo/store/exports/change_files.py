@@ -9,7 +9,7 @@ import numpy as np
 
 from sorvolo.geometry.arrays import Boxes, Floats, ImageBGR, ImageGray, Mask
 from sorvolo.geometry.polygons import signed_area
-from sorvolo.store.atomic import atomic_write_bytes, writing
+from sorvolo.store.atomic import atomic_write_bytes, make_folder
 from sorvolo.store.exports.places import Placemark, place_deg, ring
 from sorvolo.store.exports.plain import feature_collection, rounded, time_words, utc_text
 from sorvolo.store.images import png_from_rgba
@@ -82,8 +82,7 @@ def write_view_masks(folder: Path, name: str, changed: ImageGray, valid: Mask) -
 
 def write_pictures(folder: Path, pictures: Mapping[str, ImageBGR | ImageGray]) -> None:
     """Write pictures, BGR or gray uint8, as `<name>.png` into the folder, which is made; StoreError on a full disk."""
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     for name, picture in pictures.items():
         _, data = cv2.imencode(".png", picture)
         atomic_write_bytes(folder / f"{name}.png", data.tobytes(), durable=False)

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from math import isfinite
 from pathlib import Path, PurePath
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -18,6 +17,7 @@ from sorvolo.store.atomic import (
     TEMPORARY_PREFIX,
     atomic_path,
     atomic_write_bytes,
+    make_folder,
     remove_leftovers,
     take_lock,
     writing,
@@ -93,8 +93,7 @@ def claimed_folder(
     UnavailableError while another process writes it.
     """
     _refuse_others(folder, source, fingerprint, may_be_there=replaces or goes_on)
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     with _held(folder):
         with writing(folder):
             if goes_on and not replaces:
@@ -127,12 +126,7 @@ class DetectionLines:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._file.close()
 
     def append(self, rows: Iterable[Mapping[str, Any]]) -> None:
@@ -281,8 +275,7 @@ def crop_around(image: ImageRGB, box_px: Iterable[float], *, margin: float = 0.6
 def write_crop(folder: Path, track_id: int, crop: ImageRGB) -> str:
     """Write a track's crop; its file's name within the folder."""
     name = f"{CROPS}/{track_id}.jpg"
-    with writing(folder / CROPS):
-        (folder / CROPS).mkdir(exist_ok=True)
+    make_folder(folder / CROPS)
     atomic_write_bytes(folder / name, jpeg_from_image(crop), durable=False)
     return name
 
@@ -438,8 +431,7 @@ def coco_document(
 
 def write_coco(path: Path, labelled: LabelledSet, scores: Sequence[Floats] | None = None) -> None:
     """Write `coco_document` to the file `path`, whole or not at all. Raises StoreError on a full disk."""
-    with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     atomic_write_bytes(path, json_bytes(coco_document(labelled, path.parent, scores)))
 
 
@@ -479,16 +471,14 @@ def yolo_text(boxes_px: BoxesPx, labels: Labels, width_px: int, height_px: int) 
 
 def write_yolo_text(path: Path, text: str) -> None:
     """Write one label file and the folders above it. Raises StoreError on a full disk."""
-    with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     atomic_write_bytes(path, text.encode(), durable=False)
 
 
 def write_yolo_names(folder: Path, classes: Iterable[str]) -> None:
     """Write `classes.txt` and `data.yaml`, the two places where tools look for YOLO's class names."""
     names = list(classes)
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     atomic_write_bytes(
         folder / "classes.txt", "".join(f"{name}\n" for name in names).encode(), durable=False
     )

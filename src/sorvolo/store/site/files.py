@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Protocol
 
 from sorvolo.errors import StoreError, UnavailableError
-from sorvolo.store.atomic import TEMPORARY_PREFIX, take_lock, writing
+from sorvolo.store.atomic import TEMPORARY_PREFIX, make_folder, take_lock, writing
 from sorvolo.store.nofollow import refuse_links
 from sorvolo.store.site.catalogue_place import CATALOGUE, POINTER, Catalogues, create_database
 
@@ -206,8 +206,7 @@ def begin_writing(folder: Path, catalogues: Catalogues | None) -> int:
 def _make_folder(folder: Path) -> None:
     """Create the folder; refuse one that holds anything but a site (or what a killed creation left)."""
     try:
-        with writing(folder):
-            folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
     except (FileExistsError, NotADirectoryError) as error:
         raise StoreError(f"{folder} is a file, a folder was needed; choose another name") from error
     if _has_catalogue(folder):

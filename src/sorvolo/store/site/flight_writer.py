@@ -4,7 +4,6 @@ import hashlib
 import shutil
 from collections.abc import Mapping, MutableMapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -12,7 +11,13 @@ import numpy as np
 from sorvolo.errors import StoreError, UnavailableError, goes_on
 from sorvolo.geometry.arrays import Boxes, ImageGray, ImageRGB, ImageRGBA, Mask
 from sorvolo.geometry.grid import TileIndex
-from sorvolo.store.atomic import TEMPORARY_PREFIX, atomic_write_bytes, sync_file, writing
+from sorvolo.store.atomic import (
+    TEMPORARY_PREFIX,
+    atomic_write_bytes,
+    make_folder,
+    sync_file,
+    writing,
+)
 from sorvolo.store.exports.change_files import (
     BOXES_FILE,
     CROPS,
@@ -78,9 +83,9 @@ class FlightWriter:
 
     def __exit__(
         self,
-        kind: type[BaseException] | None,
+        kind: object,
         error: BaseException | None,
-        trace: TracebackType | None,
+        trace: object,
     ) -> None:
         self._growing.close()
         if not self._is_open:
@@ -120,8 +125,7 @@ class FlightWriter:
         data = jpeg_from_image(image)
         relative = self._image_path(index)
         path = self._files.folder / relative
-        with writing(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         atomic_write_bytes(path, data, durable=False)
         self._cache.forget(index)
         self._sizes[relative] = (image.shape[1], image.shape[0])
@@ -303,8 +307,7 @@ class FlightWriter:
     def staged(self, name: str) -> Path:
         """The folder of this name, made, whose files become the flight's with the commit. See `take_staged`."""
         folder = self._staged / name
-        with writing(folder):
-            folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         return folder
 
     def _stage(self, changes: Sequence[Change], search: ObjectSearch | None) -> None:

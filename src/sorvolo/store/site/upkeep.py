@@ -13,6 +13,7 @@ from sorvolo.geometry.arrays import ImageRGBA
 from sorvolo.geometry.grid import TileIndex
 from sorvolo.store.atomic import (
     atomic_write_bytes,
+    make_folder,
     remove_leftovers,
     sync_file,
     temporary_beside,
@@ -154,8 +155,7 @@ def _remove_unused_pictures(flight: Path, known_runs: set[str]) -> None:
 
 def _write_flight_files(files: "Archive", owed: OwedFiles) -> None:
     folder = files.flight_folder(owed.flight_id)
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     contents = {name: content for name, content in owed.documents.items() if content}
     for name in (*contents, *owed.leftovers):
         files.document_path(owed.flight_id, name)  # refuses one that could lie elsewhere
