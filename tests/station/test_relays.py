@@ -73,7 +73,7 @@ def test_a_webhook_gets_signed_events_in_order_and_again_after_a_restart(
     receiver = Receiver(503)
     place = tmp_path / "hook.json"
     relay = Relay("hook", webhook(receiver.url, "secret"), events, place, pause_s=0.02)
-    relay.start()
+    relay.begin()
     events.append(FOUND, NewEvent("run.progress", {"frames": 5}, "field"), FOUND)
     wait_for(lambda: relay.figures().delivered == 2)
     relay.close()
@@ -82,7 +82,7 @@ def test_a_webhook_gets_signed_events_in_order_and_again_after_a_restart(
     assert headers[SIGNATURE] == f"sha256={hmac.new(b'secret', body, hashlib.sha256).hexdigest()}"
     events.append(FOUND)
     again = Relay("hook", webhook(receiver.url), events, place, pause_s=0.02)
-    again.start()
+    again.begin()
     wait_for(lambda: again.figures().delivered == 1)
     again.close()
     assert receiver.seqs == [1, 1, 3, 4] and SIGNATURE not in receiver.got[-1][0]
@@ -94,7 +94,7 @@ def test_an_event_that_a_receiver_refuses_is_counted_and_holds_up_nothing(
 ) -> None:
     receiver = Receiver(code)
     relay = Relay("hook", webhook(receiver.url), events, tmp_path / "hook.json", pause_s=0.02)
-    relay.start()
+    relay.begin()
     events.append(FOUND, FOUND)
     wait_for(lambda: relay.figures().delivered == 1)
     relay.close()
@@ -109,7 +109,7 @@ def test_a_receiver_that_is_away_is_waited_for(events: EventLog, tmp_path: Path)
     relay = Relay(
         "hook", webhook("http://127.0.0.1:9/"), events, tmp_path / "hook.json", pause_s=0.02
     )
-    relay.start()
+    relay.begin()
     events.append(FOUND)
     wait_for(lambda: relay.figures().words != "")
     assert relay.figures().waiting == 1 and "refused" in relay.figures().words
@@ -217,7 +217,7 @@ def test_a_real_broker_gets_events_also_those_of_while_it_was_away(
     listener = listening(broker.port, got)
     sender = MqttSender(mqtt_place(f"mqtt://127.0.0.1:{broker.port}/team"))
     relay = Relay("mqtt", sender.send, events, tmp_path / "mqtt.json", pause_s=0.05)
-    relay.start()
+    relay.begin()
     events.append(FOUND)
     wait_for(lambda: len(got) == 2)
     assert got[0] == ("team/status", b"online") and got[1][0] == "team/field/object.found"

@@ -161,7 +161,7 @@ def station_app(
     async def while_it_runs(_: FastAPI) -> AsyncIterator[None]:
         await asyncio.to_thread(deletion.clear)
         await door.open()
-        station.runs.start_watching()
+        station.runs.begin()
         station.map_watch.start()
         outward.start()
         yield

@@ -24,7 +24,6 @@ from sorvolo.store.exports.places import longitude_latitude
 from sorvolo.store.exports.plain import features_name
 from sorvolo.store.nofollow import read_below
 from sorvolo.store.site.archive import Archive
-from sorvolo.store.site.catalogue import FlightEntry
 from sorvolo.store.site.files import LIVE_COVERAGE, is_plain_name
 from sorvolo.survey.flight import Site
 
@@ -384,11 +383,7 @@ _MAKERS: Mapping[str, Callable[[Archive], list[Feature]]] = {
 
 
 def _flights(archive: Archive) -> list[str]:
-    return [each.id for each in _complete(archive)]
-
-
-def _complete(archive: Archive) -> list[FlightEntry]:
-    return [each for each in archive.flights() if each.status == "complete"]
+    return [each.id for each in archive.complete_flights]
 
 
 def _lonlat(geometry: Any, site: Site) -> Any:
@@ -425,7 +420,7 @@ def _content(archive: Archive) -> object:
     names = [features_name(name, is_local=archive.site().is_local) for name in ("frames", COVERAGE)]
     return (
         archive.created_utc,
-        [(each.id, each.finished_utc) for each in _complete(archive)],
+        [(each.id, each.finished_utc) for each in archive.complete_flights],
         [
             _modified(archive, f"flights/{flight}/{name}")
             for flight in _flights(archive)

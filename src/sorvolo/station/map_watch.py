@@ -1,7 +1,6 @@
 """Follows the maps of all sites, whoever paints them: an event for each change that readers can see."""
 
 import sys
-import threading
 import time
 from dataclasses import dataclass
 
@@ -10,6 +9,7 @@ from sorvolo.station.events import EventLog, NewEvent
 from sorvolo.station.problems import Problem
 from sorvolo.station.reviews import Reviews
 from sorvolo.station.sites import SiteShelf, bounds_lonlat
+from sorvolo.station.state import ThreadOwner
 from sorvolo.station.tiles import TilePyramid, WebTiles
 from sorvolo.store.site.archive import Archive
 
@@ -26,7 +26,7 @@ class _Seen:
     versions: int
 
 
-class MapWatch:
+class MapWatch(ThreadOwner):
     """What the maps looked like last. Only `look` changes it; a thread calls it."""
 
     def __init__(
@@ -41,21 +41,14 @@ class MapWatch:
             str, int
         ] = {}  # when the coverage of the flight in the air was written, by site
         self._settled_s = 0.0
-        self._ending = threading.Event()
-        self._thread = threading.Thread(target=self._watch, name="maps", daemon=True)
+        super().__init__("maps", self._watch)
 
     def start(self) -> None:
         """Follow the maps from now on; the sites of this moment are known when this returns."""
         self._listed |= (
             self._shelf.folders().keys()
         )  # one deleted before the first look has to be announced as well
-        self._thread.start()
-
-    def close(self) -> None:
-        """Stop following."""
-        self._ending.set()
-        if self._thread.is_alive():
-            self._thread.join(5.0)
+        self.begin()
 
     def look(self) -> None:
         """Compare every map with how it was, and announce what changed."""

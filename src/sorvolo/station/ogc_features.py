@@ -324,7 +324,7 @@ def stac_routes(shelf: SiteShelf) -> APIRouter:
     def collection(site: str) -> dict[str, Any]:
         """A site with its extent in space and time, and a link to each version."""
         archive = shelf.open(site)
-        versions = _complete(archive)
+        versions = archive.versions()
         return {
             "type": "Collection",
             "stac_version": _VERSION,
@@ -355,7 +355,7 @@ def stac_routes(shelf: SiteShelf) -> APIRouter:
     def item(site: str, version: int) -> JSONResponse:
         """A version of the map: its ground, its time, its tiles, and the rasters of the newest one."""
         archive = shelf.open(site)
-        versions = _complete(archive)
+        versions = archive.versions()
         found = next((each for each in versions if each.id == version), None)
         if found is None:
             raise Problem(
@@ -411,10 +411,6 @@ def _assets(
                 "roles": ["tiles"],
             }
     return assets
-
-
-def _complete(archive: Archive) -> Sequence[VersionEntry]:
-    return archive.versions()
 
 
 def _bbox(archive: Archive, version: int | None) -> list[float] | None:

@@ -1,7 +1,6 @@
 """The receivers of a station's events besides its pages: webhooks, an MQTT broker, a TAK server or team."""
 
 import hashlib
-import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -24,7 +23,7 @@ from sorvolo.station.relays import (
     webhook,
     webhook_name,
 )
-from sorvolo.station.state import utc_now
+from sorvolo.station.state import ThreadOwner, utc_now
 from sorvolo.store.exports.cursor_on_target import (
     COT_TYPES,
     DroneView,
@@ -105,9 +104,9 @@ class Outward:
     def start(self) -> None:
         """Begin to pass events on."""
         for each in self._relays:
-            each.start()
+            each.begin()
         if self._cot is not None:
-            self._cot.start()
+            self._cot.begin()
 
     def close(self) -> None:
         """End; what was not delivered is, when the station runs again."""
@@ -147,25 +146,18 @@ Drones = Callable[[], Mapping[str, DroneView]]
 """The drones that send to this station, by stream."""
 
 
-class CotRelay:
+class CotRelay(ThreadOwner):
     """Sends events, and once a second each drone. `send` is for one `Relay`; a sender is not shared by threads."""
 
     def __init__(self, sender: CotSender, drones: Drones, drone_sender: CotSender) -> None:
         self._sender, self._drones, self._drone_sender = sender, drones, drone_sender
         self._sent_types: dict[str, str] = {}
         self._placed_s: dict[str, float] = {}
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="drones to TAK", daemon=True)
-
-    def start(self) -> None:
-        """Begin to send the drones."""
-        self._thread.start()
+        super().__init__("drones to TAK", self._run)
 
     def close(self) -> None:
         """End, and let go of the connections."""
-        self._stop.set()
-        if self._thread.is_alive():
-            self._thread.join(5.0)
+        super().close()
         self._sender.close()
         self._drone_sender.close()
 
@@ -235,7 +227,7 @@ class CotRelay:
             )
 
     def _run(self) -> None:
-        while not self._stop.wait(_DRONE_EVERY_S):
+        while not self._ending.wait(_DRONE_EVERY_S):
             for stream, view in self._drones().items():
                 event = cot_drone(
                     view,

@@ -23,6 +23,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 from sorvolo.capture.live.reconnect import Backoff
 from sorvolo.errors import SettingsError, StoreError
 from sorvolo.station.events import EventLog
+from sorvolo.station.state import ThreadOwner
 from sorvolo.store.atomic import atomic_write_bytes
 
 PASSED_ON = frozenset(
@@ -63,7 +64,7 @@ class RelayFigures:
     words: str
 
 
-class Relay:
+class Relay(ThreadOwner):
     """One receiver, served in a thread of its own. Its place in the events is kept in a file.
 
     An event is delivered at least once: a station that ends between sending and noting sends it again, with the same
@@ -85,18 +86,7 @@ class Relay:
         self._seq = _place_in(path, events.last)
         self._delivered = self._lost = 0
         self._words = ""
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name=f"relay {name}", daemon=True)
-
-    def start(self) -> None:
-        """Begin to pass events on."""
-        self._thread.start()
-
-    def close(self) -> None:
-        """End; what was not delivered is, when the station runs again."""
-        self._stop.set()
-        if self._thread.is_alive():
-            self._thread.join(5.0)
+        super().__init__(f"relay {name}", self._run)
 
     def figures(self) -> RelayFigures:
         """How it goes."""
@@ -104,7 +94,7 @@ class Relay:
         return RelayFigures(self.name, self._delivered, self._lost, waiting, self._words)
 
     def _run(self) -> None:
-        while not self._stop.is_set():
+        while not self._ending.is_set():
             events = self._events.after(self._seq) if self._events.last > self._seq else []
             for event in events:
                 if event["type"] in self._wanted and not self._deliver(event):
@@ -113,11 +103,11 @@ class Relay:
             if events:
                 self._keep_place()
             else:
-                self._stop.wait(_TURN_S)
+                self._ending.wait(_TURN_S)
 
     def _deliver(self, event: Mapping[str, Any]) -> bool:
         """Send until it is taken, refused or too old; False where the station ends meanwhile."""
-        while not self._stop.is_set():
+        while not self._ending.is_set():
             try:
                 self._send(event)
             except NotTaken as error:
@@ -129,7 +119,7 @@ class Relay:
                     self._lose(event, self._words)
                     return True
                 self._keep_place()
-                self._stop.wait(self._backoff.next_s())
+                self._ending.wait(self._backoff.next_s())
             else:
                 self._delivered += 1
                 self._words = ""

@@ -44,7 +44,15 @@ from sorvolo.station.problems import Problem
 from sorvolo.station.security import needs
 from sorvolo.station.settings import RESERVE_FILE, RUNS_FOLDER, STREAMS_FOLDER, StationSettings
 from sorvolo.station.sites import SiteShelf
-from sorvolo.station.state import Reserve, StationState, compact_json, shortage, utc_after, utc_now
+from sorvolo.station.state import (
+    Reserve,
+    StationState,
+    ThreadOwner,
+    compact_json,
+    shortage,
+    utc_after,
+    utc_now,
+)
 from sorvolo.station.tokens import Holder, Role
 from sorvolo.store.atomic import take_lock, writing
 
@@ -96,7 +104,7 @@ class Run:
     kill_at: str | None = None  # when a stop that brought no end becomes a kill
 
 
-class Runs:
+class Runs(ThreadOwner):
     """The missions of a station. Only `look` changes what is known of one that runs; a thread calls it."""
 
     def __init__(
@@ -125,18 +133,7 @@ class Runs:
         ] = {}  # ended by their own journal, their processes not yet: since when
         self._is_low = False
         self._reserve = Reserve(settings.state_folder / RESERVE_FILE)
-        self._ending = threading.Event()
-        self._thread = threading.Thread(target=self._watch, name="runs", daemon=True)
-
-    def start_watching(self) -> None:
-        """Follow the missions that run, those of an earlier server included."""
-        self._thread.start()
-
-    def close(self) -> None:
-        """Stop following; missions go on."""
-        self._ending.set()
-        if self._thread.is_alive():
-            self._thread.join(5.0)
+        super().__init__("runs", self._watch)
 
     def all(self, limit: int = 200, site: str = "") -> list[Run]:
         """The newest runs first, of one site or ("") of all."""

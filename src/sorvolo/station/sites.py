@@ -181,9 +181,7 @@ def site_detail(site_id: str, archive: Archive) -> dict[str, Any]:
         **site_summary(site_id, archive),
         "versions": [version_row(each) for each in versions],
         "flights": [
-            _flight_row(each, archive, versions, compared)
-            for each in archive.flights()
-            if each.status == "complete"
+            _flight_row(each, archive, versions, compared) for each in archive.complete_flights
         ],
         "has_heights": any(
             archive.height_path(each.flight_id, HeightFile.REPORT).exists() for each in versions

@@ -5,7 +5,7 @@ import os
 import shutil
 import sqlite3
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -190,3 +190,21 @@ class RootLock:
         if self._file >= 0:
             os.close(self._file)
             self._file = -1
+
+
+class ThreadOwner:
+    """A part of the station with a thread, which works until `_ending` is set. `begin` and `close` begin and end it."""
+
+    def __init__(self, name: str, work: Callable[[], None]) -> None:
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=work, name=name, daemon=True)
+
+    def begin(self) -> None:
+        """Begin to work."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop working; what was not done yet is done when the station runs again."""
+        self._ending.set()
+        if self._thread.is_alive():
+            self._thread.join(5.0)

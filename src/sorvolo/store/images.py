@@ -20,6 +20,7 @@ MOST_KEYFRAME_PX = 160_000_000
 MOST_TILE_PX = 4096 * 4096
 """Of a tile or a crop."""
 
+_PAPER = 236  # the grey under what is transparent
 _FLOAT_PX = 1 << 20  # of a picture, as floats at a time
 # 4:4:4 and 92: features found again on the stored keyframe sit where they sat; 4:2:0 shifts coloured edges.
 _JPEG = [
@@ -64,21 +65,19 @@ def jpeg_from_image(image: ImageRGB, most_px: int | None = None) -> bytes:
     return data.tobytes()
 
 
-def jpeg_from_rgba(rgba: ImageRGBA, most_px: int | None = None, ground: int = 236) -> bytes:
+def jpeg_from_rgba(rgba: ImageRGBA, most_px: int | None = None) -> bytes:
     """Encode a picture as `jpeg_from_image` does, what is transparent in it in a grey."""
     alpha = rgba[..., 3:].astype(np.float32) / 255
-    flat = np.round(rgba[..., :3] * alpha + ground * (1 - alpha))
+    flat = np.round(rgba[..., :3] * alpha + _PAPER * (1 - alpha))
     return jpeg_from_image(flat.astype(np.uint8), most_px)
 
 
-def image_from_jpeg(
-    data: bytes, name: str, most_px: int = MOST_KEYFRAME_PX, step: int = 1
-) -> ImageRGB:
+def image_from_jpeg(data: bytes, name: str, step: int = 1) -> ImageRGB:
     """Decode a JPEG, at a `step`-th (1, 2, 4, 8) of its size, rounded up.
 
-    Raises StoreError, naming `name`, when it is damaged or has more than `most_px` pixels.
+    Raises StoreError, naming `name`, when it is damaged or has more pixels than any camera.
     """
-    image = _decoded(data, _jpeg_pixels, _JPEG_STEPS[step], name, most_px)
+    image = _decoded(data, _jpeg_pixels, _JPEG_STEPS[step], name, MOST_KEYFRAME_PX)
     if image is None:
         raise StoreError(
             f"{name} is damaged: no JPEG in its {len(data)} bytes; map its flight again"
@@ -95,9 +94,9 @@ def png_from_rgba(rgba: ImageRGBA) -> bytes:
     return data.tobytes()
 
 
-def rgba_from_png(data: bytes, name: str, most_px: int = MOST_TILE_PX) -> ImageRGBA:
+def rgba_from_png(data: bytes, name: str) -> ImageRGBA:
     """Decode an RGBA PNG; raises StoreError, naming `name`, when it is damaged, too large, or has no alpha."""
-    image = _decoded(data, _png_pixels, cv2.IMREAD_UNCHANGED, name, most_px)
+    image = _decoded(data, _png_pixels, cv2.IMREAD_UNCHANGED, name, MOST_TILE_PX)
     if image is None or image.ndim != 3 or image.shape[2] != 4:
         raise StoreError(
             f"{name} is damaged: no RGBA PNG in its {len(data)} bytes; map its flight again"

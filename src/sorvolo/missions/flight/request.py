@@ -97,10 +97,8 @@ def already_done(archive: Archive, setup: FlightSetup, request: str) -> AlreadyD
     return next(
         (
             AlreadyDone(each.id, each.finished_utc)
-            for each in archive.flights()
-            if each.id == setup.source.name
-            and each.status == "complete"
-            and each.settings.get(REQUEST) == request
+            for each in archive.complete_flights
+            if each.id == setup.source.name and each.settings.get(REQUEST) == request
         ),
         None,
     )

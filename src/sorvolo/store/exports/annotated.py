@@ -172,12 +172,15 @@ def _write(
         x = max(0, min(corner[0], picture.shape[1] - width - 2))
         y = max(height + 2, min(corner[1], picture.shape[0] - below))
         bars.append((x, y - height - 2, x + width + 2, y + below))
-    bar = next((each for each in bars if not any(_meet(each, other) for other in written)), bars[0])
+    bar = next(
+        (each for each in bars if not any(boxes_meet(each, other) for other in written)), bars[0]
+    )
     cv2.rectangle(picture, bar[:2], bar[2:], (20, 20, 20), cv2.FILLED)
     place = (bar[0] + 1, bar[3] - below)
     cv2.putText(picture, plain, place, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
     return bar
 
 
-def _meet(one: _Bar, other: _Bar) -> bool:
+def boxes_meet(one: Sequence[float], other: Sequence[float]) -> bool:
+    """Whether two boxes, left, top, right, bottom, have ground in common."""
     return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]

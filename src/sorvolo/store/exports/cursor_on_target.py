@@ -8,7 +8,7 @@ from xml.etree.ElementTree import Element, SubElement, tostring
 
 import numpy as np
 
-from sorvolo.store.exports.places import place_deg, wrapped_deg
+from sorvolo.store.exports.places import place_deg, printable, wrapped_deg
 from sorvolo.store.exports.plain import utc_text
 from sorvolo.survey.flight import Site
 from sorvolo.survey.objects import Track
@@ -51,7 +51,7 @@ def cot_event(
     ground's height above the ellipsoid where the site knows it. Speed and course are sent of what moves. The site must
     be geo-referenced.
     """
-    label = _printable(track.label)
+    label = printable(track.label)
     event, detail = begin_event(
         uid,
         cot_type(track.label),
@@ -114,7 +114,7 @@ def cot_drone(view: DroneView, *, uid: str, callsign: str, now_ns: int, stale_s:
         stale_s=stale_s,
         height=_known(view.height_m, ".1f"),
         error_m=view.error_m,
-        callsign=_printable(callsign),
+        callsign=printable(callsign),
     )
     if isfinite(view.course_deg):
         speed = f"{view.speed_m_s:.1f}" if isfinite(view.speed_m_s) else "0.0"
@@ -165,9 +165,9 @@ def cot_spot(
         now_ns=now_ns,
         stale_s=stale_s,
         error_m=error_m,
-        callsign=_printable(callsign),
+        callsign=printable(callsign),
     )
-    SubElement(detail, "remarks").text = _printable(words)
+    SubElement(detail, "remarks").text = printable(words)
     return event_bytes(event)
 
 
@@ -221,12 +221,6 @@ def event_bytes(event: Element) -> bytes:
 
 def _known(value: float, form: str) -> str:
     return format(value, form) if isfinite(value) else UNKNOWN_M
-
-
-def _printable(text: str) -> str:
-    return "".join(
-        letter for letter in text if letter.isprintable()
-    )  # another's model may name anything
 
 
 def cot_removal(uid: str, *, type_: str, now_ns: int) -> bytes:

@@ -100,10 +100,10 @@ def kml_from_one(title: str) -> Iterator[simplekml.Kml]:
 
 def kml_bytes(title: str, placemarks: Sequence[Placemark]) -> bytes:
     """The places as KML: a point each, and its outline where it has one."""
-    with kml_from_one(_printable(title)) as document:
+    with kml_from_one(printable(title)) as document:
         for each in placemarks:
             folder = document.newmultigeometry(
-                name=_printable(each.name), description=_printable(each.description)
+                name=printable(each.name), description=printable(each.description)
             )
             folder.newpoint(coords=[(each.longitude_deg, each.latitude_deg)])
             if each.outline_deg:
@@ -119,14 +119,14 @@ def kml_bytes(title: str, placemarks: Sequence[Placemark]) -> bytes:
 def gpx_bytes(title: str, placemarks: Sequence[Placemark]) -> bytes:
     """The places as GPX 1.1 waypoints."""
     document = gpxpy.gpx.GPX()
-    document.creator, document.name = "Sorvolo", _printable(title)
+    document.creator, document.name = "Sorvolo", printable(title)
     for each in placemarks:
         document.waypoints.append(
             gpxpy.gpx.GPXWaypoint(
                 latitude=round(each.latitude_deg, 8),
                 longitude=round((each.longitude_deg + 180) % 360 - 180, 8),
-                name=_printable(each.name),
-                description=_printable(each.description),
+                name=printable(each.name),
+                description=printable(each.description),
                 time=_moment(each.seen_ns) if each.seen_ns >= DAY_NS else None,
             )
         )
@@ -137,6 +137,6 @@ def _moment(time_ns: int) -> datetime:
     return datetime.fromtimestamp(time_ns // 1_000_000_000, UTC)
 
 
-def _printable(text: str) -> str:
+def printable(text: str) -> str:
     """The text without letters that XML cannot hold; somebody else's model may name anything."""
     return "".join(letter for letter in text if letter.isprintable() or letter == "\n")

@@ -115,7 +115,9 @@ def site_state(archive: Archive) -> IndexedState:
     if not archive.has_site:
         return IndexedState(archive.folder.name, False, "", {}, {})
     site = archive.site()
-    flights = {} if site.is_local else {each.id: _state_of(each) for each in _complete(archive)}
+    flights = (
+        {} if site.is_local else {each.id: _state_of(each) for each in archive.complete_flights}
+    )
     verdicts = (
         {} if site.is_local else {each.change_id: each.verdict.value for each in archive.reviews()}
     )
@@ -129,7 +131,7 @@ def flight_rows(archive: Archive, wanted: Collection[str]) -> Iterator[FlightRow
     """The rows of these flights; a broken frames.geojson counts as missing. Raises StoreError as `Archive` does."""
     site, compared = archive.site(), archive.comparisons()
     versions = {each.flight_id: each for each in archive.versions()}
-    for each in _complete(archive):
+    for each in archive.complete_flights:
         if each.id not in wanted:
             continue
         yield FlightRows(
@@ -140,10 +142,6 @@ def flight_rows(archive: Archive, wanted: Collection[str]) -> Iterator[FlightRow
             _objects(archive, each.id, site),
             _changes(archive, each.id, site),
         )
-
-
-def _complete(archive: Archive) -> list[FlightEntry]:
-    return [each for each in archive.flights() if each.status == "complete"]
 
 
 def _state_of(flight: FlightEntry) -> str:

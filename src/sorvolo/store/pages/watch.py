@@ -11,6 +11,7 @@ import numpy as np
 from markupsafe import Markup
 
 from sorvolo.geometry.arrays import Floats
+from sorvolo.store.exports.annotated import boxes_meet
 from sorvolo.store.exports.places import SYSTEMS, degrees_words
 from sorvolo.store.exports.plain import NO_PLACE_FILES
 from sorvolo.store.pages.plots import round_length
@@ -38,7 +39,6 @@ _FACTS = {
     "calibrated": "half are right at 0.5",
     "trained_on": "trained on",
 }
-_Box = tuple[float, float, float, float]  # left, top, right, bottom
 _Track = Mapping[str, Any]
 
 
@@ -197,15 +197,12 @@ def _label_places(dots_px: Floats, names: Sequence[str]) -> list[tuple[float, fl
             )
         ]
         place = next(
-            (each for each in sides if not any(_meet(each, other) for other in taken)), sides[0]
+            (each for each in sides if not any(boxes_meet(each, other) for other in taken)),
+            sides[0],
         )
         taken.append(place)
         places.append((float(place[0]), float(place[3] - 2)))
     return places
-
-
-def _meet(one: _Box, other: _Box) -> bool:
-    return bool(one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3])
 
 
 def _rows(tracks: Sequence[_Track], *, is_local: bool) -> list[dict[str, Any]]:

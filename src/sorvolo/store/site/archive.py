@@ -161,6 +161,11 @@ class Archive:
         """Every flight by rank. A complete run stays listed until the run that replaces it commits."""
         return self.catalogue_rows(records.list_flights)
 
+    @property
+    def complete_flights(self) -> list[FlightEntry]:
+        """Those whose newest run is complete, by rank."""
+        return [each for each in self.flights() if each.status == "complete"]
+
     def change_mark(self) -> tuple[int, int]:
         """Another one after each change that others made to the catalogue; what is read after it is no older."""
         return self.catalogue.change_mark()
