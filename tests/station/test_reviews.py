@@ -267,3 +267,13 @@ def _confirmed(client: TestClient, site: str) -> list[str]:
     items = f"/api/sites/{site}/collections/findings/items?review=confirmed"
     found = client.get(items).json()["features"]
     return [each for feature in found for each in feature["properties"]["sightings"]]
+
+
+def test_a_note_is_no_vote(client: TestClient) -> None:
+    """Neither on what another confirmed nor on what is disputed."""
+    review_changes(client.app.state.station.settings.root / "field", ["b-1"], Verdict.CONFIRMED)
+    noted = client.post(REVIEWS, json={"kind": "change", "id": "b-1", "note": "look again"}).json()
+    assert (noted["verdict"], noted["state"]) == ("confirmed", "single")
+    assert verdict(client, "b-1", "rejected").json()["state"] == "disputed"
+    noted = client.post(REVIEWS, json={"kind": "change", "id": "b-1", "note": "a shed"}).json()
+    assert (noted["verdict"], noted["note"]) == ("disputed", "a shed")

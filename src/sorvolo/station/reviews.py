@@ -32,11 +32,12 @@ _COLUMNS = "kind, id, revision, verdict, label, note, who, at"
 
 
 class ReviewWish(BaseModel):
-    """A person's vote on an object or a change; "none" withdraws one's own. `label` is the class that it is held for."""
+    """A person's vote on an object or a change; "none" withdraws one's own, without any it stays, for a note. `label` is
+    the class that it is held for."""
 
     kind: Literal["object", "change"]
     id: str = Field(min_length=1, max_length=400)
-    verdict: Literal["confirmed", "rejected", "unsure", "none"]
+    verdict: Literal["confirmed", "rejected", "unsure", "none"] | None = None
     label: str = Field("", max_length=100)
     note: str = Field("", max_length=2000)
 
@@ -119,7 +120,7 @@ class Reviews:
             wish.kind,
             thing,
             max((each.revision for each in votes), default=0) + 1,
-            wish.verdict,
+            wish.verdict or next((v.verdict for v in votes[::-1] if v.who == who), NO_VERDICT),
             wish.label,
             wish.note,
             who,

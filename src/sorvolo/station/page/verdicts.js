@@ -41,7 +41,7 @@ export function verdictForm(screen, feature, { keys = false, given = null } = {}
     fill(line, verdictLine(screen.data.find(feature.id) ?? feature));
   };
   note.addEventListener("keydown", (event) => {
-    if (event.key === "Enter") { give(feature.properties.review ?? "none"); note.blur(); }
+    if (event.key === "Enter") { give(null); note.blur(); } // one's own vote stays as it is
     if (event.key === "Escape") note.blur();
     event.stopPropagation();
   });
@@ -53,5 +53,5 @@ export function verdictForm(screen, feature, { keys = false, given = null } = {}
       el("button", { type: "button", class: "reject", "aria-pressed": String(current === "rejected"), on: { click: () => press("rejected") } }, "Reject", hint("R")),
       el("button", { type: "button", class: "quiet", "aria-pressed": String(current === "unsure"), on: { click: () => press("unsure") } }, "Not sure"),
       current ? el("button", { type: "button", class: "quiet", on: { click: () => press("none") } }, "Withdraw", hint("U")) : null),
-    el("div", { class: "row" }, note, button("Save note", () => give(feature.properties.review ?? "none"), { class: "quiet" })));
+    el("div", { class: "row" }, note, button("Save note", () => give(null), { class: "quiet" })));
 }

@@ -54,11 +54,16 @@ def flown_flights(connection: Connection) -> list[tuple[str, int, int, int]]:
 def present_objects(register: Register, objects: Sequence[StoredObject]) -> list[StoredObject]:
     """What stands on the site by the newest look at each place, as the newest flight that detected it found it."""
     of_finding = {each.id: found for found in register.present for each in found.sightings}
-    newest = {of_finding[each.thing.id].id: each for each in objects if each.thing.id in of_finding}
+    newest = {
+        of_finding[each.thing.id].id: each.thing.id
+        for each in objects
+        if each.thing.id in of_finding
+    }
+    shown = set(newest.values())
     return [
         StoredObject(each.flight_id, each.rank, each.thing, of_finding[each.thing.id])
         for each in objects
-        if each in set(newest.values())
+        if each.thing.id in shown
     ]
 
 
