@@ -91,6 +91,14 @@ def test_one_strip_straight_on_a_spot_names_no_person(
         focus(near[:1], lambda _: pictures[52], _LATTICE, -9.0, 7.0)
 
 
+def test_ground_that_too_few_views_show_is_not_called_empty() -> None:
+    bare = make_forest(5, 60, 0.0, _PEOPLE_M, _FLOOR_M)
+    views = fly(bare, np.arange(-12, 13, 6.0), np.arange(-12, 13, 8.0))
+    pictures = [photograph(bare, view) for view in views]
+    with pytest.raises(InputError, match="more than 20 pictures, 24 are needed"):
+        look_under_trees(views, pictures.__getitem__, _LATTICE, -9.0, 7.0)
+
+
 def test_cameras_a_metre_off_show_nobody(views: list[View], pictures: list[np.ndarray]) -> None:
     draw = np.random.default_rng(3)
     off = [

@@ -408,3 +408,11 @@ def test_segments_need_probabilities_that_add_up(tmp_path: Path) -> None:
         write(*wrong)
         with pytest.raises(InputError, match=r"poa|too large"):
             read_segments(path)
+
+
+def test_a_look_through_trees_ignores_no_option(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["search", str(tmp_path), "--through-trees", "--area", "area.kml", "--refly", "a.kml"]
+    assert main(words) == 1
+    assert capsys.readouterr().err.startswith("error: --area, --refly: --through-trees looks")

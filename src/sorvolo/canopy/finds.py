@@ -20,6 +20,7 @@ from sorvolo.canopy.integral import (
     levelled,
     seeing,
 )
+from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats32, Numbers, PointsM
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.views import View
@@ -164,8 +165,13 @@ def look_under_trees(
     """The floor of these cells between two heights (site metres up) by focus, its integral and the people on it.
 
     Pictures have the size of their views' cameras and no distortion. Cameras must be known to about 0.25 m and 0.3
-    degrees. Raises InputError where no floor comes into focus.
+    degrees. Raises InputError where no floor comes into focus, or too few views show any of it.
     """
     floor = focus(views, picture, lattice, low_m, high_m)
     under = integrate(views, picture, lattice, floor.on(lattice))
+    if (most := int(under.views.max())) < LEAST_VIEWS:
+        raise InputError(
+            f"no spot is in more than {most} pictures, {LEAST_VIEWS} are needed to look through trees; fly strips 2 to 4 m "
+            "apart with a picture every 2 m, and map all pictures as photos"
+        )
     return under, floor, find_people(under, views, picture)

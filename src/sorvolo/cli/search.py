@@ -112,6 +112,11 @@ def search_command(
         raise SettingsError(
             "--through-trees looks at one mapped flight; give the map's folder and one --flight"
         )
+    measured = {"--area": area, "--poa": poa, "--refly": refly, "--classes": classes}
+    if through_trees and (unused := [name for name, value in measured.items() if value]):
+        raise SettingsError(
+            f"{', '.join(unused)}: --through-trees looks below all that the flight saw, and measures nothing; leave it out"
+        )
     settings = SearchSettings(plants, wanted_classes(classes), model, enough, through_crowns)
     with opened_site(site or _map_of(inputs), writes=bool(site)) as place:
         outputs = SearchOutputs(

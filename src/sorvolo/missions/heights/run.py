@@ -52,16 +52,16 @@ _AXES = ("east", "north", "up")
 def flight_views(
     archive: Archive, flight_id: str, keyframes: Sequence[StoredKeyframe]
 ) -> list[View]:
-    """The views of a flight. Raises InputError for one that heights cannot be made of."""
+    """The views of a flight. Raises InputError for one without cameras in space, or without metres."""
     if not keyframes:
         known = ", ".join(each.id for each in archive.flights()) or "none"
         raise InputError(
             f"{archive.folder} has no cameras in space of a flight {flight_id!r} (its flights: {known}); "
-            "heights need a flight mapped with --method planar"
+            "give a flight mapped with --method planar"
         )
     if archive.site().is_local:
         raise InputError(
-            f"{archive.folder} has no GPS and so no metres: heights need a flight with GPS positions"
+            f"{archive.folder} has no GPS and so no metres; map a flight with GPS positions into a new site"
         )
     residuals = _residuals_m(archive, flight_id)
     return [
