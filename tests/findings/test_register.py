@@ -76,9 +76,9 @@ def test_all_missions_of_two_dates_see_each_thing_once() -> None:
     seen += [sighting(1, "compare", east_m) for east_m in cars[:3]]
     seen += [sighting(1, "watch", east_m - 0.3) for east_m in cars[:3]]
     seen += [sighting(1, "compare", 50.0, label="person")]
-    register = associate(seen, Register(), [look(0), look(1)])
+    register = associate(seen, [look(0), look(1)])
     for day, count in ((0, 4), (1, 3)):
-        labels = [each.label for each in register.present_at(f"flight{day}")]
+        labels = [each.label for each in register.findings if f"flight{day}" in each.dates]
         assert (labels.count("car"), labels.count("person")) == (count, 1)
     gone = [each for each in register.findings if each.gone]
     assert [(each.label, each.gone) for each in gone] == [("car", "flight1"), ("person", "flight1")]
@@ -91,17 +91,17 @@ def test_all_missions_of_two_dates_see_each_thing_once() -> None:
 def test_silence_is_no_absence() -> None:
     """A date whose flight did not look there states nothing; one whose comparison saw it leave does."""
     seen = [sighting(0, "map", 0.0), sighting(1, "map", 60.0)]
-    (first, _) = associate(seen, Register()).findings
+    (first, _) = associate(seen).findings
     assert first.presence("flight1") is Presence.NOT_LOOKED and not first.gone
     left = sighting(0, "left", 0.1, gone="flight1", origin=KnownBy.CHANGED)
-    (first, _) = associate([*seen, left], Register()).findings
+    (first, _) = associate([*seen, left]).findings
     assert first.gone == "flight1" and len(first.sightings) == 2
 
 
 def test_what_comes_after_it_was_gone_is_another() -> None:
     """A second car in the place of the first has an interval of its own."""
     seen = [sighting(0, "map", 0.0), sighting(2, "map", 0.2)]
-    register = associate(seen, Register(), [look(0), look(1), look(2)])
+    register = associate(seen, [look(0), look(1), look(2)])
     assert [(each.dates, each.gone) for each in register.findings] == [
         (("flight0",), "flight1"),
         (("flight2",), ""),
@@ -115,7 +115,7 @@ def test_two_things_half_a_metre_apart_never_merge() -> None:
         for day in (0, 1)
         for east_m in (0.0, 0.5)
     ]
-    register = associate(seen, Register(), [look(0), look(1)])
+    register = associate(seen, [look(0), look(1)])
     assert [len(each.sightings) for each in register.findings] == [2, 2]
     assert not any(each.gone for each in register.findings)
 
@@ -125,23 +125,16 @@ def test_moving_things_are_one_within_a_date_and_never_between_dates() -> None:
     walks = {"moving": True, "velocity_m_s": (1.0, 0.0), "label": "person"}
     later_ns = DAY_NS + 2 * 10**10
     seen = [sighting(0, "map", 0.0, **walks), sighting(0, "watch", 10.0, last_ns=later_ns, **walks)]
-    assert len(associate(seen, Register()).findings) == 1
-    assert len(associate([*seen, sighting(1, "map", 10.0, **walks)], Register()).findings) == 2
+    assert len(associate(seen).findings) == 1
+    assert len(associate([*seen, sighting(1, "map", 10.0, **walks)]).findings) == 2
 
 
 def test_a_renamed_class_is_one_thing_on_one_date() -> None:
     """Two models' names for what both see; on another date another class is another thing."""
     seen = [sighting(0, "map", 0.0), sighting(0, "watch", 0.2, label="van", length_m=5.0)]
-    (found,) = associate(seen, Register()).findings
+    (found,) = associate(seen).findings
     assert set(found.class_scores) == {"car", "van"}
-    assert (
-        len(
-            associate(
-                [seen[0], replace(sighting(1, "map", 0.0), label="tree")], Register()
-            ).findings
-        )
-        == 2
-    )
+    assert len(associate([seen[0], replace(sighting(1, "map", 0.0), label="tree")]).findings) == 2
 
 
 PLACES = st.lists(st.integers(0, 40), min_size=1, max_size=6, unique=True)
@@ -156,18 +149,14 @@ MISSIONS = st.lists(
 @settings(max_examples=60, deadline=None)
 @given(MISSIONS, st.randoms())
 def test_laws(missions: list[tuple[int, str, list[int]]], random: object) -> None:
-    """Order does not matter, a rerun changes nothing, a deleted flight is forgotten, no mission sees a thing twice."""
+    """Order does not matter, and no mission sees a thing twice."""
     seen = [
         [sighting(day, name, 3.0 * place) for place in places] for day, name, places in missions
     ]
-    whole = associate(list(chain(*seen)), Register())
-    step = Register()
-    for mission in random.sample(seen, len(seen)):
-        step = associate(mission, step)
-    assert shown(step) == shown(whole)
-    assert shown(associate(seen[0], whole)) == shown(whole)
-    kept = [each for each in list(chain(*seen)) if each.date != "flight0"]
-    assert shown(whole.without((), ["flight0"])) == shown(associate(kept, Register()))
+    whole = associate(list(chain(*seen)))
+    mixed = list(chain(*seen))
+    random.shuffle(mixed)
+    assert shown(associate(mixed)) == shown(whole)
     for each in whole.findings:
         names = [one.mission for one in each.sightings]
         assert len(set(names)) == len(names)
@@ -175,12 +164,11 @@ def test_laws(missions: list[tuple[int, str, list[int]]], random: object) -> Non
     assert len(set(ids)) == len(ids)
 
 
-def test_one_flight_more_is_quick() -> None:
-    """Of 200 flights over 50 things; a register of 10,000 flights and a million sightings takes below 2 s."""
+def test_two_hundred_flights_are_quick() -> None:
+    """Over 50 things, a map each."""
     at_m = np.random.default_rng(1).uniform(-99, 99, (50, 2))
     seen = [sighting(day, "map", *place) for day in range(200) for place in at_m]
-    register = associate(seen, Register())
     started_s = time.monotonic()
-    register = associate([sighting(200, "map", *place) for place in at_m], register, [look(200)])
-    assert time.monotonic() - started_s < 1.0
-    assert len(register.present_at("flight200")) == 50
+    register = associate(seen, [look(200)])
+    assert time.monotonic() - started_s < 5.0
+    assert len(register.findings) == 50 and not register.present

@@ -2,11 +2,11 @@
 
 import hashlib
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
-from itertools import groupby, takewhile
+from itertools import groupby
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -110,8 +110,9 @@ class GroundFinding:
     @property
     def newest(self) -> MissionSighting:
         """The surest sighting of the newest date that saw it, a detector's own before a change's."""
+        last = self.dates[-1]
         return max(
-            _of_last_date(self.sightings),
+            (each for each in self.sightings if each.date == last),
             key=lambda each: (each.origin is KnownBy.DETECTED, each.score, each.mission, each.id),
         )
 
@@ -139,77 +140,32 @@ class GroundFinding:
 
 @dataclass(frozen=True, eq=False)
 class Register:
-    """All findings of a site, the missions that they are of, and the looks that ended some of them."""
+    """All findings of a site, and the looks that ended some of them."""
 
     findings: tuple[GroundFinding, ...] = ()
     looks: tuple[SearchedDate, ...] = ()
-    missions: frozenset[str] = frozenset()
-
-    @cached_property
-    def places_m(self) -> PointsM:
-        """(N, 2) where the findings are, site metres."""
-        flat = [value for each in self.findings for value in each.position_m]
-        return frozen(np.reshape(flat, (-1, 2)))
-
-    @cached_property
-    def last_order(self) -> float:
-        """The rank of the newest date that is known; -1 for none."""
-        sightings = (each.sightings[-1].order for each in self.findings)
-        return max((-1, *sightings, *(each.order for each in self.looks)))
 
     @property
     def present(self) -> list[GroundFinding]:
         """What is there by the newest look at each place."""
         return [each for each in self.findings if not each.gone]
 
-    def present_at(self, date: str) -> list[GroundFinding]:
-        """What a date's missions saw."""
-        return [each for each in self.findings if each.presence(date) is Presence.SEEN]
 
-    def without(self, missions: Iterable[str], dates: Iterable[str] = ()) -> "Register":
-        """The register as if these missions, and all of these dates, had never been."""
-        missions, dates = set(missions), set(dates)
-        kept = [
-            each
-            for found in self.findings
-            for each in found.sightings
-            if each.mission not in missions and each.date not in dates
-        ]
-        return associate(kept, Register(), [each for each in self.looks if each.date not in dates])
+def associate(sightings: Sequence[MissionSighting], looks: Sequence[SearchedDate] = ()) -> Register:
+    """What missions saw, each thing one finding; the same whatever their order.
 
-
-def associate(
-    sightings: Sequence[MissionSighting], register: Register, looks: Sequence[SearchedDate] = ()
-) -> Register:
-    """The register with what missions saw added, each thing one finding; the same whatever the missions' order.
-
-    A mission that the register knows is replaced. Dates are taken in order of time, and a date's missions by name:
-    where the new ones are not the newest, what is known is put together again. Two sightings of one mission are never
-    one finding. What a date looked at and did not find is gone; the next thing there is another finding.
+    Dates are taken in order of time, and a date's missions by name. Two sightings of one mission are never one finding.
+    What a date looked at and did not find is gone; the next thing there is another finding.
     """
     steps: list[MissionSighting | SearchedDate] = [*sightings, *looks]
-    orders = [each.order for each in steps]
-    missions = register.missions | {each.mission for each in sightings}
-    again = {each.mission for each in sightings} & register.missions
-    if register.findings or register.looks:
-        if again or min(orders, default=register.last_order + 1) <= register.last_order:
-            replaced = {each.date for each in looks}
-            kept = [
-                each
-                for found in register.findings
-                for each in found.sightings
-                if each.mission not in again
-            ]
-            old = [each for each in register.looks if each.date not in replaced]
-            return associate([*kept, *sightings], Register(), [*old, *looks])
-    working = _Working(register, sightings)
+    working = _Working(len(sightings))
     for date, of_date in groupby(sorted(steps, key=_order), key=lambda each: each.date):
         taken = list(of_date)
         seen = [each for each in taken if isinstance(each, MissionSighting)]
         for _, mission in groupby(seen, key=lambda each: each.mission):
             working.take(list(mission))
         working.end(date, [each.frames for each in taken if isinstance(each, SearchedDate)])
-    return Register(working.findings(), (*register.looks, *looks), missions)
+    return Register(tuple(each.finding() for each in working.things), tuple(looks))
 
 
 def _order(each: MissionSighting | SearchedDate) -> tuple[float, str, str, int, str]:
@@ -221,12 +177,11 @@ def _order(each: MissionSighting | SearchedDate) -> tuple[float, str, str, int, 
 class _Thing:
     """A finding while missions are added."""
 
-    def __init__(self, found: GroundFinding) -> None:
-        self.id, self.gone = found.id, found.gone
-        self.sightings = list(found.sightings)
-        self.of_date = _of_last_date(found.sightings)
-        self.sums = dict(found.class_sums)
-        self.place_m, self.sigma_m = found.position_m, found.sigma_m
+    def __init__(self, id_: str) -> None:
+        self.id, self.gone = id_, ""
+        self.sightings: list[MissionSighting] = []
+        self.of_date: list[MissionSighting] = []
+        self.sums: dict[str, float] = {}
 
     def add(self, sighting: MissionSighting) -> None:
         """Take a sighting; of a date's places, the mean by their errors counts."""
@@ -263,22 +218,12 @@ class _Thing:
 class _Working:
     """The findings while missions are added, one after another, with the places of those that still stand."""
 
-    def __init__(self, register: Register, sightings: Sequence[MissionSighting]) -> None:
-        self._known = register.findings
-        self._count = len(self._known)
-        self._ids = {each.id for each in self._known}
-        self._things: dict[int, _Thing] = {}
-        self._places_m = np.concatenate([register.places_m, np.zeros((len(sightings), 2))])
-        self._stands = np.zeros(len(self._places_m), bool)
-        self._stands[: self._count] = [not each.gone for each in self._known]
+    def __init__(self, most: int) -> None:
+        self.things: list[_Thing] = []
+        self._ids: set[str] = set()
+        self._places_m = np.zeros((most, 2))
+        self._stands = np.zeros(most, bool)
         self._seen: set[int] = set()  # on the date that is added
-
-    def findings(self) -> tuple[GroundFinding, ...]:
-        """All findings, those that were not touched as they were."""
-        result = list(self._known)
-        for number, thing in sorted(self._things.items()):
-            result[number : number + 1] = [thing.finding()]
-        return tuple(result)
 
     def take(self, mission: Sequence[MissionSighting]) -> None:
         """Add all sightings of one mission, each to a finding of its own."""
@@ -290,35 +235,29 @@ class _Working:
             around = cKDTree(self._places_m[near]).query_ball_point(places_m, radii_m)
             for row, columns in enumerate(around):
                 for number in near[columns].tolist():
-                    cost = _cost(mission[row], self._thing(number))
+                    cost = _cost(mission[row], self.things[number])
                     if cost is not None:
                         pairs[row, number] = cost
         joined = _one_to_one(pairs)
         for row, sighting in enumerate(mission):
             if (number := joined.get(row)) is None:
-                number, self._count = self._count, self._count + 1
-                empty = GroundFinding(
-                    self._id(sighting), (), sighting.position_m, sighting.sigma_m, {}
-                )
-                self._things[number] = _Thing(empty)
+                number = len(self.things)
+                self.things.append(_Thing(self._id(sighting)))
                 self._stands[number] = True
             self._seen.add(number)
-            thing = self._things[number]
-            thing.add(sighting)
-            self._places_m[number] = thing.place_m
+            self.things[number].add(sighting)
+            self._places_m[number] = self.things[number].place_m
 
     def end(self, date: str, searches: Sequence[SearchedFrames]) -> None:
         """Conclude a date: what it looked at and did not see is gone, and what had left before it."""
-        left = [
-            number for number, thing in self._things.items() if self._stands[number] and thing.left
-        ]
-        for number in set(left) - self._seen:
-            self._things[number].gone = self._things[number].left
-            self._stands[number] = False
+        for number, thing in enumerate(self.things):
+            if self._stands[number] and thing.left and number not in self._seen:
+                thing.gone = thing.left
+                self._stands[number] = False
         if outlines_m := [each.outlines_m.reshape(-1, 2) for each in searches]:
             near = self._standing_near(np.concatenate(outlines_m))
             unseen = [number for number in near.tolist() if number not in self._seen]
-            things = [self._thing(number) for number in unseen]
+            things = [self.things[number] for number in unseen]
             labels = [next(iter(_shares(each.sums))) for each in things]
             is_gone = looked_at(self._places_m[unseen], labels, searches)
             self._stands[unseen] = ~is_gone
@@ -331,14 +270,9 @@ class _Working:
         if not len(places_m):
             return np.zeros(0, np.int64)
         low_m, high_m = places_m.min(axis=0) - _MOST_WALK_M, places_m.max(axis=0) + _MOST_WALK_M
-        own_m = self._places_m[: self._count]
-        is_near = self._stands[: self._count] & ((own_m >= low_m) & (own_m <= high_m)).all(axis=1)
+        own_m = self._places_m[: len(self.things)]
+        is_near = self._stands[: len(own_m)] & ((own_m >= low_m) & (own_m <= high_m)).all(axis=1)
         return np.flatnonzero(is_near)
-
-    def _thing(self, number: int) -> _Thing:
-        if number not in self._things:
-            self._things[number] = _Thing(self._known[number])
-        return self._things[number]
 
     def _id(self, first: MissionSighting) -> str:
         attempt = 0
@@ -363,11 +297,6 @@ def _odds(sighting: MissionSighting) -> Mapping[str, float]:
 def _shares(sums: Mapping[str, float]) -> dict[str, float]:
     total = sum(sums.values()) or 1.0
     return {name: sums[name] / total for name in sorted(sums, key=lambda each: (-sums[each], each))}
-
-
-def _of_last_date(sightings: Sequence[MissionSighting]) -> list[MissionSighting]:
-    last = [each.date for each in sightings[-1:]]
-    return list(takewhile(lambda each: [each.date] == last, reversed(sightings)))[::-1]
 
 
 def _known(value: float, otherwise: float = 0.0) -> float:

@@ -12,7 +12,6 @@ from sorvolo.findings.register import (
     GroundFinding,
     KnownBy,
     MissionSighting,
-    Register,
     associate,
     id_by,
 )
@@ -41,7 +40,7 @@ def found_features(archive: Archive | None, tracks: Sequence[Track]) -> list[Fea
     if archive is None:
         longitude_deg, latitude_deg = tracks[0]["lonlat"][:2] if tracks else (0.0, 0.0)
         site = Site("watched", Geodetic(latitude_deg, longitude_deg, 0.0), "", 1.0)
-        register = associate(_sightings_of(tracks, site, []), Register())
+        register = associate(_sightings_of(tracks, site, []))
         stored: list[StoredObject] = []
     else:
         site = on_earth(archive.site())

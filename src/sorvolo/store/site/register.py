@@ -35,7 +35,7 @@ def site_register(
         if _is_of(change.flight_id, flights) and change.verdict is not Verdict.REJECTED:
             sightings += _of_change(change, before.get(change.flight_id, ""), dates)
     looks = [SearchedDate(each.flight_id, float(each.rank), each.frames) for each in searches]
-    return associate([*sightings, *watched], Register(), looks)
+    return associate([*sightings, *watched], looks)
 
 
 def flown_flights(connection: Connection) -> list[tuple[str, int, int, int]]:
