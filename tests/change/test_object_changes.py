@@ -101,5 +101,4 @@ def test_a_class_that_was_not_looked_for_is_not_gone() -> None:
 def test_what_is_longer_may_lie_farther_from_where_it_was() -> None:
     assert car("again", 12.2, 10).stands_where(car("parked", 10, 10))
     assert not car("short", 12.2, 10, length_m=1.7).stands_where(car("parked", 10, 10))
-    assert car("short", 12.2, 10, length_m=1.7).stands_where(car("parked", 10, 10), sigma_m=0.6)
     assert not car("moves", 10, 10, moving=True).stands_where(car("parked", 10, 10))

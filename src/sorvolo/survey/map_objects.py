@@ -63,16 +63,11 @@ class MapObject:
                 f"object {self.id}: seen {self.views} times of {self.possible_views}"
             )
 
-    def stands_where(self, other: "MapObject", sigma_m: float = 0.0) -> bool:
-        """Whether it stands where another date's object did, by its own size and twice what both places may err apart:
-        a car parked again. What moves stands nowhere."""
+    def stands_where(self, other: "MapObject") -> bool:
+        """Whether it stands where another date's object did, by its own size: a car parked again. What moves stands nowhere."""
         if self.moving or other.moving:
             return False
-        reach_m = (
-            REACH_OF_LENGTH * float(np.nan_to_num(self.length_m))
-            + REACH_M
-            + 2 * float(np.nan_to_num(sigma_m))
-        )
+        reach_m = REACH_OF_LENGTH * float(np.nan_to_num(self.length_m)) + REACH_M
         return bool(np.hypot(*(self.position_m - other.position_m)) <= reach_m)
 
 

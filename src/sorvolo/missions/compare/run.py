@@ -151,19 +151,14 @@ class CompareRun:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: object,
-        error: BaseException | None,
-        trace: object,
-    ) -> None:
+    def __exit__(self, *ended: Any) -> None:
         try:
             self._comparing.shutdown(cancel_futures=True)
             self._corroborating.shutdown(cancel_futures=True)
             self._objects.close()
         finally:  # also when Ctrl-C strikes again meanwhile
-            self._writer.__exit__(kind, error, trace)
-            self._memo.end(error)
+            self._writer.__exit__(*ended)
+            self._memo.end(ended[1])
 
     @property
     def views(self) -> int:

@@ -81,17 +81,12 @@ class FlightRun(ABC):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: object,
-        error: BaseException | None,
-        trace: object,
-    ) -> None:
+    def __exit__(self, *ended: Any) -> None:
         if self._finder is not None:
             self._finder.close()
         if self._writer is not None and self._began_writer:
-            self._writer.__exit__(kind, error, trace)
-        self._memo.end(error)
+            self._writer.__exit__(*ended)
+        self._memo.end(ended[1])
 
     @property
     def selected(self) -> int:
@@ -262,14 +257,9 @@ class PlanarRun(FlightRun):
             int, FoundFrame
         ] = {}  # by keyframe, where the site's own map shows its ground
 
-    def __exit__(
-        self,
-        kind: object,
-        error: BaseException | None,
-        trace: object,
-    ) -> None:
+    def __exit__(self, *ended: Any) -> None:
         self._spill.close()
-        super().__exit__(kind, error, trace)
+        super().__exit__(*ended)
 
     @property
     def images(self) -> Mapping[int, str]:
