@@ -213,8 +213,9 @@ def test_the_floor_of_free_space_holds(root: Path) -> None:
 def test_what_is_announced_needs_its_room_too(client: TestClient, monkeypatch: Any) -> None:
     usage = shutil.disk_usage("/")
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=20 * GIGA))
-    codes = [begin(client, f"{each}.mp4", 8 * GIGA).status_code for each in "abc"]
-    assert codes == [201, 201, 507]
+    answers = [begin(client, f"{each}.mp4", 8 * GIGA) for each in "abc"]
+    assert [each.status_code for each in answers] == [201, 201, 507]
+    assert f"{24 * GIGA / 1e9:.1f} GB of uploads are to come" in answers[2].text
 
 
 @pytest.mark.parametrize(

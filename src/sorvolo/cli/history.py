@@ -66,7 +66,8 @@ def history(
             return
         console = Console()
         _show_versions(entries, console)
-        console.print(came_and_left(place.folder), highlight=False, soft_wrap=True)
+        if words := came_and_left(place.folder):
+            console.print(words, highlight=False, soft_wrap=True)
         if entries and not (of_map := site_of(place.folder)).is_local:
             origin = of_map.origin
             written = place_text(

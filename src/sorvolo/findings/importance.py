@@ -43,6 +43,9 @@ def between(register: Register, before: str, after: str) -> str:
         if left[label]:
             words.append(f"{left[label]} left" if words else counted(left[label], label) + " left")
         parts.append(", ".join(words))
+    unsearched = [date for date in (before, after) if date not in known]
+    if not parts and unsearched:
+        return f"no telling what came or left: no objects were searched for on {' and '.join(unsearched)}"
     return "; ".join(parts) or "nothing known came or left"
 
 

@@ -225,9 +225,10 @@ class Uploads:
         """Raise Problem (507) where this many bytes more would not leave the floor of free space."""
         free = shutil.disk_usage(self._settings.root).free
         if free - more_bytes < self._settings.free_floor_gb * 1e9:
+            coming = f", {more_bytes / 1e9:.1f} GB of uploads are to come" if more_bytes else ""
             raise Problem(
                 507,
-                f"{free / 1e9:.1f} GB are free, and {self._settings.free_floor_gb:.1f} GB must stay so; delete "
+                f"{free / 1e9:.1f} GB are free{coming}, and {self._settings.free_floor_gb:.1f} GB must stay so; delete "
                 "uploads, recordings or flights that you no longer need",
             )
 
