@@ -1539,6 +1539,24 @@ def test_what_a_watch_found_is_judged_with_the_keyboard(opened: Watched, served:
         (results / "tracks.geojson").unlink()
 
 
+def test_a_vote_on_what_a_watch_has_just_found_is_shown(opened: Watched, served: Served) -> None:
+    """The page has it from an event, by the watch's own id; the station's list has it by its finding's."""
+    results, page = watch_run(served.station, "run-8"), opened.page
+    try:
+        place = {"type": "Point", "coordinates": [11.0, 46.0]}
+        person = {"id": 1, "class": "person", "score": 0.9}
+        found = {"type": "Feature", "id": 1, "properties": person, "geometry": place}
+        served.station.events.append(NewEvent("object.found", {"feature": found}, "field", "run-8"))
+        page.locator("[data-panel=review]").click()
+        page.get_by_role("button", name="Objects (1)").click()
+        page.locator(".strip button[data-id='run-8:1']").click()
+        page.keyboard.press("c")
+        page.locator(".strip button.confirmed").wait_for()
+        expect(page.locator(".strip button[data-id='run-8:1']")).to_have_count(0)
+    finally:
+        (results / "tracks.geojson").unlink()
+
+
 def serious(page: Any, rules: list[str] | None = None) -> list[str]:
     only = {"runOnly": {"type": "rule", "values": rules}} if rules else {}
     result = page.evaluate(

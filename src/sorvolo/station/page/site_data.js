@@ -59,7 +59,7 @@ export class SiteData extends EventTarget {
   }
 
   find(id) {
-    return this.all.changes.find((each) => each.id === id) ?? this.all.objects.find((each) => each.id === id) ?? null;
+    return this.all.changes.find((each) => each.id === id) ?? this.all.objects.find((each) => isOf(each, id)) ?? null;
   }
 
   choose(feature) {
@@ -82,11 +82,12 @@ export class SiteData extends EventTarget {
     this.changed([name]);
   }
 
-  /** A vote came, ours or another's: how all stand. */
-  judge({ kind, id, verdict, state, note, revision, who, at }) {
+  /** A vote came, ours or another's: how all stand. What a running watch found has another id in the station's list. */
+  async judge({ kind, id, verdict, state, note, revision, who, at }) {
     const name = kind === "change" ? "changes" : "objects";
     const found = this.all[name].find((each) => isOf(each, id));
-    if (!found || (found.properties.revision ?? 0) > revision) return;
+    if (!found) return this.load([name]).catch(() => {});
+    if ((found.properties.revision ?? 0) > revision) return;
     Object.assign(found.properties, { review: verdict === "none" ? null : verdict, note, revision, review_state: state, reviewer: who, reviewed_at: at });
     this.changed([name]);
   }

@@ -11,7 +11,7 @@ export async function judge(screen, feature, verdict, note = null) {
   const kind = isChange(feature) ? "change" : "object";
   const act = screen.opened?.see ? button("Show it", () => screen.opened?.see?.(feature)) : null; // the gallery has moved on
   try {
-    screen.data.judge(await post(siteUrl(screen.data.id, "reviews"), { kind, id: feature.id, verdict, note: note ?? values.note ?? "" }));
+    await screen.data.judge(await post(siteUrl(screen.data.id, "reviews"), { kind, id: feature.id, verdict, note: note ?? values.note ?? "" }));
     return true;
   } catch (problem) {
     message(problem.title, { kind: "error", todo: problem.detail, act });
