@@ -85,7 +85,7 @@ def test_all_missions_of_two_dates_see_each_thing_once() -> None:
     assert gone[0].presence("flight1") is Presence.GONE
     assert len(register.present) == 4
     assert between(register, "flight0", "flight1") == "1 person came, 1 left; 1 car left"
-    unsearched = associate([], Register(), [look(0)])
+    unsearched = associate([], [look(0)])
     assert "no objects were searched for on flight1" in between(unsearched, "flight0", "flight1")
     assert [each.label for each in ordered(register.findings)] == ["person"] * 2 + ["car"] * 4
 
