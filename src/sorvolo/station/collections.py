@@ -21,7 +21,7 @@ from sorvolo.store.exports.change_files import changes_geojson
 from sorvolo.store.exports.detection_files import CROPS, TRACKS
 from sorvolo.store.exports.ground_files import COVERAGE
 from sorvolo.store.exports.places import longitude_latitude
-from sorvolo.store.exports.plain import features_name
+from sorvolo.store.exports.plain import feature, features_name
 from sorvolo.store.nofollow import read_below
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.files import LIVE_COVERAGE, is_plain_name
@@ -259,14 +259,7 @@ def _frames_of(archive: Archive, site: Site, flight: str) -> list[Feature]:
         geometry = _lonlat(each.get("geometry"), site)
         if site.is_local:
             values |= _camera_on_earth(values, site)
-        features.append(
-            {
-                "type": "Feature",
-                "id": f"{flight}:{values.get('frame')}",
-                "geometry": geometry,
-                "properties": values,
-            }
-        )
+        features.append(feature(geometry, values, id=f"{flight}:{values.get('frame')}"))
     return features
 
 
@@ -292,9 +285,7 @@ def _track(archive: Archive) -> list[Feature]:
             "times": [time for time, _ in places],
         }
         geometry = {"type": "LineString", "coordinates": [place for _, place in places]}
-        features.append(
-            {"type": "Feature", "id": flight, "geometry": geometry, "properties": values}
-        )
+        features.append(feature(geometry, values, id=flight))
     return features
 
 
@@ -305,70 +296,41 @@ def _changes(archive: Archive) -> list[Feature]:
     for change, each in zip(
         stored, changes_geojson(stored, on_earth(archive.site()))["features"], strict=True
     ):
-        label = change.class_after or change.class_before or change.kind.value
-        version = versions.get(change.flight_id)
-        more = {
+        version, properties = versions.get(change.flight_id), each["properties"]
+        values = {
+            **properties,
             "flight": change.flight_id,
-            "class": label,
+            "class": change.class_after or change.class_before or change.kind.value,
             "version": version and version.id,
             "from_version": version and version.parent_id,
+            "datetime": properties["first_seen"],
+            "end_datetime": properties["last_seen"],
+            "review_kind": "change",
         }
-        features.append(_with(each, "change", label, more))
+        features.append(feature(each["geometry"], values, id=change.id))
     return features
-
-
-def _with(
-    feature: Feature, kind: str, label: str, more: Mapping[str, Any] | None = None
-) -> Feature:
-    values = {
-        **feature["properties"],
-        **(more or {}),
-        "class": label,
-        "datetime": feature["properties"]["first_seen"],
-        "end_datetime": feature["properties"]["last_seen"],
-        "review_kind": kind,
-    }
-    return {
-        "type": "Feature",
-        "id": values["id"],
-        "geometry": feature["geometry"],
-        "properties": values,
-    }
 
 
 def _coverage(archive: Archive) -> list[Feature]:
-    features = []
-    for flight in _flights(archive):
-        for number, each in enumerate(archive.features(f"flights/{flight}", COVERAGE)):
-            values = {**(each.get("properties") or {}), "flight": flight}
-            geometry = _lonlat(each.get("geometry"), archive.site())
-            features.append(
-                {
-                    "type": "Feature",
-                    "id": f"{flight}:{number}",
-                    "geometry": geometry,
-                    "properties": values,
-                }
-            )
-    for number, each in enumerate(
-        archive.features("", _LIVE_COVERAGE, is_local=False)
-    ):  # of the flight in the air
-        values = {**(each.get("properties") or {}), "flight": None}
-        geometry = _lonlat(each.get("geometry"), archive.site())
-        features.append(
-            {"type": "Feature", "id": f"live:{number}", "geometry": geometry, "properties": values}
+    site = archive.site()
+    parts: list[tuple[str | None, list[Any]]] = [
+        (flight, archive.features(f"flights/{flight}", COVERAGE)) for flight in _flights(archive)
+    ]
+    in_the_air = archive.features("", _LIVE_COVERAGE, is_local=False)
+    return [
+        feature(
+            _lonlat(each.get("geometry"), site),
+            {**(each.get("properties") or {}), "flight": flight},
+            id=f"{flight or 'live'}:{number}",
         )
-    return features
+        for flight, found in [*parts, (None, in_the_air)]
+        for number, each in enumerate(found)
+    ]
 
 
 def _pod(archive: Archive) -> list[Feature]:
     return [
-        {
-            "type": "Feature",
-            "id": str(number),
-            "geometry": each.get("geometry"),
-            "properties": each.get("properties"),
-        }
+        feature(each.get("geometry"), each.get("properties"), id=str(number))
         for number, each in enumerate(archive.features(SEARCH_FOLDER, "pod", is_local=False))
     ]
 

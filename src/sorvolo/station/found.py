@@ -18,7 +18,7 @@ from sorvolo.findings.register import (
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.store.exports.change_files import objects_geojson
 from sorvolo.store.exports.places import place_deg
-from sorvolo.store.exports.plain import rounded, utc_text
+from sorvolo.store.exports.plain import feature, rounded, utc_text
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.change_records import StoredObject
 from sorvolo.survey.flight import Site
@@ -152,7 +152,7 @@ def _feature(
         "crop_of": crop,
     }
     geometry = {"type": "Point", "coordinates": [values["longitude"], values["latitude"]]}
-    return {"type": "Feature", "id": found.id, "geometry": geometry, "properties": values}
+    return feature(geometry, values, id=found.id)
 
 
 def _ns(time: str) -> int:

@@ -17,7 +17,7 @@ from sorvolo.missions.heights.run import height_grid, newest_flight, run_of
 from sorvolo.paths import AnyPath
 from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.store.exports.places import longitude_latitude
-from sorvolo.store.exports.plain import feature_collection, geojson_bytes
+from sorvolo.store.exports.plain import feature, feature_collection, geojson_bytes
 from sorvolo.store.rasters.height_model import read_height_cog
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.files import DamagedError, HeightFile
@@ -231,8 +231,4 @@ def _read_report(archive: Archive, flight_id: str) -> Mapping[str, Any] | None:
 def _line(line: Any, level_m: float, site: Site) -> dict[str, Any]:
     longitudes, latitudes = longitude_latitude(line, site)
     places = [[round(float(x), 8), round(float(y), 8)] for x, y in zip(longitudes, latitudes)]
-    return {
-        "type": "Feature",
-        "geometry": {"type": "LineString", "coordinates": places},
-        "properties": {"height_m": round(level_m, 3)},
-    }
+    return feature({"type": "LineString", "coordinates": places}, {"height_m": round(level_m, 3)})

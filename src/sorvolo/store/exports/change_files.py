@@ -11,7 +11,7 @@ from sorvolo.geometry.arrays import Boxes, Floats, ImageBGR, ImageGray, Mask
 from sorvolo.geometry.polygons import signed_area
 from sorvolo.store.atomic import atomic_write_bytes, make_folder
 from sorvolo.store.exports.places import Placemark, place_deg, ring
-from sorvolo.store.exports.plain import feature_collection, rounded, time_words, utc_text
+from sorvolo.store.exports.plain import feature, feature_collection, rounded, time_words, utc_text
 from sorvolo.store.images import png_from_rgba
 from sorvolo.store.site.change_records import StoredChange, StoredObject
 from sorvolo.survey.findings import Change, Verdict
@@ -124,13 +124,9 @@ def _feature(change: StoredChange, site: Site) -> dict[str, Any]:
         "review": None if change.verdict is None else change.verdict.value,
         "note": change.note or None,
     }
-    return {
-        "type": "Feature",
-        "id": change.id,
-        "geometry": {"type": "Polygon", "coordinates": [_ring(change.outline_m, site)]},
-        "properties": properties,
-        "outline_m": [[rounded(east, 4), rounded(north, 4)] for east, north in change.outline_m],
-    }
+    geometry = {"type": "Polygon", "coordinates": [_ring(change.outline_m, site)]}
+    outline_m = [[rounded(east, 4), rounded(north, 4)] for east, north in change.outline_m]
+    return feature(geometry, properties, id=change.id) | {"outline_m": outline_m}
 
 
 def _description(change: StoredChange) -> str:
@@ -250,9 +246,5 @@ def _feature_object(stored: StoredObject, site: Site, crops_from_site: bool) -> 
         "best_frame": each.best_frame,
         "crop": f"{folder}{CROPS}/{crop_name(each.id)}",
     }
-    return {
-        "type": "Feature",
-        "id": _identity(stored),
-        "geometry": {"type": "Point", "coordinates": coordinates},
-        "properties": properties,
-    }
+    geometry = {"type": "Point", "coordinates": coordinates}
+    return feature(geometry, properties, id=_identity(stored))

@@ -10,7 +10,13 @@ from sorvolo.geometry.arrays import Floats, PointsM
 from sorvolo.geometry.polygons import signed_area, swollen
 from sorvolo.geometry.pose import gimbal_angles_from_rotation
 from sorvolo.store.exports.places import longitude_latitude, place_deg, ring
-from sorvolo.store.exports.plain import feature_collection, geojson_bytes, rounded, utc_text
+from sorvolo.store.exports.plain import (
+    feature,
+    feature_collection,
+    geojson_bytes,
+    rounded,
+    utc_text,
+)
 from sorvolo.survey.control import ControlReport, ControlResidual, ControlRole
 from sorvolo.survey.coverage import CoveredGround, SeenGround
 from sorvolo.survey.flight import Site
@@ -52,7 +58,7 @@ def _frame(frame: PlacedFrame, site: Site) -> dict[str, Any]:
     geometry = None
     if np.isfinite(frame.outline_m).all():
         geometry = {"type": "Polygon", "coordinates": [ring(frame.outline_m, site, 10)]}
-    return {"type": "Feature", "geometry": geometry, "properties": properties}
+    return feature(geometry, properties)
 
 
 def _camera_place(frame: PlacedFrame, site: Site) -> dict[str, Any]:
@@ -145,7 +151,7 @@ def _multipolygon(
     ]
     geometry = {"type": "MultiPolygon", "coordinates": polygons}
     rings_m = [[np.round(corners, 3).tolist() for corners in rings] for rings in polygons_m]
-    return {"type": "Feature", "geometry": geometry, "properties": properties, "rings_m": rings_m}
+    return feature(geometry, properties) | {"rings_m": rings_m}
 
 
 def control_summary(report: ControlReport) -> dict[str, Any]:

@@ -85,6 +85,11 @@ def feature_collection(
     return {"name": name, "crs": None, "note": note, "features": plain}
 
 
+def feature(geometry: Any, properties: Any, **own: Any) -> dict[str, Any]:
+    """One feature of GeoJSON; `own` are further members, such as its id."""
+    return {"type": "Feature", **own, "geometry": geometry, "properties": properties}
+
+
 def features_name(name: str, *, is_local: bool) -> str:
     """The file name of a collection: GeoJSON, or plain JSON for a local site."""
     return f"{name}.json" if is_local else f"{name}.geojson"

@@ -18,6 +18,7 @@ from sorvolo.geometry.polygons import swollen
 from sorvolo.store.atomic import atomic_path
 from sorvolo.store.exports.map_pictures import Picture, with_room
 from sorvolo.store.exports.places import longitude_latitude, near_longitudes
+from sorvolo.store.exports.plain import feature
 from sorvolo.store.rasters.geotiff import crs_of_epsg, quiet_gdal
 from sorvolo.survey.flight import Site
 
@@ -132,11 +133,10 @@ def region_features(
     for region, own in zip(regions, properties, strict=True):
         rings = [np.round([*ring, ring[0]], 9).tolist() for ring in region.rings_lonlat]
         features.append(
-            {
-                "type": "Feature",
-                "geometry": {"type": "Polygon", "coordinates": rings},
-                "properties": {**own, "area_m2": round(region.area_m2, 1)},
-            }
+            feature(
+                {"type": "Polygon", "coordinates": rings},
+                {**own, "area_m2": round(region.area_m2, 1)},
+            )
         )
     return features
 
@@ -148,11 +148,7 @@ def point_features(
     longitudes, latitudes = longitude_latitude(np.reshape(places_m, (-1, 2)), site)
     places = np.round(np.column_stack([longitudes, latitudes]), 9).tolist()
     return [
-        {
-            "type": "Feature",
-            "geometry": {"type": "Point", "coordinates": place},
-            "properties": dict(own),
-        }
+        feature({"type": "Point", "coordinates": place}, dict(own))
         for place, own in zip(places, properties, strict=True)
     ]
 

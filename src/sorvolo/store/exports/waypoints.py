@@ -19,6 +19,7 @@ from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.geometry.planning import FlightPlan
 from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.store.exports.places import kml_from_one
+from sorvolo.store.exports.plain import feature
 
 _KML, _WPML = "http://www.opengis.net/kml/2.2", "http://www.dji.com/wpmz/1.0.2"
 _SAFE_HEIGHT_M = 20.0  # at least so high before the way to the first waypoint begins
@@ -341,11 +342,7 @@ def _geojson(plan: FlightPlan, lonlat: _LonLat, name: str) -> str:
 
 
 def _feature(kind: str, coordinates: Any, properties: _Item) -> _Item:
-    return {
-        "type": "Feature",
-        "geometry": {"type": kind, "coordinates": coordinates},
-        "properties": properties,
-    }
+    return feature({"type": kind, "coordinates": coordinates}, properties)
 
 
 def _summary(plan: FlightPlan) -> _Item:
