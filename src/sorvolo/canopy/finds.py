@@ -25,7 +25,8 @@ from sorvolo.geometry.arrays import Floats32, Numbers, PointsM
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.views import View
 
-_LEAST_ANOMALY = 5.0  # sigmas; chosen on simulated forests, as all of these
+# by choice, after looks at simulated forests and at one real one
+_LEAST_ANOMALY = 5.0  # sigmas
 _APART_M = 1.5  # finds that are nearer are one
 _REACH_M = 3.0  # of the ground that is looked at around a find
 _AREA_M2 = (0.08, 2.0)  # at half the contrast
