@@ -397,12 +397,13 @@ def test_a_flight_without_telemetry_finds_itself(flown, site, tmp_path):
 
 
 def test_a_guessed_camera_becomes_the_one_that_mapping_found(surveyed, tmp_path):
-    site = tmp_path / "site"
-    for _ in map_flights([surveyed / "flight1"], site, _MAP):
+    site, bare = tmp_path / "site", tmp_path / "no-camera-file"
+    shutil.copytree(surveyed, bare, ignore=shutil.ignore_patterns("camera.xml"))
+    for _ in map_flights([bare / "flight1"], site, _MAP):
         pass
     found = report(site, "flight1")["camera"]
     for _ in compare_flights(
-        [surveyed / "flight2"], site, replace(_COMPARE, updates_map=False, views_per_second=1)
+        [bare / "flight2"], site, replace(_COMPARE, updates_map=False, views_per_second=1)
     ):
         pass
     printed = report(site)["camera"]
