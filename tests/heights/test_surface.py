@@ -301,12 +301,7 @@ def test_the_orthophoto_shows_roofs_and_ground_in_their_place(survey, surface: S
     site_grid = SiteGrid.at(ORIGIN, 30 / views[0].camera.fx_px, CRS)
     tiles = {
         index: rgba
-        for index, rgba, _ in paint_orthophoto(
-            surface,
-            site_grid,
-            views,
-            lambda k, part: pictures[k][part[1] : part[3], part[0] : part[2]],
-        )
+        for index, rgba, _ in paint_orthophoto(surface, site_grid, views, lambda k: pictures[k])
     }
     lattice = surface.lattice
     picture = np.zeros((*lattice.shape, 4), np.uint8)

@@ -1,7 +1,6 @@
 """The true orthophoto: each piece of ground seen by a photo that nothing hides it from, on its own height."""
 
 from collections.abc import Callable, Collection, Iterator, Sequence
-from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -22,9 +21,6 @@ from sorvolo.mosaic.blending import (
     winners_from_shares,
 )
 
-Part: TypeAlias = tuple[int, int, int, int]
-"""Of a picture, px: x0, y0, x1, y1, ends exclusive."""
-
 _HIDDEN_CELLS = 3.0  # a height this much above the line of sight, in cells, hides what is behind
 _HIDDEN_MERIT = 0.02  # of a photo that does not see the ground, against one that does
 _BLOCK_TILES = 2  # painted together, to a side: what is painted around them is a smaller share
@@ -37,12 +33,12 @@ def paint_orthophoto(
     surface: Surface,
     site_grid: SiteGrid,
     views: Sequence[View],
-    pictures: Callable[[int, Part], ImageRGB],
+    pictures: Callable[[int], ImageRGB],
 ) -> Iterator[tuple[TileIndex, ImageRGBA, float]]:
     """The tiles of the true orthophoto, block by block, each with the share that is done; those unseen are left out.
 
-    `pictures(i, part)` is a part, always the same, of view i's picture without distortion, its exposure corrected;
-    holes of the surface are closed from the ground around.
+    `pictures(i)` is view i's picture without distortion, its exposure corrected; holes of the surface are closed from
+    the ground around.
     """
     ground = filled(surface.up_m, np.isfinite(surface.up_m))
     painter = _Painter(
@@ -137,15 +133,10 @@ class _Painter:
         labels: Winners,
         site_grid: SiteGrid,
         views: Sequence[View],
-        pictures: Callable[[int, Part], ImageRGB],
+        pictures: Callable[[int], ImageRGB],
     ) -> None:
         self._ground, self._labels, self._views = ground, labels, views
         self._pictures, self._grid = pictures, site_grid.grid
-        reach = int(np.ceil(LAYER_APRON_PX * self._grid.m_per_px / lattice.cell_m)) + 2
-        self._parts = [
-            _part_of(view, number, lattice, ground, labels, reach)
-            for number, view in enumerate(views)
-        ]
         right, bottom = lattice.width - 1, lattice.height - 1
         corners = lattice.site_from_cells @ np.array(
             [[0, right, right, 0], [0, 0, bottom, bottom], [1, 1, 1, 1]]
@@ -229,13 +220,8 @@ class _Painter:
                 self._site_from_grid @ shift @ _shift(x0, y0),
                 up_m[y0:y1, x0:x1],
             )
-            part = self._parts[number]
             seen = cv2.remap(
-                self._pictures(number, part),
-                u - part[0],
-                v - part[1],
-                cv2.INTER_LINEAR,
-                borderMode=cv2.BORDER_REFLECT_101,
+                self._pictures(number), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101
             )
             yield Layer(number, x0, y0, np.asarray(seen, np.uint8))
 
@@ -263,30 +249,6 @@ def _window_of(view: View, lattice: Lattice, up_m: Floats32) -> tuple[int, int, 
         np.ceil(cells.max(axis=0)).astype(int) + 2, 0, [lattice.width, lattice.height]
     ).tolist()
     return x0, y0, x1, y1
-
-
-def _part_of(
-    view: View, number: int, lattice: Lattice, up_m: Floats32, labels: Winners, reach: int
-) -> Part:
-    """What a view's picture shows of the cells that it wins, and of those up to `reach` cells beside them."""
-    x0, y0, x1, y1 = _window_of(view, lattice, up_m)
-    left, top, width, height = cv2.boundingRect(pixels_of(labels[y0:y1, x0:x1], number))
-    if not width:
-        return 0, 0, 1, 1
-    x1, y1 = (
-        min(lattice.width, x0 + left + width + reach),
-        min(lattice.height, y0 + top + height + reach),
-    )
-    x0, y0 = max(0, x0 + left - reach), max(0, y0 + top - reach)
-    around = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
-    near = cv2.dilate(pixels_of(labels[y0:y1, x0:x1], number), around) > 0
-    window = lattice.window(x0, y0, x1, y1)
-    u, v = laid_pixels(view, window.site_from_cells, np.ascontiguousarray(up_m[y0:y1, x0:x1]))
-    ends = []
-    for at, size in ((u[near], view.camera.width_px), (v[near], view.camera.height_px)):
-        low = int(np.clip(np.floor(at.min()) - 1, 0, size - 1))
-        ends.append((low, int(np.clip(np.ceil(at.max()) + 2, low + 1, size))))
-    return ends[0][0], ends[1][0], ends[0][1], ends[1][1]
 
 
 def _merit(window: Lattice, up_m: Floats32, view: View) -> Floats:

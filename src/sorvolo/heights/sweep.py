@@ -406,7 +406,7 @@ class _Laid:
         columns, rows = np.arange(self.shape[1]), np.arange(self.shape[0])[:, None]
         known = np.ones(self.shape, bool)
         for line in lines:
-            known &= line[0] * columns >= -(line[1] * rows + line[2])
+            known &= line[0] * columns + (line[1] * rows + line[2]) >= 0
         return known
 
     def shows(self, up_m: Floats32, side: int) -> Mask:
@@ -532,12 +532,8 @@ def _likeness(product: Floats32, both: Sequence[Seen], settings: SweepSettings) 
     assert total is not None
     if not partly:
         return np.divide(total, np.float32(whole), out=total)
-    count = np.full_like(total, whole)
-    for seen in partly:
-        count += seen
-    total /= np.maximum(count, 1)
-    total -= count == 0  # where it is 0
-    return total
+    count = np.sum(partly, axis=0, dtype=np.float32) + np.float32(whole)
+    return np.where(count > 0, total / np.maximum(count, 1), np.float32(-1))
 
 
 def _better_mean(scores: list[Floats32], share: float) -> Floats32:

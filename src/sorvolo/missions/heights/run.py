@@ -22,7 +22,7 @@ from sorvolo.heights.figures import (
     surface_warnings,
 )
 from sorvolo.heights.lattice import Lattice
-from sorvolo.heights.orthophoto import Part, paint_orthophoto
+from sorvolo.heights.orthophoto import paint_orthophoto
 from sorvolo.heights.surface import Surface, SurfaceSettings, sweep_surface
 from sorvolo.heights.terrain import terrain
 from sorvolo.heights.views import View, fix_from_residual, ground_outlines_m, pixels_wide
@@ -35,7 +35,7 @@ from sorvolo.registration.lens import Undistorter, at_size, refined_camera
 from sorvolo.store.atomic import atomic_write_bytes, scratch_folder
 from sorvolo.store.exports.plain import features_name, json_bytes
 from sorvolo.store.freed_memory import give_back
-from sorvolo.store.images import BytesCache, png_from_rgba
+from sorvolo.store.images import ImageCache, png_from_rgba
 from sorvolo.store.rasters.geotiff import write_cog
 from sorvolo.store.rasters.height_model import write_height_cog
 from sorvolo.store.site.archive import Archive
@@ -96,7 +96,7 @@ def _residuals_m(archive: Archive, flight_id: str) -> dict[str, tuple[float | No
         raise InputError(f"{path} is gone or damaged ({error!r}); map the flight again") from error
 
 
-_LARGE_BYTES = 192 << 20  # of parts of pictures, for the orthophoto: about 15 of 12 megapixels
+_LARGE_BYTES = 192 << 20  # of pictures as stored, for the orthophoto: five of 12 megapixels
 _SMALL_BYTES = (
     128 << 20
 )  # of gray ones, for the sweep: about a hundred of 4000 px at the usual cells
@@ -115,12 +115,11 @@ class FlightPictures:
         self._lens = (
             Undistorter(refined_camera(keyframes[0].camera, 1.0, *radial)) if any(radial) else None
         )
-        self._large = BytesCache[tuple[int, Part], ImageRGB](_LARGE_BYTES, lambda part: part.nbytes)
+        self._large = ImageCache(self._load, _LARGE_BYTES)
 
-    def colour(self, number: int, part: Part) -> ImageRGB:
-        """A part of a picture as it is stored, corrected."""
-        x0, y0, x1, y1 = part
-        return self._large.get((number, part), lambda: self._load(number)[y0:y1, x0:x1].copy())
+    def colour(self, number: int) -> ImageRGB:
+        """A picture as it is stored, corrected."""
+        return self._large.get(number)
 
     def release(self) -> None:
         """Drop the pictures that are kept."""
