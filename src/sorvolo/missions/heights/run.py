@@ -35,7 +35,7 @@ from sorvolo.registration.lens import Undistorter, at_size, refined_camera
 from sorvolo.store.atomic import atomic_write_bytes, scratch_folder
 from sorvolo.store.exports.plain import features_name, json_bytes
 from sorvolo.store.freed_memory import give_back
-from sorvolo.store.images import ImageCache, png_from_rgba
+from sorvolo.store.images import BytesCache, ImageCache, png_from_rgba
 from sorvolo.store.rasters.geotiff import write_cog
 from sorvolo.store.rasters.height_model import write_height_cog
 from sorvolo.store.site.archive import Archive
