@@ -70,13 +70,12 @@ def search_under_trees(
             replace(v, camera=v.camera.resized(*(max(32, round(n * share)) for n in (v.camera.width_px, v.camera.height_px))))
             for v in views
         ]  # fmt: skip
-        whole = 0, 0, keyframes[0].camera.width_px, keyframes[0].camera.height_px
-        colours = pictures.colour(0, whole).astype(np.int16)
+        colours = pictures.colour(0).astype(np.int16)
         is_thermal = int(np.ptp(colours, axis=2).max()) <= _GRAY
 
         def load(number: int) -> Any:
             size = views[number].camera.width_px, views[number].camera.height_px
-            image = cv2.resize(pictures.colour(number, whole), size, interpolation=cv2.INTER_AREA)
+            image = cv2.resize(pictures.colour(number), size, interpolation=cv2.INTER_AREA)
             return image[..., 1] if is_thermal else image
 
         grid = height_grid(site, cell_m)
