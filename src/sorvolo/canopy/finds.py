@@ -132,7 +132,8 @@ def _judge(
         share(_mean(views, numbers, images, window, up_m + k * step_m)[0])
         for k in (-1, -0.5, 0.5, 1)
     ]
-    if max(profile[0], profile[3]) > _FADED or max(profile) > 1:
+    faded = max(profile[0], profile[3])
+    if faded > _FADED or max(profile) > 1:
         return "at another height than the floor"
 
     alone = np.array([share(each) for each in laid])
@@ -143,7 +144,7 @@ def _judge(
         area_m2,
         int(shows.sum()),
         weakest,
-        max(profile[0], profile[3]),
+        faded,
         tuple(views[numbers[k]].name for k in best),
     )
 

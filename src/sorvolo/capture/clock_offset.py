@@ -22,14 +22,8 @@ _ALIKE = 2.0  # times the best misfit, or half a fix's sigma: an offset that fit
 _FREE_STEP_S = 0.5  # between offsets all over the log
 _NEAR_S = 2.0  # from the best of these: searched more closely
 _MOST_FRAMES = 400  # that a noise is learnt from
-_SHARES = (
-    0.0,
-    0.25,
-    0.5,
-    0.75,
-    0.9,
-    0.97,
-)  # of the noise that neighbouring frames may have in common
+# of the noise that neighbouring frames may have in common
+_SHARES = (0.0, 0.25, 0.5, 0.75, 0.9, 0.97)
 _MEMORIES = 6  # times in which it is forgotten: from one frame to the whole flight
 
 
@@ -235,16 +229,15 @@ def _smooth_path(
     On straight lines from fix to fix noise is halved midway between two. Where frames and fixes keep step, an offset of
     half an interval then fits better than the true one: by 0.04 s on flights with fixes ten times a second.
     """
-    reach = _REACH
-    if interval_s <= 0 or len(fix_s) <= 2 * reach:
+    if interval_s <= 0 or len(fix_s) <= 2 * _REACH:
         return fix_s, fixes_m
     step_s = interval_s / _STEPS
     first_s, last_s = max(fix_s[0], within_s[0] - step_s), min(fix_s[-1], within_s[1] + step_s)
     path_s = np.arange(first_s, last_s + step_s / 2, step_s)
     if len(path_s) < 2:
         return fix_s, fixes_m
-    first = np.clip(np.searchsorted(fix_s, path_s) - reach, 0, len(fix_s) - 2 * reach)
-    rows = first[:, None] + np.arange(2 * reach)
+    first = np.clip(np.searchsorted(fix_s, path_s) - _REACH, 0, len(fix_s) - 2 * _REACH)
+    rows = first[:, None] + np.arange(2 * _REACH)
     along = (fix_s[rows] - path_s[:, None]) / (_WIDTH * interval_s)
     weight = np.exp(-0.5 * along**2)
     powers = along[..., None] ** np.arange(3)

@@ -458,8 +458,8 @@ class _Connection(H11Protocol):
         super().connection_made(transport)
         self._since_s = self.loop.time()
         self.loop.call_later(self._SILENT_S, self._look)
-        silent = [each for each in self.connections if isinstance(each, _Connection)]
-        silent = sorted(filter(_Connection._is_silent, silent), key=lambda each: each._since_s)
+        own = (each for each in self.connections if isinstance(each, _Connection))
+        silent = sorted((each for each in own if each._is_silent()), key=lambda each: each._since_s)
         for each in silent[: -self._MOST_SILENT]:
             each.transport.abort()
 

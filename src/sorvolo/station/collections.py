@@ -214,13 +214,26 @@ class SiteCollections:
             known = self._kept.get((site_id, name))
         if known is not None and known.mark == mark:
             return known.collection
-        content = _content(archive)
-        if known is not None and known.content == content:
-            made = known.collection
-        else:
-            made = Collection.of(_MAKERS[name](archive) if archive.has_site else [])
+        return self._made(
+            (site_id, name),
+            _content(archive),
+            lambda: _MAKERS[name](archive) if archive.has_site else [],
+            mark,
+        )
+
+    def _made(
+        self,
+        key: tuple[str, str],
+        content: object,
+        make: Callable[[], Sequence[Feature]],
+        mark: object = None,
+    ) -> Collection:
+        """The collection that is kept for this content, else made of it and kept."""
         with self._lock:
-            self._kept[site_id, name] = _Kept(mark, content, made)
+            known = self._kept.get(key)
+        made = known.collection if known and known.content == content else Collection.of(make())
+        with self._lock:
+            self._kept[key] = _Kept(mark, content, made)
         return made
 
     def _found(self, site_id: str, name: str) -> Collection:
@@ -232,17 +245,14 @@ class SiteCollections:
             if not tracks:
                 raise
             archive = None
-        content = (archive and _content(archive), tracks)
-        with self._lock:
-            known = self._kept.get((site_id, name))
-        if known is None or known.content != content:
-            found = found_features(archive if archive and archive.has_site else None, tracks)
-            if name != FINDINGS:
-                found = [each for each in found if not each["properties"]["gone"]]
-            known = _Kept(None, content, Collection.of(found))
-        with self._lock:
-            self._kept[site_id, name] = known
-        return known.collection
+
+        def make() -> Sequence[Feature]:
+            if name == FINDINGS:
+                return found_features(archive if archive and archive.has_site else None, tracks)
+            found = self._found(site_id, FINDINGS).features
+            return [each for each in found if not each["properties"]["gone"]]
+
+        return self._made((site_id, name), (archive and _content(archive), tracks), make)
 
 
 def _frames(archive: Archive) -> list[Feature]:

@@ -272,7 +272,7 @@ def _keep(connection: sqlite3.Connection, key: tuple[str, str], vote: Review) ->
 
 
 def _as_stored(review: Review) -> Verdict | None:
-    """What missions are told: nothing while people disagree, or are unsure."""
+    """The verdict that missions take: none while people disagree, or are unsure."""
     return Verdict(review.verdict) if review.verdict in set(Verdict) else None
 
 

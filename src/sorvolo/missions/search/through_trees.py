@@ -18,7 +18,7 @@ from sorvolo.missions.heights.run import FlightPictures, flight_views, height_gr
 from sorvolo.paths import AnyPath
 from sorvolo.store.atomic import atomic_write_bytes, make_folder
 from sorvolo.store.exports.places import place_deg
-from sorvolo.store.exports.plain import feature_collection, geojson_bytes, json_bytes
+from sorvolo.store.exports.plain import feature, feature_collection, geojson_bytes, json_bytes
 from sorvolo.store.images import ImageCache
 from sorvolo.store.rasters.height_model import write_height_cog
 from sorvolo.store.site.archive import Archive
@@ -96,16 +96,16 @@ def search_under_trees(
         "refused": dict(finds.refused),
         "pictures": len(views),
         "seen_m2": float(seen.sum()) * cell_m**2,
-        "views_median": float(np.median(under.views[seen])) if seen.any() else 0.0,
+        "views_median": float(np.median(under.views[seen])),
         "floor_m": float(np.median(floor.up_m)) + zero_m,
         "floor_sigma_m": float(np.median(floor.sigma_m)),
         "height_reference": site.height_reference,
         "notices": [*notices, *(each.text for each in archive.notices)],
     }
     features = [
-        {"type": "Feature", "geometry": {"type": "Point", "coordinates": place_deg(find.place_m, site)}, "properties": row}
+        feature({"type": "Point", "coordinates": place_deg(find.place_m, site)}, row)
         for find, row in zip(finds.people, rows)
-    ]  # fmt: skip
+    ]
     collection = feature_collection("under_trees", features, is_local=False)
     atomic_write_bytes(folder / "under_trees.geojson", geojson_bytes(collection))
     atomic_write_bytes(folder / "under_trees.json", json_bytes(report))
@@ -114,5 +114,9 @@ def search_under_trees(
 
 def _properties(find: Find, site: Site) -> dict[str, Any]:
     longitude_deg, latitude_deg = place_deg(find.place_m, site)
-    row = asdict(find) | {"latitude_deg": latitude_deg, "longitude_deg": longitude_deg}
-    return row | {"pictures": list(find.pictures), "place_m": find.place_m.tolist()}
+    return asdict(find) | {
+        "latitude_deg": latitude_deg,
+        "longitude_deg": longitude_deg,
+        "pictures": list(find.pictures),
+        "place_m": find.place_m.tolist(),
+    }

@@ -25,6 +25,7 @@ from sorvolo.store.atomic import (
 from sorvolo.store.exports.places import Placemark, longitude_latitude, place_deg
 from sorvolo.store.exports.plain import (
     NO_PLACE_FILES,
+    feature,
     feature_collection,
     features_name,
     json_bytes,
@@ -186,8 +187,8 @@ def write_detections(folder: Path, site: Site) -> int:
         file.write(json.dumps(head, ensure_ascii=False)[:-1] + ', "features": [\n')
         for line in lines:
             row = json.loads(line)
-            feature = {**kind, "geometry": _point(row), "properties": row}
-            file.write((",\n" if count else "") + json.dumps(feature, ensure_ascii=False))
+            each = {**kind, "geometry": _point(row), "properties": row}
+            file.write((",\n" if count else "") + json.dumps(each, ensure_ascii=False))
             count += 1
         file.write("\n]}\n")
     return count
@@ -226,18 +227,12 @@ def tracks_collection(
     features = []
     for track in tracks:
         properties = track_properties(track, site)
-        features.append(
-            {
-                "type": "Feature",
-                "id": track.id,
-                "geometry": _point(properties),
-                "properties": {
-                    **properties,
-                    "crop": crops.get(track.id),
-                    "path": _path(track.path_m, track.path_ns, site),
-                },
-            }
-        )
+        shown = {
+            **properties,
+            "crop": crops.get(track.id),
+            "path": _path(track.path_m, track.path_ns, site),
+        }
+        features.append(feature(_point(properties), shown, id=track.id))
     return _collection(TRACKS, features, site)
 
 

@@ -170,17 +170,16 @@ def control_summary(report: ControlReport) -> dict[str, Any]:
 def control_documents(report: ControlReport) -> dict[str, bytes]:
     """The file of control points for the flight's folder, by its name."""
     features = [
-        {
-            "type": "Feature",
-            "geometry": {
+        feature(
+            {
                 "type": "Point",
                 "coordinates": [
                     round(each.point.longitude_deg, 9),
                     round(each.point.latitude_deg, 9),
                 ],
             },
-            "properties": _residual(each),
-        }
+            _residual(each),
+        )
         for each in report.residuals
     ]
     return {CONTROL_FILE: geojson_bytes(feature_collection("control", features, is_local=False))}
