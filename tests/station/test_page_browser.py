@@ -1,6 +1,8 @@
 """The page in a real Chromium before a real station: what a crew does with it, and what must never happen."""
 
+import itertools
 import json
+import random
 import re
 import shutil
 import struct
@@ -294,6 +296,53 @@ def test_keys_are_meant_for_what_is_shown_though_the_station_answers_late(
         f".strip button.open[data-id='{second}']"
     ).wait_for()  # withdrawn: it is to be reviewed again
     assert watched.faults == []
+    page.context.close()
+
+
+def test_no_vote_is_lost_to_the_network_or_a_restart(browser: Any, served: Served) -> None:
+    """Votes that are given while requests and answers get lost come to the station in their order."""
+    page = browser.new_context().new_page()
+    page.goto(served.url)
+    page.locator(".card").wait_for()
+    chance, faults = random.Random(7), []
+
+    def lossy(route: Any) -> None:
+        fault = chance.choice(["request", "answer", "busy", None])
+        if fault == "answer":
+            route.fetch()
+        faults.append(fault)
+        if fault in ("request", "answer"):
+            route.abort()
+        elif fault == "busy":
+            route.fulfill(status=503, json={"title": "busy"})
+        else:
+            route.continue_()
+
+    page.route("**/reviews", lossy)
+    given = [str(number) for number in range(40)]
+    ids = [each["id"] for each in changes(served)]
+    for begun in range(0, len(given), 10):  # the page begins anew four times, others at work still
+        page.evaluate(
+            """async ([notes, ids, begun]) => {
+          const {votes} = await import(`/page/votes.js?begun=${begun}`);
+          votes.who = 'this machine';
+          setInterval(() => dispatchEvent(new Event('online')), 10);
+          for (const note of notes)
+            votes.add({site: 'field', kind: 'change', id: ids[note % 2], verdict: ['confirmed', 'rejected'][note % 3 % 2], note});
+        }""",
+            [given[begun : begun + 10], ids, begun],
+        )
+    wait_for(lambda: page.evaluate("localStorage.getItem('sorvolo-votes')") == "[]", 60)
+    notes = [each["note"] for each in served.ask("/api/sites/field/reviews?kind=change")][::-1]
+    notes = [each for each in notes if each.isdigit()]
+    assert [each for each, _ in itertools.groupby(notes)] == given
+    assert len([each for each in faults if each]) > 60
+    for each in ids[:2]:
+        served.ask(
+            "/api/sites/field/reviews",
+            "POST",
+            {"kind": "change", "id": each, "verdict": "none", "note": ""},
+        )
     page.context.close()
 
 

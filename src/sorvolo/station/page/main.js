@@ -5,6 +5,7 @@ import { applyTheme, choices } from "./choices.js";
 import { button, choice, dialog, el, field, fill, message, report, tick } from "./dom.js";
 import { Events } from "./events.js";
 import { showSites } from "./sites.js";
+import { votes } from "./votes.js";
 
 const main = document.getElementById("main");
 const title = document.getElementById("title");
@@ -38,6 +39,8 @@ async function enter() {
     setTimeout(enter, 3000);
     return;
   }
+  votes.who = station.status.name;
+  votes.send();
   if (!station.events) listen();
   await route();
 }
@@ -48,9 +51,12 @@ function listen() {
   const show = () => {
     const state = station.events.state;
     linkState.className = state;
-    fill(linkState, words[state]);
+    const { length } = votes.waiting;
+    fill(linkState, words[state], length ? ` · ${length} waiting` : "");
+    if (state === "live") votes.send();
   };
   show();
+  votes.addEventListener("change", show);
   station.events.addEventListener("state", show);
   station.events.addEventListener("reload", () => route());
   station.events.addEventListener("station.disk", ({ detail: { data } }) => disk(data));

@@ -3,7 +3,7 @@
 import { get, siteUrl } from "./api.js";
 import { showStationMap } from "./base_map.js";
 import { choices } from "./choices.js";
-import { el, fill, icon, message } from "./dom.js";
+import { button, el, fill, icon, message } from "./dom.js";
 import { comparePanel } from "./compare.js";
 import { drawPanel, loadDrawings } from "./draw.js";
 import { exportPanel } from "./exports.js";
@@ -18,6 +18,7 @@ import { SiteData } from "./site_data.js";
 import { featureCard } from "./feature_card.js";
 import { videoPane } from "./video.js";
 import { siteName } from "./sites.js";
+import { votes } from "./votes.js";
 import * as words from "./words.js";
 
 const PANELS = [
@@ -81,6 +82,9 @@ class SiteScreen {
     this.hear(this.station.events, "site.gone", ({ detail }) => { if (detail.site === this.data.id) this.gone(); });
     this.hear(this.station.events, "state", ({ detail }) => { if (detail === "live") this.check(); });
     this.hear(this.station.events, "review.changed", ({ detail }) => { if (detail.site === this.data.id) this.data.judge(detail.data); });
+    this.hear(votes, "change", () => { this.data.expect(); this.data.changed(["changes", "objects"]); });
+    this.hear(votes, "taken", ({ detail: { vote, answer } }) => { if (vote.site === this.data.id) this.data.judge(answer); });
+    this.hear(votes, "refused", ({ detail }) => this.refused(detail));
     this.open(view);
     this.load();
   }
@@ -88,6 +92,15 @@ class SiteScreen {
   hear(target, type, listener) {
     target.addEventListener(type, listener);
     this.ends.push(() => target.removeEventListener(type, listener));
+  }
+
+  /** A vote that the station does not take: what it has is shown again. */
+  refused({ vote, problem }) {
+    if (vote.site !== this.data.id) return;
+    const found = this.data.find(vote.id);
+    message(`This verdict was not taken: ${problem.title}`, { kind: "error", todo: problem.detail,
+      act: found ? button("Show it", () => (this.opened?.see ? this.opened.see(found) : this.data.choose(found))) : null });
+    this.data.load([vote.kind === "change" ? "changes" : "objects"]).catch(() => {});
   }
 
   async load() {

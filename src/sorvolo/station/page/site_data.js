@@ -2,6 +2,7 @@
 
 import { features, get, siteUrl } from "./api.js";
 import { ALL, passing } from "./filters.js";
+import { votes } from "./votes.js";
 
 const NAMES = ["objects", "changes", "frames", "track", "coverage", "pod"];
 
@@ -25,6 +26,7 @@ export class SiteData extends EventTarget {
       const watched = this.all[name].filter((each) => each.properties.watched && !kept.some((other) => isOf(other, each.id)));
       this.all[name] = [...kept, ...watched]; // what a running watch has just found is not in its file yet
     }));
+    this.expect();
     this.changed(names);
   }
 
@@ -82,13 +84,24 @@ export class SiteData extends EventTarget {
     this.changed([name]);
   }
 
+  /** Show the votes that wait to be sent over what the station states. */
+  expect() {
+    for (const { site, kind, id, verdict, note } of votes.mine) {
+      const found = site === this.id && this.all[kind === "change" ? "changes" : "objects"].find((each) => isOf(each, id));
+      if (!found) continue;
+      if (verdict) found.properties.review = verdict === "none" ? null : verdict;
+      Object.assign(found.properties, { note, waiting: true });
+    }
+  }
+
   /** A vote came, ours or another's: how all stand. What a running watch found has another id in the station's list. */
   async judge({ kind, id, verdict, state, note, revision, who, at }) {
     const name = kind === "change" ? "changes" : "objects";
     const found = this.all[name].find((each) => isOf(each, id));
     if (!found) return this.load([name]).catch(() => {});
     if ((found.properties.revision ?? 0) > revision) return;
-    Object.assign(found.properties, { review: verdict === "none" ? null : verdict, note, revision, review_state: state, reviewer: who, reviewed_at: at });
+    Object.assign(found.properties, { review: verdict === "none" ? null : verdict, note, revision, review_state: state, reviewer: who, reviewed_at: at, waiting: false });
+    this.expect();
     this.changed([name]);
   }
 }

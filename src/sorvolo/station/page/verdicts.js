@@ -1,29 +1,22 @@
 // A person's vote on an object or a change: confirm, reject, not sure, note; votes that differ are shown as disputed, none is overwritten.
 
-import { post, siteUrl } from "./api.js";
-import { button, el, fill, message } from "./dom.js";
+import { button, el, fill } from "./dom.js";
 import { isChange } from "./site_data.js";
+import { votes } from "./votes.js";
 import * as words from "./words.js";
 
-/** Send a vote; gives whether it was taken. */
-export async function judge(screen, feature, verdict, note = null) {
-  const values = feature.properties;
+/** Give a vote: shown at once, sent in its turn. */
+export function judge(screen, feature, verdict, note = null) {
   const kind = isChange(feature) ? "change" : "object";
-  const act = screen.opened?.see ? button("Show it", () => screen.opened?.see?.(feature)) : null; // the gallery has moved on
-  try {
-    await screen.data.judge(await post(siteUrl(screen.data.id, "reviews"), { kind, id: feature.id, verdict, note: note ?? values.note ?? "" }));
-    return true;
-  } catch (problem) {
-    message(problem.title, { kind: "error", todo: problem.detail, act });
-    return false;
-  }
+  votes.add({ site: screen.data.id, kind, id: feature.id, verdict, note: note ?? feature.properties.note ?? "" });
 }
 
 const wordsOf = (verdict) => (verdict === "none" || !verdict ? "no verdict" : verdict);
 
 /** Who judged it how and when, in a line. */
 export function verdictLine(feature) {
-  const { review, reviewer, reviewed_at: at, note, review_state: state } = feature.properties;
+  const { review, reviewer, reviewed_at: at, note, review_state: state, waiting } = feature.properties;
+  if (waiting) return el("p", { class: `verdict ${review || "none"}` }, el("b", {}, wordsOf(review)), " · waits to be sent", note ? el("span", { class: "remark" }, ` “${note}”`) : "");
   if (!review && !note) return el("p", { class: "verdict none" }, "Not reviewed yet");
   return el("p", { class: `verdict ${review || "none"}` }, el("b", {}, wordsOf(review)),
     state === "agreed" ? ", agreed" : "", reviewer ? ` by ${reviewer}` : "", at ? `, ${words.time(at)}` : "", note ? el("span", { class: "remark" }, ` “${note}”`) : "");
@@ -36,8 +29,8 @@ export function verdictForm(screen, feature, { keys = false, given = null } = {}
   if (!may) return el("div", {}, line, el("p", { class: "note" }, "Your token may look, not review."));
   const note = el("input", { type: "text", maxlength: 2000, placeholder: "Note", "aria-label": "Note", ".value": feature.properties.note ?? "" });
   const current = feature.properties.review;
-  const give = async (verdict) => {
-    await judge(screen, feature, verdict, note.value.trim());
+  const give = (verdict) => {
+    judge(screen, feature, verdict, note.value.trim());
     fill(line, verdictLine(screen.data.find(feature.id) ?? feature));
   };
   note.addEventListener("keydown", (event) => {
