@@ -265,6 +265,19 @@ def test_what_few_frames_saw_is_left_out() -> None:
     assert sum(len(each.members) for each in fused.objects) + fused.dropped == len(laid)
 
 
+def test_a_car_that_sure_views_show_at_many_places_drives() -> None:
+    """Each place seen once, so surely that it alone would be reported: one car that moves, not five that stand."""
+    frames, laid = survey()[:5], list[LaidSighting]()
+    for frame, score in zip(frames, [0.6, 0.98, 0.98, 0.98, 0.6]):
+        box = box_of(frame, "car", 1.0 + 4.0 * frame.time_ns / SECOND_NS, 2.0, 90.0)
+        assert box is not None
+        seen = Detections(box[None], np.array([score]), np.array([CLASSES.index("car")]), CLASSES)
+        laid += [each for each in lay_on_ground(seen, frame) if each is not None]
+    assert len(fuse(laid[1:2], frames, {"car": 0.3}).objects) == 1
+    (car,) = fuse(laid, frames, {"car": 0.3}).objects
+    assert car.moves and len(car.members) == 5
+
+
 def test_a_walker_is_one_and_moves() -> None:
     """1.3 m/s along the strip: seen at many places, reported once, with its velocity and where it was last."""
     frames = survey()[:10]

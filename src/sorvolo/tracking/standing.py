@@ -100,7 +100,8 @@ def fuse(
 
     `least` is the score from which on each class is reported, else 0.3. Weaker sightings count as evidence: what all
     frames that show its place leave below it is dropped, unless several sightings of that score lie on the way of
-    something that walks or drives: that is reported once, as moving.
+    something that walks or drives: that is reported once, as moving. So is what seems to stand by one whole view of its
+    place, where at least half of the frames that show it do not see it there.
     """
     if not laid:
         return Fused((), 0)
@@ -110,16 +111,25 @@ def fuse(
     )
     # only groups of which a frame alone would report at least one sighting
     groups = [group for group in _merged(_gathered(laid), laid) if strong[group].any()]
-    objects: list[Standing] = []
+    standing: list[Standing] = []
     left: list[int] = []
+    doubted: set[int] = set()
     for group, possible in zip(groups, _possible_views(groups, laid, frames)):
         label, score = _score(group, possible, laid)
-        if score >= thresholds[label]:
-            objects.append(_standing(group, laid, possible, score))
-        elif len(_frames_of(group, laid)) < max(2.0, _STANDING_SHARE * possible):
-            left += [k for k in group if strong[k]]
-    alone = [laid[k] for k in left]
-    objects += [_moving([left[k] for k in walk], laid) for walk in _walks(alone)]
+        is_reported = score >= thresholds[label]
+        views = len(_frames_of([k for k in group if not (is_reported and laid[k].is_cut)], laid))
+        if is_reported:
+            standing.append(_standing(group, laid, possible, score))
+        is_seldom = views < max(2.0, _STANDING_SHARE * possible)
+        if is_seldom and (not is_reported or 2 * views <= possible):
+            left += (own := [k for k in group if strong[k]])
+            doubted |= set(own) if is_reported else set()
+    walks = [[left[k] for k in walk] for walk in _walks([laid[k] for k in left])]
+    # two places alone may be those of two things that stand
+    walks = [each for each in walks if len(each) >= _LEAST_VIEWS or doubted.isdisjoint(each)]
+    walked = set().union(*walks) & doubted
+    objects = [each for each in standing if walked.isdisjoint(each.members)]
+    objects += [_moving(each, laid) for each in walks]
     used = sum(int(strong[list(each.members)].sum()) for each in objects)
     return Fused(tuple(sorted(objects, key=lambda each: -each.score)), int(strong.sum()) - used)
 
