@@ -7,7 +7,11 @@ import pytest
 from rich.console import Console
 
 from sorvolo.cli.compare import show_results
+from sorvolo.cli.printing import announce_people
+from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.missions.compare.report import comparison_headline
+from sorvolo.store.site.archive import Archive
+from sorvolo.survey.flight import Site
 
 COVERED = {
     "headline": {"quality": "compared", "text": "1 change in 100 m2; 20 m2 could not be compared"},
@@ -32,6 +36,7 @@ def test_withdrawn_changes_are_named(tmp_path: Path) -> None:
         "warnings": [],
         "notices": [],
         "changes": {"features": []},
+        "objects": {},
         "comparison": {"views": {"compared": 7}, "reasons": {}, **COVERED},
         "withdrawn": ["b-4", "b-7"],
     }
@@ -42,12 +47,23 @@ def test_withdrawn_changes_are_named(tmp_path: Path) -> None:
     assert "withdrawn (" not in console.export_text()
 
 
+def test_a_person_whom_a_comparison_found_is_announced(tmp_path: Path) -> None:
+    """With the bell, in a line with the place."""
+    with Archive.open(tmp_path, write=True) as archive:
+        archive.create_site(Site("field", Geodetic(41.9, 12.6, 0.0), "EPSG:32633", 0.03))
+    person = {"id": "b-o1", "class": "person", "east_m": 0.0, "north_m": 0.0, "score": 0.8}
+    console = Console(record=True, width=120, file=(out := StringIO()))
+    announce_people({"list": [person]}, tmp_path, console)
+    assert "PERSON FOUND  b-o1 at 41.9" in out.getvalue()
+
+
 def test_notices_and_the_report_are_shown_as_by_map(tmp_path: Path) -> None:
     result = {
         "flight": "b",
         "seconds": 9.0,
         "peak_memory_mb": 300.0,
         "changes": {"features": []},
+        "objects": {},
         "withdrawn": [],
         "comparison": {"views": {"compared": 7}, "reasons": {}, **COVERED},
         "notices": [{"code": "no_date", "count": 1, "text": "the table has no date"}],
@@ -69,6 +85,7 @@ def test_how_much_the_map_grew_is_shown(tmp_path: Path) -> None:
         "warnings": [],
         "notices": [],
         "changes": {"features": []},
+        "objects": {},
         "comparison": comparison
         | {"extension": {"frames": 3, "shown_as_well": 2, "area_m2": 350.4}},
         "withdrawn": [],
@@ -176,6 +193,7 @@ def test_what_was_not_compared_and_how_small_a_thing_is_found_are_shown(tmp_path
         "notices": [],
         "withdrawn": [],
         "changes": {"features": []},
+        "objects": {},
         "comparison": {"views": {"compared": 7}, "reasons": {}, **COVERED},
     }
     console = Console(record=True, width=200, file=StringIO())

@@ -10,6 +10,8 @@ from sorvolo.detection.contract import ModelInfo
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.missions.flight.looked_at import LookedAt, ground_for, looked_at, searched_document
+from sorvolo.missions.flight.map_objects import is_good, with_objects
+from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.watch.run import headline_of_watch
 from sorvolo.missions.watch.settings import WatchSettings
 from sorvolo.search.looked_ground import ClassGround, LookedGround, near_ground
@@ -118,6 +120,21 @@ def test_a_headline_never_clears_ground_that_was_not_looked_at(
     assert headline["complete"] == ("no person" in text or "98 %" in text)
 
 
+def test_a_map_answers_for_ground_it_skipped_and_for_classes_that_were_asked_for() -> None:
+    coarse = _flown({40.0 * k: 0.2 for k in range(10)})
+    assert not looked_at(coarse, 10, 10).is_enough
+    assert looked_at(coarse, 10, 10, excuses=True).is_enough
+    assert not looked_at(_flown({0.0: 0.05}), 1, 10, excuses=True).is_enough
+    for quality, found, good in (
+        ("map", {"text": "", "complete": True}, True),
+        ("compared", {"text": "", "complete": False}, False),
+        ("doubtful", {"text": "", "complete": True}, False),
+        ("map", None, True),
+    ):
+        headline = {"quality": quality, "text": "9 of 9 frames matched"}
+        assert is_good(with_objects({"objects": {"headline": found}}, headline)) is good
+
+
 def test_a_watch_that_began_late_states_that() -> None:
     whole = {"text": "1 car, no person; 9 of 9 pictures looked at", "complete": True}
     assert headline_of_watch(whole, ()) == whole
@@ -127,5 +144,6 @@ def test_a_watch_that_began_late_states_that() -> None:
 
 def test_how_much_is_enough_is_a_share() -> None:
     assert not LookedAt(8, 10).is_enough and LookedAt(8, 10, enough=0.8).is_enough
-    with pytest.raises(SettingsError, match="0 to 1, got 90"):
-        WatchSettings(enough_looked_at=90)
+    for settings in (WatchSettings, MapSettings, CompareSettings):
+        with pytest.raises(SettingsError, match="0 to 1, got 90"):
+            settings(enough_looked_at=90)

@@ -17,6 +17,7 @@ from sorvolo.cli.options import (
     AsJson,
     Camera,
     Classes,
+    EnoughLookedAt,
     GiveUp,
     GroundElevation,
     Inputs,
@@ -100,6 +101,7 @@ def compare(
     trust_map: TrustsMap = False,
     model: Model = "default",
     classes: Classes = None,
+    enough_looked_at: EnoughLookedAt = 0.9,
     give_up: GiveUp = 30.0,
     coordinates: PlaceFormatOption = "latlon",
     again: Again = False,
@@ -116,6 +118,7 @@ def compare(
     """
     from sorvolo.capture.live.reconnect import LiveSettings
     from sorvolo.missions.compare.flights import compare_flights
+    from sorvolo.missions.flight.map_objects import is_good
     from sorvolo.missions.flight.settings import CompareSettings
 
     settings = CompareSettings(
@@ -129,6 +132,7 @@ def compare(
         model=model,
         trusts_map=trust_map,
         classes=wanted_classes(classes),
+        enough_looked_at=enough_looked_at,
     )
     with opened_site(site, writes=True) as place:
         with ended_by_signal(inputs) as until:
@@ -159,7 +163,7 @@ def compare(
             print_json({"site": str(place.folder), "flights": results})
         else:
             show_results(results, place.folder, Console(), coordinates)
-    if any(result["comparison"]["headline"]["quality"] != "compared" for result in results):
+    if not all(is_good(result["comparison"]["headline"]) for result in results):
         raise typer.Exit(TO_CHECK)
 
 
@@ -200,6 +204,7 @@ def read_results(
             "flight",
             "method",
             "comparison",
+            "objects",
             "frames",
             "peak_memory_mb",
             "warnings",
@@ -223,7 +228,7 @@ def show_results(
 
     for result in results:
         _show_result(result, console, form)
-        announce_people(result.get("objects", {}), site, console)
+        announce_people(result["objects"], site, console)
         folder = site / "flights" / result["flight"]
         show_path("page", folder / "changes.html", console)
         show_path("list", features_path(folder, "changes"), console)

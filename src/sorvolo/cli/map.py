@@ -17,6 +17,7 @@ from sorvolo.cli.options import (
     Camera,
     CatalogueAddress,
     Classes,
+    EnoughLookedAt,
     GiveUp,
     GroundElevation,
     Inputs,
@@ -102,6 +103,7 @@ def map_command(
     base: BaseMap = None,
     model: Model = "default",
     classes: Classes = None,
+    enough_looked_at: EnoughLookedAt = 0.9,
     give_up: GiveUp = 30.0,
     catalogue: CatalogueAddress = "",
     heights: WithHeights = None,
@@ -123,6 +125,7 @@ def map_command(
     Example: sorvolo map rtsp://192.168.1.10/live --telemetry serial:/dev/ttyUSB0 --site field
     """
     from sorvolo.capture.live.reconnect import LiveSettings
+    from sorvolo.missions.flight.map_objects import is_good
     from sorvolo.missions.flight.settings import MapSettings
     from sorvolo.missions.map.flights import map_flights
     from sorvolo.missions.site.copy import folder_of
@@ -139,6 +142,7 @@ def map_command(
         checks=names(check),
         classes=wanted_classes(classes),
         heights=heights,
+        enough_looked_at=enough_looked_at,
     )
     with opened_site(site, writes=True) as place:
         # in a store the catalogue lies with the tiles
@@ -169,7 +173,7 @@ def map_command(
             )
         reports = [read_json(folder / "report.json") for folder in folders]
         _print(reports, place.folder, catalogues, with_heights=bool(heights), as_json=as_json)
-    if any(report["headline"]["quality"] != "map" for report in reports):
+    if not all(is_good(report["headline"]) for report in reports):
         raise typer.Exit(TO_CHECK)
 
 

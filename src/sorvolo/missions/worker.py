@@ -394,6 +394,7 @@ def _mapped(journal: Journal, site: Path, before: int, known: Sequence[str]) -> 
 
     Writes each person that the new versions show.
     """
+    from sorvolo.missions.flight.map_objects import is_good
     from sorvolo.store.exports.change_files import objects_geojson
     from sorvolo.store.site.archive import Archive
     from sorvolo.survey.objects import PERSON
@@ -413,8 +414,8 @@ def _mapped(journal: Journal, site: Path, before: int, known: Sequence[str]) -> 
         journal.add(PERSON_FOUND, {"feature": feature, "is_local": place.is_local})
     headlines = [(each.get("comparison") or each).get("headline") or {} for each in reports]
     texts = [str(each.get("text") or "") for each in headlines]
-    is_good = all(each.get("quality") in ("map", "compared") for each in headlines)
-    return Done("; ".join(filter(None, texts)) or "finished", "".join(flights[-1:]), is_good)
+    headline, are_good = "; ".join(filter(None, texts)), all(map(is_good, headlines))
+    return Done(headline or "finished", "".join(flights[-1:]), are_good)
 
 
 # ---- what happens on the way ------------------------------------------------------------------------------------

@@ -36,7 +36,7 @@ class ComparisonObjects:
         memo: ResultCache,
     ) -> None:
         """`settings.classes` are looked for, in frames as in the changes' own pictures."""
-        self._name, self._model = setup.source.name, settings.model
+        self._name, self._settings = setup.source.name, settings
         self._selection = StretchSelection(_OVERLAP, keep_all=setup.source.kind != "video")
         self._finder: ObjectFinder | None = None
         self._classes: ChangeClasses | None = None
@@ -109,6 +109,8 @@ class ComparisonObjects:
     ) -> tuple[dict[str, Any], dict[str, bytes]]:
         """The report's part on objects, and the outlines of the ground that was looked at."""
         if self._finder is None:
-            return search_summary(None, None, 0.0, why_not_searched(self._model)), {}
-        looked, ground = self._finder.looked_at(placed, site)
+            return search_summary(None, None, 0.0, why_not_searched(self._settings.model)), {}
+        # without metres pictures are counted, and each stretch of ground is in a few that are searched
+        enough = 0.0 if site.is_local else self._settings.enough_looked_at
+        looked, ground = self._finder.looked_at(placed, site, enough)
         return search_summary(search, looked, self._finder.seconds), searched_document(ground, site)

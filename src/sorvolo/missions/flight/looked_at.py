@@ -41,6 +41,7 @@ class LookedAt:
     enough: float = ENOUGH_LOOKED_AT
     ground: Mapping[str, ClassGround] = field(default_factory=dict)
     flown_m2: float = 0.0
+    excused: frozenset[str] = frozenset()  # classes that nobody asked for, in too coarse pixels
 
     def share_of(self, name: str) -> float:
         """The share, 0 to 1, that was looked at for a class: of the ground, else of the pictures."""
@@ -56,7 +57,9 @@ class LookedAt:
     @property
     def is_enough(self) -> bool:
         """Whether as much was looked at as was asked for."""
-        return self.share >= min(self.enough, _ALL)
+        least = min(self.enough, _ALL)
+        classes = self.ground.keys() - self.excused if self.ground else {""}
+        return all(self.share_of(each) >= least for each in classes)
 
     def words(self) -> str:
         """In pictures and shares of the ground."""
@@ -105,12 +108,21 @@ class LookedAt:
 
 
 def looked_at(
-    ground: LookedGround | None, searched: int, seen: int, enough: float = ENOUGH_LOOKED_AT
+    ground: LookedGround | None,
+    searched: int,
+    seen: int,
+    enough: float = ENOUGH_LOOKED_AT,
+    *,
+    excuses: bool = False,
 ) -> LookedAt:
-    """The account of so many pictures, on this ground (None: nothing places the flight)."""
+    """The account of so many pictures, on this ground (None: nothing places the flight). `excuses`: what is looked for
+    unasked needs no finer pixels than there are."""
     if ground is None or not ground.flown_m2:
         return LookedAt(searched, seen, enough)
-    return LookedAt(searched, seen, enough, ground.of_classes(), ground.flown_m2)
+    classes = ground.of_classes()
+    coarse = {name for name, own in classes.items() if own.coarse_m2 > own.looked_m2}
+    excused = frozenset(coarse if excuses else ())
+    return LookedAt(searched, seen, enough, classes, ground.flown_m2, excused)
 
 
 def _searched_geojson(ground: LookedGround, site: Site) -> bytes:

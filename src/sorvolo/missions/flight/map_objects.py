@@ -105,6 +105,7 @@ class ObjectFinder:
         self._detector, self._camera = detector, camera
         self._live_folder = live_folder
         self._classes = tuple(classes) or detector.info.usual_classes
+        self._is_asked = bool(classes)
         self._thread = ThreadPoolExecutor(
             1, "detector", lower_priority if live_folder is not None else None
         )
@@ -195,10 +196,10 @@ class ObjectFinder:
         )
 
     def looked_at(
-        self, placed: Sequence[PlacedFrame], site: Site
+        self, placed: Sequence[PlacedFrame], site: Site, enough: float
     ) -> tuple[LookedAt, LookedGround | None]:
-        """How much of what the flight's frames show, by their final places, was looked at; the ground of a site with
-        metres."""
+        """How much of what the flight's frames show, by their final places, was looked at, of which a share is
+        `enough`; the ground of a site with metres."""
         ground = None if site.is_local else ground_for(site, self._detector.info, self._classes)
         for frame in placed if ground is not None else ():
             pose, seen = pose_of(frame), self._seen.get(frame.index)
@@ -209,7 +210,8 @@ class ObjectFinder:
             ground.show(outline_m)
             if seen is not None:
                 ground.look(outline_m, float(camera_m[2]) / frame.camera.fx_px, seen.least)
-        return looked_at(ground, len(self._seen), len(placed)), ground
+        excuses = not self._is_asked
+        return looked_at(ground, len(self._seen), len(placed), enough, excuses=excuses), ground
 
     def _least(self, frames: Sequence[PlacedFrame]) -> dict[str, float]:
         """From which score on each class is reported: where frames of two lights differ, the higher; of a class that no
@@ -282,9 +284,17 @@ def search_summary(
 
 
 def with_objects(report: Mapping[str, Any], headline: Mapping[str, Any]) -> dict[str, Any]:
-    """A headline with what was found, and how much was looked at, by the report's part on objects."""
+    """A headline with what was found, and whether enough was looked at, by the report's part on objects."""
     found = report["objects"].get("headline")
-    return {**headline, "text": f"{headline['text']}; {found['text']}"} if found else dict(headline)
+    if not found:
+        return dict(headline)
+    text = f"{headline['text']}; {found['text']}"
+    return {**headline, "text": text, "complete": found["complete"]}
+
+
+def is_good(headline: Mapping[str, Any]) -> bool:
+    """Whether a map or a comparison needs no check, by its headline: exit code 0, else 3."""
+    return headline.get("quality") in ("map", "compared") and bool(headline.get("complete", True))
 
 
 def why_not_searched(model: str) -> str:

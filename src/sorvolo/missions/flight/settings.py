@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal, Protocol
 from sorvolo.change.compare import PairMethod
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.geodesy import check_map_crs
+from sorvolo.missions.flight.looked_at import ENOUGH_LOOKED_AT, check_enough
 
 if TYPE_CHECKING:
     from sorvolo.missions.flight.map_objects import ObjectFinder
@@ -105,8 +106,10 @@ class MapSettings:
         None  # whether the map stands on measured heights; None: where the ground is not level
     )
     classes: tuple[str, ...] = ()  # that are looked for; none: those that the model usually reports
+    enough_looked_at: float = ENOUGH_LOOKED_AT  # share of the ground, else the result is to check
 
     def __post_init__(self) -> None:
+        check_enough(self.enough_looked_at)
         memory_budget_bytes(self.memory_mb)
         if not 1e-4 <= self.control_sigma_m <= 100:
             raise SettingsError(
@@ -152,8 +155,10 @@ class CompareSettings:
     trusts_map: bool = False  # also a map that contradicts itself
     model: str = "default"  # that looks for objects: an installed one's name, a file, or "none"
     classes: tuple[str, ...] = ()  # that are looked for; none: those that the model usually reports
+    enough_looked_at: float = ENOUGH_LOOKED_AT  # share of the ground, else the result is to check
 
     def __post_init__(self) -> None:
+        check_enough(self.enough_looked_at)
         if not 0.05 <= self.views_per_second <= 240:
             raise SettingsError(
                 f"views per second must lie in 0.05 to 240, got {self.views_per_second}"

@@ -161,7 +161,7 @@ class FlightRun(ABC):
         """Add what was searched for to a report and its headline; the outlines of the ground that was looked at."""
         looked, ground, site = None, None, self._archive.site()
         if self._finder is not None:
-            looked, ground = self._finder.looked_at(placed, site)
+            looked, ground = self._finder.looked_at(placed, site, self._settings.enough_looked_at)
         seconds = 0.0 if self._finder is None else self._finder.seconds
         report["objects"] = search_summary(
             search, looked, seconds, why_not_searched(self._settings.model)
