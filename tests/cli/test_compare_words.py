@@ -144,6 +144,7 @@ def test_a_map_without_metres_is_not_shown_in_metres(
         "notices": [],
         "withdrawn": [],
         "changes": {"features": [change]} | georeference,
+        "objects": {},
         "comparison": {"views": {"compared": 7}, "reasons": {}, **COVERED},
     }
     console = Console(record=True, width=120, file=StringIO())
@@ -177,6 +178,7 @@ def test_places_are_written_as_asked_for(tmp_path: Path, form: str, place: str) 
         "notices": [],
         "withdrawn": [],
         "changes": {"features": [change]},
+        "objects": {},
         "comparison": {"views": {"compared": 7}, "reasons": {}, **COVERED},
     }
     console = Console(record=True, width=120, file=StringIO())
