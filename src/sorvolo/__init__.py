@@ -27,7 +27,6 @@ if TYPE_CHECKING:
         write_evaluation,
     )
     from sorvolo.lab.evaluation.mosaic import evaluate_mosaic
-    from sorvolo.lab.evaluation.objects import evaluate_objects
     from sorvolo.lab.simulation.pictures import PictureSettings, simulate_pictures
     from sorvolo.lab.simulation.presets import preset, preset_names
     from sorvolo.lab.simulation.settings import SimulationSettings
@@ -140,7 +139,6 @@ __all__ = [
     "evaluate_changes",
     "evaluate_detector",
     "evaluate_mosaic",
-    "evaluate_objects",
     "find_views",
     "inspect_input",
     "make_heights",
@@ -206,7 +204,6 @@ _HOMES = {
         "write_evaluation",
     ),
     "lab.evaluation.mosaic": ("evaluate_mosaic",),
-    "lab.evaluation.objects": ("evaluate_objects",),
     "lab.simulation.site": ("simulate_site",),
     "lab.simulation.pictures": ("PictureSettings", "simulate_pictures"),
     "lab.simulation.presets": ("preset", "preset_names"),

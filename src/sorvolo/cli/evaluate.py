@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from sorvolo.lab.evaluation.map_quality import Spread
     from sorvolo.lab.evaluation.mask_folders import MaskScores
     from sorvolo.lab.evaluation.mosaic import MosaicEvaluation
-    from sorvolo.lab.evaluation.objects import FlightObjects
 
 evaluate_app = typer.Typer(no_args_is_help=True)
 
@@ -201,54 +200,6 @@ def changes(
     console = Console()
     for each in measured:
         show_changes(console, each)
-
-
-@evaluate_app.command()
-def objects(
-    site: SiteArgument,
-    truth: Truth,
-    flight: OnlyFlight = None,
-    as_json: AsJson = False,
-) -> None:
-    """Measure the objects on the map against the truth: found, missed, false, counted once, how well placed.
-
-    Example: sorvolo evaluate objects field-map --truth simulated-field
-    """
-    from sorvolo.lab.evaluation.objects import evaluate_objects
-
-    assert truth is not None  # typer demands it
-    with opened_site(site) as place:
-        measured = evaluate_objects(place.folder, truth, flight=flight)
-    if as_json:
-        print_json(measured)
-        return
-    console = Console()
-    for each in measured:
-        _show_objects(console, each)
-
-
-def _show_objects(console: Console, measured: "FlightObjects") -> None:
-    table = Table("objects", "to find", "found", "named right", "reported twice", "false")
-    for name, counts in (*measured.by_class.items(), ("all", measured.all)):
-        numbers = counts.must_find, counts.found, counts.named_right, counts.twice, counts.false
-        if any(numbers) or name == "all":
-            table.add_row(name, *map(str, numbers))
-    console.print(table)
-    console.print(
-        f"{measured.flight}: count error {measured.count_error:+.1%}; {measured.moving} of the objects found move; "
-        f"moving or standing is right for {measured.moving_right}",
-        highlight=False,
-    )
-    if math.isfinite(measured.rms_m):
-        console.print(
-            f"{measured.flight}: position error {measured.rms_m:.2f} m rms, {measured.p95_m:.2f} m at 95 %, "
-            f"{measured.own_rms_m:.2f} m rms without the map's own shift of {measured.map_shift_m:.2f} m; "
-            f"{_share(measured.within_two_sigma)} within twice the reported accuracy (1 sigma, median "
-            f"{measured.sigma_median_m:.2f} m); length error {measured.length_error_m:.2f} m median",
-            highlight=False,
-        )
-    for each in measured.missed:
-        console.print(f"{measured.flight}: missed {each}", highlight=False)
 
 
 def show_changes(console: Console, measured: "MeasuredChanges") -> None:

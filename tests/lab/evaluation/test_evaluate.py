@@ -20,7 +20,6 @@ from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import NADIR_CAMERA_NORTH_UP, Pose
 from sorvolo.lab.evaluation.changes import evaluate_changes
 from sorvolo.lab.evaluation.mosaic import evaluate_mosaic
-from sorvolo.lab.evaluation.objects import evaluate_objects
 from sorvolo.mosaic.canvas import Canvas
 from sorvolo.mosaic.canvas_frame import CanvasFrame
 from sorvolo.store.site.archive import Archive
@@ -209,7 +208,7 @@ def test_wrong_truth_is_refused(site, truth, tmp_path):
         evaluate_mosaic(tmp_path / "nothing")
 
 
-@pytest.mark.parametrize("measure", [evaluate_mosaic, evaluate_objects, evaluate_changes])
+@pytest.mark.parametrize("measure", [evaluate_mosaic, evaluate_changes])
 def test_site_and_truth_that_are_swapped_are_reported(site, truth, measure):
     with pytest.raises(
         InputError, match=r"a simulation's folder, no site; give the site first, and --truth"
