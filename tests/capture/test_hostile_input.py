@@ -162,25 +162,23 @@ def test_a_kmz_with_a_negative_offset_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        '{{"fx": {0}, "fy": 1000, "cx": 500, "cy": 400, "width": 1000, "height": 800}}',
-        '{{"camera_matrix": [[{0}, 0, 500], [0, 1000, 400], [0, 0, 1]]}}',
-        '{{"camera_matrix": {{"rows": {0}, "cols": 3, "data": [1000, 0, 500, 0, 1000, 400, 0, 0, 1]}}}}',
+        "fx: {0}\nfy: 1000\ncx: 500\ncy: 400\nwidth: 1000\nheight: 800",
+        "camera_matrix: [{0}, 0, 500, 0, 1000, 400, 0, 0, 1]",
+        "camera_matrix:\n rows: {0}\n cols: 3\n data: [1000, 0, 500, 0, 1000, 400, 0, 0, 1]",
     ],
 )
 def test_a_camera_file_with_a_number_of_hundreds_of_digits_is_refused(
     tmp_path: Path, text: str, digits: int
 ) -> None:
-    path = tmp_path / "camera.json"
+    path = tmp_path / "camera.yaml"
     path.write_text(text.format("9" * digits))
     with pytest.raises(InputError):
         read_camera(path, 1000, 800)
 
 
 def test_a_camera_file_with_a_truth_value_is_read(tmp_path: Path) -> None:
-    path = tmp_path / "camera.json"
-    path.write_text(
-        '{"fx": 900, "fy": 900, "cx": 500, "cy": 400, "width": 1000, "height": 800, "fisheye": false}'
-    )
+    path = tmp_path / "camera.yaml"
+    path.write_text("fx: 900\nfy: 900\ncx: 500\ncy: 400\nwidth: 1000\nheight: 800\nfisheye: false")
     assert read_camera(path, 1000, 800).camera.fx_px == 900
     path.write_text(path.read_text().replace("false", "true"))
     with pytest.raises(InputError, match="fisheye"):

@@ -4,14 +4,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from sorvolo.errors import GeometryError
 from sorvolo.geometry.arrays import Floats, ImageGray, Mask
 from sorvolo.geometry.pose import Pose
-from sorvolo.store.site.journal import Entry, RecordPacker, RunJournal, unpacked
+from sorvolo.store.site.journal import Entry, RunJournal, packed, unpacked
 
 
 class Colour(StrEnum):
@@ -46,9 +48,9 @@ def outer(mask: Mask | None = None) -> Outer:
 
 def test_a_record_comes_back_bit_by_bit_through_the_file(tmp_path: Path) -> None:
     mask = np.random.default_rng(3).random((5, 7)) > 0.5
-    packer = RecordPacker()
-    values = {"one": packer.packed(outer(mask)), "two": packer.packed(outer())}
-    RunJournal(tmp_path / "j", "k", 0).append(Entry("x", values, packer.arrays))
+    arrays: dict[str, NDArray[Any]] = {}
+    values = {"one": packed(outer(mask), arrays), "two": packed(outer(), arrays)}
+    RunJournal(tmp_path / "j", "k", 0).append(Entry("x", values, arrays))
     (entry,) = RunJournal(tmp_path / "j", "k", 0).entries()
     one, two = (unpacked(Outer, entry.values[name], entry.arrays) for name in ("one", "two"))
     assert one.mask is not None and two.mask is None
@@ -67,15 +69,13 @@ def test_a_record_comes_back_bit_by_bit_through_the_file(tmp_path: Path) -> None
         None,
         ["blue", True, 1.0, None, "a0", None, [], []],
         ["red", 1, 1.0, None, "a0", None, [], []],
-        ["red", True, 1.0, ["a0", "|b1", 10**9, 10**9], "a0", None, [], []],
-        ["red", True, 1.0, ["a0", "|b1", 5, -7], "a0", None, [], []],
-        ["red", True, 1.0, ["a0", "|b1", 50, 70], "a0", None, [], []],
+        ["red", True, 1.0, None, "a0", None, [[1, 0.5, 2]], []],
         ["red", True, 1.0, None, "none", None, [], []],
     ],
 )
 def test_what_no_packer_made_is_refused(value: object) -> None:
     with pytest.raises((KeyError, TypeError, ValueError, IndexError)):
-        unpacked(Outer, value, {"a0": np.frombuffer(b"x\x9c\x03\x00\x00\x00\x00\x01", np.uint8)})
+        unpacked(Outer, value, {"a0": np.zeros(3, np.uint8)})
 
 
 def test_a_record_checks_itself_when_it_comes_back() -> None:
@@ -85,4 +85,4 @@ def test_a_record_checks_itself_when_it_comes_back() -> None:
 
 def test_only_data_is_packed() -> None:
     with pytest.raises(TypeError):
-        RecordPacker().packed(open)
+        packed(open, {})

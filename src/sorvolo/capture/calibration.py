@@ -27,8 +27,7 @@ _BETTER = "give --camera FILE, or make one with `sorvolo calibrate`"
 def read_camera(path: Path, width_px: int, height_px: int) -> CameraModel:
     """The camera of a calibration file, for frames of this size.
 
-    Reads OpenCV's XML, YAML and JSON (the UMCD dataset's too), ROS camera_info YAML, and plain JSON with
-    the fields of `Camera`. The order of five bare distortion coefficients differs: OpenCV writes k1 k2 p1
+    Reads OpenCV's XML and YAML (the UMCD dataset's too) and ROS camera_info YAML. The order of five bare distortion coefficients differs: OpenCV writes k1 k2 p1
     p2 k3, the dataset k1 k2 k3 p1 p2 (thesis section 2.3); `origin` states which was read and why. Raises
     InputError for a file that cannot be read, a broken matrix, a lens model with more coefficients, or
     another image shape.

@@ -1,10 +1,9 @@
 """From a calibration file's named numbers to a checked camera of the frames' size; nothing is read here."""
 
-import json
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -28,19 +27,17 @@ _NUMBER = re.compile(
 def read_nodes(path: Path) -> Mapping[str, Node]:
     """The nodes of a camera file, recognised by its first character.
 
-    Raises InputError for a file that is missing, empty, far too large, or no XML, YAML or JSON.
+    Raises InputError for a file that is missing, empty, far too large, or no XML or YAML.
     """
     raw = read_small_file(path, "camera file", _MOST_BYTES)
-    text = text_of(path, raw, "camera file", "XML, YAML or JSON with named values")
+    text = text_of(path, raw, "camera file", "XML or YAML with named values")
     if text.startswith("<"):
         nodes = _from_xml(path, text)
-    elif text.startswith("{"):
-        nodes = _from_json(path, text)
     else:
         nodes = _from_yaml(path, text)
     if not nodes:
         raise InputError(
-            f"{path}: not a camera file: neither XML, YAML nor JSON with named values was found"
+            f"{path}: not a camera file: neither XML nor YAML with named values was found"
         )
     return nodes
 
@@ -68,35 +65,6 @@ def _named_elements(parent: Element) -> Iterator[Element]:
             yield child
         else:
             yield from _named_elements(child)
-
-
-def _from_json(path: Path, text: str) -> dict[str, Node]:
-    nodes: dict[str, Node] = {}
-    try:
-        _flatten_json(path, json.loads(text), nodes)
-    except (
-        ValueError,
-        RecursionError,
-    ) as error:  # a whole number of thousands of digits is a plain ValueError
-        raise InputError(f"{path}: broken JSON: {error}") from error
-    return nodes
-
-
-def _flatten_json(path: Path, tree: Mapping[str, Any], nodes: dict[str, Node]) -> None:
-    for name, value in tree.items():
-        if isinstance(value, dict) and "data" in value:
-            children = {each: json.dumps(inner) for each, inner in value.items()}
-            nodes.setdefault(_key(name), _camera_nodes_matrix(path, name, children))
-        elif isinstance(value, dict):
-            _flatten_json(path, value, nodes)
-        elif isinstance(value, list):
-            nodes.setdefault(_key(name), _array(path, name, value))
-        elif isinstance(value, str):
-            nodes.setdefault(_key(name), value)
-        elif isinstance(value, bool):
-            nodes.setdefault(_key(name), str(value).lower())
-        elif isinstance(value, int | float):
-            nodes.setdefault(_key(name), _number(str(value)))
 
 
 def _from_yaml(path: Path, text: str) -> dict[str, Node]:
@@ -135,15 +103,6 @@ def _camera_nodes_matrix(path: Path, name: str, children: Mapping[str, str]) -> 
             f"{path}: {name} should hold {rows[:20]} x {columns[:20]} numbers but has {len(numbers)}"
         )
     return numbers.reshape(int(rows), int(columns))
-
-
-def _array(path: Path, name: str, values: list[Any]) -> Floats:
-    try:
-        return np.array(values, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(
-            f"{path}: {name} is not a list of numbers that a camera can have"
-        ) from error
 
 
 def _scalar_or_array(text: str) -> Node:
@@ -194,34 +153,6 @@ _DISTORTION_KEYS = (
 _WIDTH_KEYS = ("imagewidth", "imgwidth", "framewidth", "widthpx", "width")
 _HEIGHT_KEYS = ("imageheight", "imgheight", "frameheight", "heightpx", "height")
 _SIZE_KEYS = ("imagesize", "imgsize", "framesize", "size", "resolution")
-# of cameras and videos on the market; a guessed size is rounded to one
-_COMMON_WIDTHS_PX = (
-    640,
-    720,
-    800,
-    848,
-    960,
-    1024,
-    1280,
-    1440,
-    1600,
-    1920,
-    2000,
-    2048,
-    2704,
-    2720,
-    3840,
-    4000,
-    4032,
-    4056,
-    4096,
-    5280,
-    5472,
-    6016,
-    8000,
-    8192,
-)
-
 _LARGEST_TANGENTIAL = 0.02
 """Lenses are centred well enough that |p1| and |p2| stay below this; a third coefficient above it is a k3."""
 
@@ -255,8 +186,14 @@ def camera_from_nodes(
     words = f"calibration {file_name}, {order_words}"
     size = _size(nodes)
     if size is None:
-        size = _size_from_centre(file_name, matrix, width_px, height_px)
-        words += f", no image size in it, taken as {size[0]}x{size[1]} from the optical centre"
+        # the optical centre lies near the middle of the picture
+        size = width_px, height_px
+        if (np.abs((2 * matrix[:2, 2] + 1) / size - 1) > 0.2).any():
+            raise InputError(
+                f"{file_name}: no image size, and its optical centre ({matrix[0, 2]:.1f}, {matrix[1, 2]:.1f}) "
+                f"is not that of {width_px}x{height_px} pictures; add image_width and image_height"
+            )
+        words += ", no image size in it, taken as that of the pictures"
     if abs(size[0] * height_px / (size[1] * width_px) - 1) > 0.01:
         raise InputError(
             f"{file_name}: made for {size[0]}x{size[1]} pictures, but these are {width_px}x{height_px}, "
@@ -387,24 +324,6 @@ def _size(nodes: Mapping[str, Node]) -> tuple[int, int] | None:
     ):
         return int(width), int(height)
     return None
-
-
-def _size_from_centre(
-    file_name: str, matrix: Matrix3, width_px: int, height_px: int
-) -> tuple[int, int]:
-    """The size of a file that states none: the optical centre lies near the middle of the picture."""
-    guess = 2 * matrix[0, 2] + 1, 2 * matrix[1, 2] + 1
-    if abs(guess[0] / width_px - 1) <= 0.2 and abs(guess[1] / height_px - 1) <= 0.2:
-        return width_px, height_px
-    width = min(_COMMON_WIDTHS_PX, key=lambda each: abs(guess[0] / each - 1))
-    height = round(width * height_px / width_px)
-    if abs(guess[0] / width - 1) > 0.06 or abs(guess[1] / height - 1) > 0.1:
-        raise InputError(
-            f"{file_name}: no image size, and its optical centre ({matrix[0, 2]:.1f}, {matrix[1, 2]:.1f}) "
-            "does not "
-            f"belong to {width_px}x{height_px} pictures; add image_width and image_height"
-        )
-    return width, height
 
 
 def check_lens(file_name: str, camera: Camera) -> None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sorvolo.build import build
 from sorvolo.capture.live.segments import FlightSoFar, joined_samples
@@ -20,7 +21,7 @@ from sorvolo.missions.flight.request import live_request
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.store.images import image_from_jpeg, jpeg_from_image
 from sorvolo.store.site.archive import Archive
-from sorvolo.store.site.journal import Entry, RecordPacker, RunJournal, content_sha256, unpacked
+from sorvolo.store.site.journal import Entry, RunJournal, content_sha256, packed, unpacked
 from sorvolo.survey.flight import CameraModel, CameraPrior, Frame
 
 _BEGUN, _SAMPLES, _FRAME, _CAME = "flight", "telemetry", "frame", "came"
@@ -114,14 +115,14 @@ class ResultCache:
         if self.journal is None:
             return
         self._keep_source()
-        packer = RecordPacker(compresses=compresses)
+        arrays: dict[str, NDArray[Any]] = {}
         values = {
             "index": frame.index,
             "name": frame.name,
             "time_ns": frame.time_ns,
-            "result": packer.packed(result),
+            "result": packed(result, arrays),
         }
-        self.journal.append(Entry(stage, values, packer.arrays))
+        self.journal.append(Entry(stage, values, arrays, compresses=compresses))
 
     def note(self, kind: str, **values: Any) -> None:
         """Keep what is of no frame. Raises StoreError when the disk is full."""
@@ -206,7 +207,7 @@ class FlightBegun:
 
 def note_flight(journal: RunJournal, source: LiveSource) -> None:
     """Note how a live flight began."""
-    packer = RecordPacker()
+    arrays: dict[str, NDArray[Any]] = {}
     begun = FlightBegun(
         source.name,
         source.fingerprint,
@@ -215,7 +216,7 @@ def note_flight(journal: RunJournal, source: LiveSource) -> None:
         source.camera,
         source.gaps_s,
     )
-    journal.append(Entry(_BEGUN, {"begun": packer.packed(begun)}, packer.arrays))
+    journal.append(Entry(_BEGUN, {"begun": packed(begun, arrays)}, arrays))
 
 
 def flight_so_far(journal: RunJournal) -> FlightSoFar | None:

@@ -1,8 +1,8 @@
 """A run's journal: what it knows of each frame so far, appended as it comes, so that a killed run can continue."""
 
 import hashlib
+import io
 import json
-import math
 import os
 import struct
 import threading
@@ -20,24 +20,15 @@ from types import MappingProxyType
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
+from numpy.lib.format import read_array, write_array
 from numpy.typing import NDArray
 
 from sorvolo.errors import goes_on
 from sorvolo.store.atomic import writing
 
-_MAGIC = b"sorvolo journal 1\n"
-_HEAD = struct.Struct("<QI")  # an entry's bytes, and their CRC-32
-_TEXT = struct.Struct("<I")  # bytes of an entry's JSON
+_MAGIC = b"sorvolo journal 2\n"
+_SIZE = struct.Struct("<Q")  # bytes of an entry, and of its JSON
 _MOST_BYTES = 1 << 30  # of one entry: a picture of 20 megapixels takes a sixteenth
-_TYPES = {
-    "<f8": np.float64,
-    "<f4": np.float32,
-    "<i8": np.int64,
-    "<i4": np.int32,
-    "|u1": np.uint8,
-    "|b1": np.bool_,
-}
-_MOST_DIMENSIONS = 4  # of an array; pictures have three
 _SYNC_EVERY_S = 1.0  # waiting for the disk after each entry would cost 4 to 5 ms each
 
 
@@ -52,6 +43,7 @@ class Entry:
     values: Mapping[str, Any]
     arrays: Mapping[str, NDArray[Any]] = field(default_factory=lambda: MappingProxyType({}))
     at: int = 0
+    compresses: bool = False  # masks become small by it, photographs do not
 
 
 class RunJournal:
@@ -217,122 +209,60 @@ def _no_link(path: str, flags: int) -> int:
 
 
 def _packed(entry: Entry) -> bytes:
-    arrays = {name: np.ascontiguousarray(array) for name, array in entry.arrays.items()}
-    if unknown := {array.dtype.str for array in arrays.values()} - _TYPES.keys():
-        raise TypeError(f"a journal holds no arrays of {sorted(unknown)}")
-    head = {
-        "kind": entry.kind,
-        "values": dict(entry.values),
-        "arrays": [[name, array.dtype.str, list(array.shape)] for name, array in arrays.items()],
-    }
-    text = json.dumps(head).encode()
-    body = b"".join([_TEXT.pack(len(text)), text, *(array.tobytes() for array in arrays.values())])
-    return _HEAD.pack(len(body), zlib.crc32(body)) + body
+    """The entry's size, then a zlib stream of its JSON and its arrays in NumPy's own format."""
+    text = json.dumps([entry.kind, dict(entry.values), list(entry.arrays)]).encode()
+    body = io.BytesIO()
+    body.write(_SIZE.pack(len(text)) + text)
+    for array in entry.arrays.values():
+        write_array(body, np.asarray(array), allow_pickle=False)
+    data = zlib.compress(body.getvalue(), 1 if entry.compresses else 0)
+    return _SIZE.pack(len(data)) + data
 
 
 def _read(file: Any) -> Entry | None:
     """The next entry; None at the end, which is where anything is not as it was written."""
-    head = file.read(_HEAD.size)
-    if len(head) < _HEAD.size:
-        return None
-    size, checksum = _HEAD.unpack(head)
-    if size > _MOST_BYTES or size > os.fstat(file.fileno()).st_size - file.tell():
-        return None
-    body = file.read(size)
-    if len(body) < size or zlib.crc32(body) != checksum:
-        return None
     try:
-        return _unpacked(body)
+        (size,) = _SIZE.unpack(file.read(_SIZE.size))
+        if size > os.fstat(file.fileno()).st_size - file.tell():
+            return None
+        unpacker = zlib.decompressobj()
+        body = io.BytesIO(unpacker.decompress(file.read(size), _MOST_BYTES))
+        kind, values, names = json.loads(body.read(*_SIZE.unpack(body.read(_SIZE.size))))
+        arrays = {str(name): read_array(body, allow_pickle=False) for name in names}
     except (
+        zlib.error,
         struct.error,
         ValueError,
         TypeError,
-        KeyError,
+        OverflowError,
+        MemoryError,
         RecursionError,
-    ):  # whole, but no Sorvolo wrote it
+    ):
         return None
+    whole = unpacker.eof and isinstance(kind, str) and isinstance(values, dict)
+    return Entry(kind, values, arrays) if whole else None
 
 
-def _unpacked(body: bytes) -> Entry:
-    (length,) = _TEXT.unpack_from(body)
-    at = _TEXT.size + length
-    head = json.loads(body[_TEXT.size : at])
-    arrays = {}
-    for name, kind, shape in head["arrays"]:
-        count = _count(shape)
-        dtype = np.dtype(_TYPES[kind])
-        if count * dtype.itemsize > len(body) - at:
-            raise ValueError(f"{name} is longer than its entry")
-        array = np.frombuffer(body, dtype, count, at).reshape(shape)
-        arrays[str(name)] = array
-        at += array.nbytes
-    if not isinstance(head["kind"], str) or not isinstance(head["values"], dict):
-        raise TypeError("an entry has a kind and values")
-    return Entry(head["kind"], head["values"], arrays)
-
-
-def _count(shape: Any) -> int:
-    whole = (
-        isinstance(shape, list)
-        and len(shape) <= _MOST_DIMENSIONS
-        and all(type(each) is int for each in shape)
-    )
-    if not whole or any(each < 0 for each in shape):
-        raise ValueError(f"no array has the shape {shape!r}")
-    return math.prod(shape)
-
-
-_MOST_CELLS = 64_000_000  # of a packed mask: a picture's pixels
 _T = TypeVar("_T")
 
 
-class RecordPacker:
-    """Takes records apart. `arrays` are those of all records packed so far, for the entry that holds them.
+def packed(value: Any, arrays: dict[str, NDArray[Any]]) -> Any:
+    """Return a record as JSON holds it; its arrays are added to those of the entry that will hold it.
 
-    Only `compresses` packs masks and pictures of one byte small: photographs gain nothing by it.
+    Raises TypeError for what is neither a record, an array, bytes, a sequence, a mapping by text nor a plain value.
     """
-
-    def __init__(self, *, compresses: bool = True) -> None:
-        self.arrays: dict[str, NDArray[Any]] = {}
-        self._compresses = compresses
-
-    def packed(self, value: Any) -> Any:
-        """Return the value as JSON holds it.
-
-        Raises TypeError for what is neither a record, an array, bytes, a sequence, a mapping by text nor a plain value.
-        """
-        if isinstance(value, bytes):
-            value = np.frombuffer(value, np.uint8)
-        if isinstance(value, np.ndarray):
-            return self._array(value)
-        if isinstance(value, Mapping):
-            return {str(name): self.packed(part) for name, part in value.items()}
-        if is_dataclass(value) and not isinstance(value, type):
-            return [self.packed(getattr(value, each.name)) for each in fields(value)]
-        if isinstance(value, list | tuple):
-            return [self.packed(each) for each in value]
-        return _plain(value)
-
-    def _array(self, array: NDArray[Any]) -> Any:
-        name = f"a{len(self.arrays)}"
-        is_small = self._compresses and array.ndim == 2 and array.dtype.itemsize == 1
-        if not is_small:
-            self.arrays[name] = array
-            return name
-        data = np.packbits(array) if array.dtype == bool else np.ascontiguousarray(array)
-        self.arrays[name] = np.frombuffer(zlib.compress(data.tobytes(), 1), np.uint8)
-        return [name, array.dtype.str, *array.shape]
-
-
-def unpacked(kind: type[_T], value: Any, arrays: Mapping[str, NDArray[Any]]) -> _T:
-    """A record of this class from what `RecordPacker.packed` made of it.
-
-    Raises KeyError, TypeError or ValueError, or what the record itself raises, for anything else.
-    """
-    return _read_journal(kind, value, arrays)
-
-
-def _plain(value: Any) -> Any:
+    if isinstance(value, bytes):
+        value = np.frombuffer(value, np.uint8)
+    if isinstance(value, np.ndarray):
+        name = f"a{len(arrays)}"
+        arrays[name] = value
+        return name
+    if isinstance(value, Mapping):
+        return {str(name): packed(part, arrays) for name, part in value.items()}
+    if is_dataclass(value) and not isinstance(value, type):
+        return [packed(getattr(value, each.name), arrays) for each in fields(value)]
+    if isinstance(value, list | tuple):
+        return [packed(each, arrays) for each in value]
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, Enum):
@@ -342,80 +272,41 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"a journal holds no {type(value).__name__}")
 
 
-def _read_journal(hint: Any, value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
-    origin = get_origin(hint)
+def unpacked(kind: type[_T], value: Any, arrays: Mapping[str, NDArray[Any]]) -> _T:
+    """A record of this class from what `packed` made of it.
+
+    Raises KeyError, TypeError or ValueError, or what the record itself raises, for anything else.
+    """
+    return _unpacked(kind, value, arrays)
+
+
+def _unpacked(hint: Any, value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
+    origin, parts = get_origin(hint), get_args(hint)
     if origin is types.UnionType:
-        kind = next(each for each in get_args(hint) if each is not types.NoneType)
-        return None if value is None else _read_journal(kind, value, arrays)
+        kind = next(each for each in parts if each is not types.NoneType)
+        return None if value is None else _unpacked(kind, value, arrays)
     if origin is np.ndarray:
-        return _read_array(value, arrays)
+        return arrays[value]
     if hint is bytes:
         return arrays[value].tobytes()
     if origin is Mapping:
-        return {
-            name: _read_journal(get_args(hint)[1], part, arrays) for name, part in value.items()
-        }
-    if origin in (tuple, Sequence):
-        return _read_sequence(get_args(hint), value, arrays)
-    if is_dataclass(hint):
-        return _read_record(hint, value, arrays)  # type: ignore[arg-type]
-    return _read_plain(hint, value)
-
-
-def _read_record(kind: type, value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
-    hints = _hints(kind)
-    if not isinstance(value, list) or len(value) != len(hints):
-        raise ValueError(f"a {kind.__name__} has {len(hints)} values")
-    return kind(
-        **{
-            name: _read_journal(each, part, arrays)
-            for (name, each), part in zip(hints.items(), value)
-        }
-    )
-
-
-def _read_plain(kind: Any, value: Any) -> Any:
-    if issubclass(kind, Enum):
-        return kind(value)
-    if kind is float and type(value) is int:
+        return {name: _unpacked(parts[1], part, arrays) for name, part in value.items()}
+    if origin in (tuple, Sequence) or is_dataclass(hint):
+        if not isinstance(value, list):
+            raise TypeError("a sequence was needed")
+        names = _hints(hint) if is_dataclass(hint) else {}  # type: ignore[arg-type]
+        hints = tuple(names.values()) or parts
+        if origin is Sequence or hints[-1:] == (Ellipsis,):
+            hints = (hints[0],) * len(value)
+        inside = [_unpacked(*each, arrays) for each in zip(hints, value, strict=True)]
+        return hint(**dict(zip(names, inside))) if names else tuple(inside)
+    if issubclass(hint, Enum):
+        return hint(value)
+    if hint is float and type(value) is int:
         return float(value)
-    if type(value) is not kind:
-        raise TypeError(f"{kind.__name__} was needed, not {type(value).__name__}")
+    if type(value) is not hint:
+        raise TypeError(f"{hint.__name__} was needed, not {type(value).__name__}")
     return value
-
-
-def _read_sequence(
-    parts: tuple[Any, ...], value: Any, arrays: Mapping[str, NDArray[Any]]
-) -> tuple[Any, ...]:
-    if not isinstance(value, list):
-        raise TypeError("a sequence was needed")
-    each = (
-        parts
-        if parts[-1:] != (Ellipsis,) and len(parts) == len(value)
-        else (parts[0],) * len(value)
-    )
-    return tuple(_read_journal(hint, item, arrays) for hint, item in zip(each, value))
-
-
-def _read_array(value: Any, arrays: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
-    if isinstance(value, str):
-        return arrays[value]
-    name, kind, rows, columns = value
-    if not (
-        type(rows) is int
-        and type(columns) is int
-        and min(rows, columns) >= 0
-        and rows * columns <= _MOST_CELLS
-    ):
-        raise ValueError("no mask is so large")
-    is_mask = kind == "|b1"
-    size = (rows * columns + 7) // 8 if is_mask else rows * columns
-    data = zlib.decompressobj().decompress(arrays[name].tobytes(), max(1, size))
-    if len(data) != size:
-        raise ValueError("a mask is cut off")
-    cells = np.frombuffer(data, np.uint8)
-    flat = np.unpackbits(cells, count=rows * columns).view(bool) if is_mask else cells
-    return flat.reshape(rows, columns)
 
 
 @cache
