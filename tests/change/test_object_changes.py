@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sorvolo.change.reconcile import SearchedGround, on_one_date
+from sorvolo.findings.register import SearchedDate, associate, begun_and_ended
+from sorvolo.store.site.register import sighting_of
 from sorvolo.survey.findings import ChangeKind
 from sorvolo.survey.map_objects import MapObject, SearchedFrames, looked_at
 
@@ -32,32 +33,37 @@ def car(
     )
 
 
-def names(before: SearchedGround, after: SearchedGround) -> dict[str, ChangeKind]:
-    return {each.id: kind for kind, each in on_one_date(before, after)}
+Searched = tuple[list[MapObject], SearchedFrames]
+"""The objects of a date, and the frames that were searched for them."""
+
+
+def names(*dates: Searched) -> dict[str, ChangeKind]:
+    """What came and left between two dates, by the name of its newest sighting."""
+    seen = [
+        sighting_of(each, str(k), k) for k, (objects, _) in enumerate(dates) for each in objects
+    ]
+    looks = [SearchedDate(str(k), k, frames) for k, (_, frames) in enumerate(dates)]
+    return {
+        each.newest.id: kind for kind, each in begun_and_ended(associate(seen, looks), {"0"}, "1")
+    }
 
 
 def test_what_one_date_shows_alone_appeared_or_disappeared() -> None:
-    before = SearchedGround([car("stays", 10, 10), car("left", 20, 10)], [SEARCHED])
-    after = SearchedGround([car("still there", 11, 10.5), car("came", 30, 10)], [SEARCHED])
+    before = ([car("stays", 10, 10), car("left", 20, 10)], SEARCHED)
+    after = ([car("still there", 11, 10.5), car("came", 30, 10)], SEARCHED)
     assert names(before, after) == {"came": ChangeKind.APPEARED, "left": ChangeKind.DISAPPEARED}
     assert names(after, before) == {"came": ChangeKind.DISAPPEARED, "left": ChangeKind.APPEARED}
 
 
 @pytest.mark.parametrize("frames_m", [np.zeros((0, 4, 2)), FRAMES_M[:1] + 100])
 def test_where_the_other_date_was_not_searched_nothing_is_known(frames_m: np.ndarray) -> None:
-    after = SearchedGround([car("came", 30, 10)], [SEARCHED])
-    assert names(SearchedGround([], [SearchedFrames(frames_m)]), after) == {}
+    after = ([car("came", 30, 10)], SEARCHED)
+    assert names(([], SearchedFrames(frames_m)), after) == {}
 
 
-def test_what_moves_or_has_no_size_is_left_out_and_hides_nothing() -> None:
-    moves, sizeless = car("moves", 30, 10, moving=True), car("sizeless", 20, 10, length_m=np.nan)
-    assert (
-        names(SearchedGround([], [SEARCHED]), SearchedGround([moves, sizeless], [SEARCHED])) == {}
-    )
-    stands = car("stands", 30, 10)
-    assert names(SearchedGround([moves], [SEARCHED]), SearchedGround([stands], [SEARCHED])) == {
-        "stands": ChangeKind.APPEARED
-    }
+def test_what_moves_hides_nothing() -> None:
+    moves, stands = car("moves", 30, 10, moving=True), car("stands", 30, 10)
+    assert names(([moves], SEARCHED), ([stands], SEARCHED))["stands"] is ChangeKind.APPEARED
 
 
 def test_two_frames_must_show_a_place_and_one_is_enough_where_there_is_only_one() -> None:
@@ -86,19 +92,22 @@ def test_a_class_that_was_not_looked_for_is_not_gone() -> None:
     everywhere, nowhere = np.ones(3, bool), np.zeros(3, bool)
     coarse = SearchedFrames(FRAMES_M, {"car": everywhere, "person": nowhere})
     person = replace(car("person", 20, 10, length_m=1.7), label="person")
-    before = SearchedGround([person, car("left", 10, 10)], [SEARCHED])
-    assert names(before, SearchedGround([], [coarse])) == {"left": ChangeKind.DISAPPEARED}
-    assert names(before, SearchedGround([], [SEARCHED])) == {
+    before = ([person, car("left", 10, 10)], SEARCHED)
+    assert names(before, ([], coarse)) == {"left": ChangeKind.DISAPPEARED}
+    assert names(before, ([], SEARCHED)) == {
         "person": ChangeKind.DISAPPEARED,
         "left": ChangeKind.DISAPPEARED,
     }
-    assert names(SearchedGround([], [coarse]), before) == {"left": ChangeKind.APPEARED}
+    assert names(([], coarse), before) == {"left": ChangeKind.APPEARED}
     assert looked_at(np.array([[20.0, 10]]), ["truck"], [coarse]).tolist() == [False], (
         "of no name at all"
     )
 
 
 def test_what_is_longer_may_lie_farther_from_where_it_was() -> None:
-    assert car("again", 12.2, 10).stands_where(car("parked", 10, 10))
-    assert not car("short", 12.2, 10, length_m=1.7).stands_where(car("parked", 10, 10))
-    assert not car("moves", 10, 10, moving=True).stands_where(car("parked", 10, 10))
+    """By its own length and the error of its place; a truck in the place of a car is another thing."""
+    parked = ([car("parked", 10, 10)], SEARCHED)
+    assert names(parked, ([car("again", 12.2, 10)], SEARCHED)) == {}
+    assert len(names(parked, ([car("far", 13.6, 10)], SEARCHED))) == 2
+    truck = replace(car("truck", 10, 10), label="truck")
+    assert len(names(parked, ([truck], SEARCHED))) == 2

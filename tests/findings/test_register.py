@@ -122,6 +122,19 @@ def test_two_things_half_a_metre_apart_never_merge() -> None:
     assert not any(each.gone for each in register.findings)
 
 
+def test_a_mission_that_is_off_as_a_whole_shows_who_parked_in_the_next_bay() -> None:
+    """Five cars, one of which left; another came two bays off. All places err by metres, and by the same."""
+    for shift_m in (0.0, 2.0):
+        wide = {"sigma_m": 1.9}
+        seen = [sighting(0, "map", east_m, **wide) for east_m in (0.0, 9.0, 18.0, 27.0, 36.0)]
+        seen += [
+            sighting(1, "map", each + shift_m, **wide) for each in (0.0, 9.0, 18.0, 27.0, 40.0)
+        ]
+        register = associate(seen, [look(0), look(1)])
+        assert between(register, "flight0", "flight1") == "1 car came, 1 left"
+        assert len(register.findings) == 6
+
+
 def test_moving_things_are_one_within_a_date_and_never_between_dates() -> None:
     """A walker where his speed takes him; the same place a day later is another's."""
     walks = {"moving": True, "velocity_m_s": (1.0, 0.0), "label": "person"}

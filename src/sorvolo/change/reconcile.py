@@ -1,7 +1,7 @@
 """Changes of several sources made one list, each piece of ground reported once."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -18,7 +18,6 @@ from sorvolo.change.outlines import (
 from sorvolo.change.things import without_shadow
 from sorvolo.geometry.arrays import Floats, PointsM
 from sorvolo.survey.findings import Change, ChangeKind, Patch
-from sorvolo.survey.map_objects import MapObject, SearchedFrames, looked_at
 
 # When a change is a part of an area, or an area only changes.
 _INSIDE = 0.7  # share of a change within an area: it is a part of it ...
@@ -130,28 +129,3 @@ def _with_sigmas(change: Change, map_sigma_m: float) -> Change:
     outline_sigma_m = area_sigma_m(size) if change.kind is ChangeKind.AREA else thing_sigma_m(size)
     in_map_m = float(np.hypot(change.sigma_m, outline_sigma_m))
     return replace(change, sigma_in_map_m=in_map_m, sigma_m=float(np.hypot(in_map_m, map_sigma_m)))
-
-
-@dataclass(frozen=True, eq=False)
-class SearchedGround:
-    """What a detector found on one date, and the frames of its searches."""
-
-    objects: Sequence[MapObject] = ()
-    searches: Sequence[SearchedFrames] = ()
-
-
-def on_one_date(
-    before: SearchedGround, after: SearchedGround
-) -> Iterator[tuple[ChangeKind, MapObject]]:
-    """The objects that stood on one date and not on the other, where that was searched for their class as well:
-    appeared or disappeared. What moves, or has no known size, is left out."""
-    for kind, own, other in (
-        (ChangeKind.APPEARED, after, before),
-        (ChangeKind.DISAPPEARED, before, after),
-    ):
-        standing = [each for each in own.objects if not each.moving and np.isfinite(each.length_m)]
-        places_m = np.array([each.position_m for each in standing]).reshape(-1, 2)
-        was_searched = looked_at(places_m, [each.label for each in standing], other.searches)
-        for each, is_searched in zip(standing, was_searched):
-            if is_searched and not any(each.stands_where(old) for old in other.objects):
-                yield kind, each

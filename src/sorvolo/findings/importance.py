@@ -4,10 +4,8 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 
-import numpy as np
-
-from sorvolo.findings.register import GroundFinding, KnownBy, Presence, Register, SearchedDate
-from sorvolo.survey.map_objects import looked_at
+from sorvolo.findings.register import GroundFinding, Register, begun_and_ended
+from sorvolo.survey.findings import ChangeKind
 from sorvolo.survey.objects import PERSON
 from sorvolo.survey.wording import counted
 
@@ -29,29 +27,17 @@ def ordered(findings: Sequence[GroundFinding]) -> list[GroundFinding]:
 def between(register: Register, before: str, after: str) -> str:
     """What came and left between two dates, by class: "1 person came, 1 left; 12 cars left". Counts only what one date
     saw and the other looked for without finding it; what moves is another's on each date."""
-    came: Counter[str] = Counter()
-    left: Counter[str] = Counter()
-    known = {each.date: each for each in register.looks}
-    for found in ordered(register.findings):
-        if found.presence(before) is Presence.SEEN and found.presence(after) is Presence.GONE:
-            left[found.label] += 1
-        elif found.dates[0] == after and _was_looked_for(found, before, known):
-            came[found.label] += 1
+    known = {each.date for each in register.looks}
+    changed = begun_and_ended(register, {before}, after)
+    counts = Counter((found.label, kind) for kind, found in changed)
     parts = []
-    for label in dict.fromkeys((*came, *left)):
-        words = [counted(came[label], label) + " came"] if came[label] else []
-        if left[label]:
-            words.append(f"{left[label]} left" if words else counted(left[label], label) + " left")
-        parts.append(", ".join(words))
+    for label in dict.fromkeys(each.label for each in ordered(register.findings)):
+        came, left = (counts[label, kind] for kind in (ChangeKind.APPEARED, ChangeKind.DISAPPEARED))
+        words = [counted(came, label) + " came"] if came else []
+        if left:
+            words.append(f"{left} left" if words else counted(left, label) + " left")
+        parts += [", ".join(words)] if words else []
     unsearched = [date for date in (before, after) if date not in known]
     if not parts and unsearched:
         return f"no telling what came or left: no objects were searched for on {' and '.join(unsearched)}"
     return "; ".join(parts) or "nothing known came or left"
-
-
-def _was_looked_for(found: GroundFinding, date: str, looks: dict[str, SearchedDate]) -> bool:
-    """Whether a thing's own comparison saw it come, or a date's frames were searched for its class where it is."""
-    if any(each.origin is KnownBy.CHANGED and not each.gone for each in found.sightings):
-        return True
-    searched = [looks[date].frames] if date in looks else []
-    return bool(looked_at(np.array([found.position_m]), [found.label], searched)[0])

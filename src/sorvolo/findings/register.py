@@ -2,7 +2,7 @@
 
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
@@ -13,13 +13,18 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 from sorvolo.geometry.arrays import Floats, PointsM, Rows, frozen
-from sorvolo.survey.map_objects import REACH_M, REACH_OF_LENGTH, SearchedFrames, looked_at
+from sorvolo.survey.findings import ChangeKind
+from sorvolo.survey.map_objects import SearchedFrames, looked_at
 
+# Of its own length something may lie from where another mission found it, and so much more: a person who turned.
+_REACH_OF_LENGTH, _REACH_M = 0.4, 0.5
 _MOST_REACH_M = 8.0  # further apart are two things, however badly they are placed
 _MOST_WALK_M = 40.0  # of what moves, from its last place by one mission to that by another
 _WALKS_M_S = (
     2.0  # by so much what moves may be off for each second between two missions' last sight of it
 )
+_SURELY_OFF = 3  # things seen again that show how far a mission as a whole is off
+_SIGMA_OF_MEDIAN = 0.85  # per axis, by the median distance of a normal scatter in the plane
 _LIKE_SIZE = 2.5  # lengths further apart than this ratio are two things, where their classes differ
 _LIKE_CLASS = 0.1  # classes' shares that agree less are two classes
 _FAR = 1e3  # the cost of a pair that cannot be one thing: more than all that can
@@ -168,6 +173,25 @@ def associate(sightings: Sequence[MissionSighting], looks: Sequence[SearchedDate
     return Register(tuple(each.finding() for each in working.things), tuple(looks))
 
 
+def begun_and_ended(
+    register: Register, before: Collection[str], after: str
+) -> Iterator[tuple[ChangeKind, GroundFinding]]:
+    """What came to be there, or left, between dates that both looked for it: appeared or disappeared."""
+    searches = [each.frames for each in register.looks if each.date in before]
+    new = [each for each in register.findings if each.dates[0] == after]
+    places_m = np.array([each.position_m for each in new]).reshape(-1, 2)
+    was_looked_for = looked_at(places_m, [each.label for each in new], searches)
+    for found, is_known in zip(new, was_looked_for):
+        # or its own comparison saw it come
+        if is_known or any(
+            each.origin is KnownBy.CHANGED and not each.gone for each in found.sightings
+        ):
+            yield ChangeKind.APPEARED, found
+    for found in register.findings:
+        if found.gone == after and any(each in found.dates for each in before):
+            yield ChangeKind.DISAPPEARED, found
+
+
 def _order(each: MissionSighting | SearchedDate) -> tuple[float, str, str, int, str]:
     if isinstance(each, SearchedDate):
         return each.order, each.date, "", -1, ""
@@ -227,18 +251,16 @@ class _Working:
 
     def take(self, mission: Sequence[MissionSighting]) -> None:
         """Add all sightings of one mission, each to a finding of its own."""
-        places_m = np.array([each.position_m for each in mission])
-        radii_m = [_MOST_WALK_M if each.moving else _MOST_REACH_M for each in mission]
-        near = self._standing_near(places_m)
-        pairs: dict[tuple[int, int], float] = {}
-        if len(near):
-            around = cKDTree(self._places_m[near]).query_ball_point(places_m, radii_m)
-            for row, columns in enumerate(around):
-                for number in near[columns].tolist():
-                    cost = _cost(mission[row], self.things[number])
-                    if cost is not None:
-                        pairs[row, number] = cost
-        joined = _one_to_one(pairs)
+        pairs = self._near(mission)
+        joined = _one_to_one(pairs, np.zeros(2), math.inf)
+        off_m = [
+            each.off_m for each in pairs if joined.get(each.row) == each.number and each.stands
+        ]
+        if len(off_m) >= _SURELY_OFF:
+            # a mission errs in common; what is left between its things and those known is how far they scatter
+            shift_m = np.median(off_m, axis=0)
+            scatter_m = _SIGMA_OF_MEDIAN * float(np.median(np.hypot(*(off_m - shift_m).T)))
+            joined = _one_to_one(pairs, shift_m, scatter_m)
         for row, sighting in enumerate(mission):
             if (number := joined.get(row)) is None:
                 number = len(self.things)
@@ -247,6 +269,21 @@ class _Working:
             self._seen.add(number)
             self.things[number].add(sighting)
             self._places_m[number] = self.things[number].place_m
+
+    def _near(self, mission: Sequence[MissionSighting]) -> list["_Pair"]:
+        """Each sighting of a mission, by row, with each thing near it that it may be, by number."""
+        places_m = np.array([each.position_m for each in mission])
+        near = self._standing_near(places_m)
+        if not len(near):
+            return []
+        radii_m = [_MOST_WALK_M if each.moving else _MOST_REACH_M for each in mission]
+        around = cKDTree(self._places_m[near]).query_ball_point(places_m, radii_m)
+        pairs = (
+            _pair(row, mission[row], number, self.things[number])
+            for row, columns in enumerate(around)
+            for number in near[columns].tolist()
+        )
+        return [each for each in pairs if each is not None]
 
     def end(self, date: str, searches: Sequence[SearchedFrames]) -> None:
         """Conclude a date: what it looked at and did not see is gone, and what had left before it."""
@@ -303,8 +340,22 @@ def _known(value: float, otherwise: float = 0.0) -> float:
     return otherwise if math.isnan(value) else value
 
 
-def _cost(sighting: MissionSighting, thing: _Thing) -> float | None:
-    """How far a sighting is from a thing, 0 to 1 of what is allowed, plus how unlike its class; None: not the same."""
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """A sighting and a thing that it may be: how far it is off, (2,), how far it may be beside its error, and how
+    unlike its class is, 0 to 1."""
+
+    row: int
+    number: int
+    off_m: Floats
+    reach_m: float
+    sigma_m: float
+    unlike: float
+    stands: bool
+
+
+def _pair(row: int, sighting: MissionSighting, number: int, thing: _Thing) -> _Pair | None:
+    """A sighting and a thing; None where they are two by their dates, missions, classes or sizes."""
     last = thing.of_date[-1]
     is_same_date = last.date == sighting.date
     if is_same_date and any(each.mission == sighting.mission for each in thing.of_date):
@@ -312,33 +363,37 @@ def _cost(sighting: MissionSighting, thing: _Thing) -> float | None:
     moves = sighting.moving or last.moving
     if moves and not is_same_date:
         return None
-    length_m = max(_known(sighting.length_m), _known(last.length_m))
-    sigma_m = math.hypot(_known(sighting.sigma_m), _known(thing.sigma_m))
-    between_s = (sighting.last_ns - last.last_ns) / 1e9 if moves else 0.0
-    reach_m = REACH_OF_LENGTH * length_m + REACH_M + 2 * sigma_m + _WALKS_M_S * abs(between_s)
-    off_m = [
-        float(here) - float(there) - speed * between_s
-        for here, there, speed in zip(sighting.position_m, thing.place_m, last.velocity_m_s)
-    ]
-    apart = math.hypot(*off_m) / min(reach_m, _MOST_REACH_M)
-    if apart > 1:
-        return None
     odds, own = _odds(sighting), _shares(thing.sums)
     shared = sum(min(share, own.get(name, 0.0)) for name, share in odds.items())
     if shared < _LIKE_CLASS:
         shorter_m, longer_m = sorted((float(sighting.length_m), float(last.length_m)))
         if not is_same_date or not longer_m <= _LIKE_SIZE * shorter_m:
             return None
-    return apart + 0.5 * (1 - shared)
+    length_m = max(_known(sighting.length_m), _known(last.length_m))
+    between_s = (sighting.last_ns - last.last_ns) / 1e9 if moves else 0.0
+    return _Pair(
+        row,
+        number,
+        sighting.position_m - thing.place_m - np.multiply(last.velocity_m_s, between_s),
+        _REACH_OF_LENGTH * length_m + _REACH_M + _WALKS_M_S * abs(between_s),
+        math.hypot(_known(sighting.sigma_m), _known(thing.sigma_m)),
+        1 - shared,
+        not moves,
+    )
 
 
-def _one_to_one(pairs: Mapping[tuple[int, int], float]) -> dict[int, int]:
-    """Each row's finding: as many pairs as can be, and of those choices the nearest."""
-    rows, numbers = (sorted({pair[side] for pair in pairs}) for side in (0, 1))
-    at_row = {row: index for index, row in enumerate(rows)}
-    at_number = {number: index for index, number in enumerate(numbers)}
+def _one_to_one(pairs: Sequence[_Pair], shift_m: Floats, most_sigma_m: float) -> dict[int, int]:
+    """Each row's finding, of a mission that is off by (2,), and beside that by `most_sigma_m` at most: as many pairs as
+    can be, and of those choices the nearest."""
+    if not pairs:
+        return {}
+    apart_m = np.hypot(*(np.array([each.off_m for each in pairs]) - shift_m).T)
+    reach_m = [each.reach_m + 2 * min(each.sigma_m, most_sigma_m) for each in pairs]
+    apart = apart_m / np.minimum(reach_m, _MOST_REACH_M)
+    kept = [pairs[k] for k in np.flatnonzero(apart <= 1).tolist()]
+    rows, at_row = np.unique([each.row for each in kept], return_inverse=True)
+    numbers, at_number = np.unique([each.number for each in kept], return_inverse=True)
     costs = np.full((len(rows), len(numbers)), _FAR)
-    for (row, number), cost in pairs.items():
-        costs[at_row[row], at_number[number]] = cost
+    costs[at_row, at_number] = apart[apart <= 1] + [0.5 * each.unlike for each in kept]
     chosen = zip(*linear_sum_assignment(costs))
-    return {rows[i]: numbers[j] for i, j in chosen if costs[i, j] < _FAR}
+    return {int(rows[i]): int(numbers[j]) for i, j in chosen if costs[i, j] < _FAR}

@@ -11,11 +11,6 @@ from sorvolo.geometry.arrays import Floats, Mask, PointsM, frozen
 from sorvolo.survey.mosaic import PlacedFrame
 
 _LOOKS = 2  # frames that must show a place before what was not found there is not there
-REACH_OF_LENGTH = 0.4
-"""Of its own length, something may lie from where another mission found it ..."""
-
-REACH_M = 0.5
-"""... and this much more: a person who turned."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,13 +57,6 @@ class MapObject:
             raise GeometryError(
                 f"object {self.id}: seen {self.views} times of {self.possible_views}"
             )
-
-    def stands_where(self, other: "MapObject") -> bool:
-        """Whether it stands where another date's object did, by its own size: a car parked again. What moves stands nowhere."""
-        if self.moving or other.moving:
-            return False
-        reach_m = REACH_OF_LENGTH * float(np.nan_to_num(self.length_m)) + REACH_M
-        return bool(np.hypot(*(self.position_m - other.position_m)) <= reach_m)
 
 
 @dataclass(frozen=True, eq=False)

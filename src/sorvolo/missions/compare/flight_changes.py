@@ -11,6 +11,7 @@ from sorvolo.change.evidence import EvidenceMap, EvidenceSettings
 from sorvolo.change.gathered import GatheredThings
 from sorvolo.change.reconcile import reconcile
 from sorvolo.change.views import ViewMaker
+from sorvolo.findings.register import GroundFinding
 from sorvolo.geometry.arrays import Floats, Mask
 from sorvolo.geometry.sun import slide_of
 from sorvolo.missions.compare.extension import NIGHT
@@ -19,7 +20,6 @@ from sorvolo.missions.flight.setup import sun_over
 from sorvolo.mosaic.selection import StretchSelection
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView
 from sorvolo.survey.flight import Site
-from sorvolo.survey.map_objects import MapObject
 
 # longest side of a compared picture; a video's frames come faster, and show a place more often
 _VIDEO_PX, _PHOTO_PX = 1280, 1600
@@ -105,7 +105,7 @@ class FlightChanges:
         return reconcile(things, areas, gathered, self._flight, self._numbers, self._slides)
 
     def of_objects(
-        self, changes: Sequence[Change], objects: Sequence[tuple[ChangeKind, MapObject]]
+        self, changes: Sequence[Change], objects: Sequence[tuple[ChangeKind, GroundFinding]]
     ) -> list[Change]:
         """After `conclude`: those objects, found on one date alone, that none of `changes`, as they are reported,
         holds, on ground that differs as well. Only where learned differences are gathered."""
@@ -113,11 +113,14 @@ class FlightChanges:
         if self._gathered is None:
             return result
         for kind, each in objects:
-            change = self._gathered.standing_at(each.position_m, each.length_m, [*changes, *result])
+            length_m = each.newest.length_m
+            change = self._gathered.standing_at(each.position_m, length_m, [*changes, *result])
             if change is not None:
                 number = next(self._numbers)
                 result.append(
-                    replace(change, id=f"{self._flight}-{number}", kind=kind, score=each.score)
+                    replace(
+                        change, id=f"{self._flight}-{number}", kind=kind, score=each.newest.score
+                    )
                 )
         return result
 

@@ -1,11 +1,12 @@
 """Objects beside a comparison: frames that fit the map are searched for them, and they name what changes are."""
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
 from sorvolo.capture.source import LiveSource
-from sorvolo.change.reconcile import SearchedGround, on_one_date
 from sorvolo.change.views import ViewMaker, ViewOutcome
+from sorvolo.findings.register import GroundFinding, SearchedDate, begun_and_ended
 from sorvolo.missions.compare.classes import ChangeClasses
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.looked_at import searched_document
@@ -15,9 +16,10 @@ from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.mosaic.selection import StretchSelection
 from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.register import sighting_of
 from sorvolo.survey.findings import Change, ChangeKind
 from sorvolo.survey.flight import Notice, PosedFrame, Site
-from sorvolo.survey.map_objects import MapObject, ObjectSearch
+from sorvolo.survey.map_objects import ObjectSearch
 from sorvolo.survey.mosaic import PlacedFrame
 
 _OVERLAP = 0.75  # of frames that are searched
@@ -40,16 +42,11 @@ class ComparisonObjects:
         self._selection = StretchSelection(_OVERLAP, keep_all=setup.source.kind != "video")
         self._finder: ObjectFinder | None = None
         self._classes: ChangeClasses | None = None
-        self._before = SearchedGround()
+        self._archive = archive
+        self._before = {each.flight_id for each in archive.versions() if each.id <= base_version}
+        self._before.discard(self._name)
         if detector is not None:
-            before = {each.flight_id for each in archive.versions() if each.id <= base_version}
-            known = [each.thing for each in archive.newest_objects(before - {self._name})]
-            searched = [
-                each.frames
-                for each in archive.searches()
-                if each.flight_id in before - {self._name}
-            ]
-            self._before = SearchedGround(known, searched)
+            known = [each.thing for each in archive.newest_objects(self._before)]
             self._classes = ChangeClasses(detector, known, settings.classes)
             live_folder = archive.folder if isinstance(setup.source, LiveSource) else None
             self._finder = ObjectFinder(
@@ -90,11 +87,19 @@ class ComparisonObjects:
             return None
         return self._finder.conclude(placed, self._name, has_metres=True)
 
-    def on_one_date(self, search: ObjectSearch | None) -> list[tuple[ChangeKind, MapObject]]:
-        """The objects that this flight or those before it found on ground where the other found none."""
+    def on_one_date(self, search: ObjectSearch | None) -> list[tuple[ChangeKind, GroundFinding]]:
+        """The objects that this flight or those before it found on ground where the other found none; what moves, or
+        has no known size, is left out."""
         if search is None:
             return []
-        return list(on_one_date(self._before, SearchedGround(search.objects, [search.frames])))
+        seen = [sighting_of(each, self._name, math.inf) for each in search.objects]
+        look = SearchedDate(self._name, math.inf, search.frames)
+        register = self._archive.register(seen, [look], self._before)
+        return [
+            (kind, each)
+            for kind, each in begun_and_ended(register, self._before, self._name)
+            if not each.newest.moving and math.isfinite(each.newest.length_m)
+        ]
 
     def classified(self, changes: Sequence[Change], search: ObjectSearch | None) -> list[Change]:
         """The changes with their classes, after `conclude`."""

@@ -15,7 +15,7 @@ from typing import Any, Self, TypeVar
 from sqlalchemy import Connection
 
 from sorvolo.errors import InputError, NotFoundError, SettingsError, SorvoloWarning, StoreError
-from sorvolo.findings.register import MissionSighting, Register
+from sorvolo.findings.register import MissionSighting, Register, SearchedDate
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.paths import AnyPath
@@ -226,9 +226,15 @@ class Archive:
         """Which ground each complete run searched for objects, by flight rank."""
         return self.catalogue_rows(change_records.load_searches)
 
-    def register(self, watched: Sequence[MissionSighting] = ()) -> Register:
-        """What all missions found, each thing one finding; with what watches saw, which the site does not keep."""
-        return self.catalogue_rows(site_register, None, watched)
+    def register(
+        self,
+        others: Sequence[MissionSighting] = (),
+        their_looks: Sequence[SearchedDate] = (),
+        flights: Collection[str] | None = None,
+    ) -> Register:
+        """What all missions of these flights found, each thing one finding; with what others saw and looked at, which
+        the site does not keep."""
+        return self.catalogue_rows(site_register, flights, others, their_looks)
 
     def flown(self) -> list[tuple[str, int, int, int]]:
         """Each flight's name, rank, and the times of its first and last frame, by rank; none of flights without."""

@@ -15,17 +15,21 @@ from sorvolo.store.site.change_records import (
     load_searches,
 )
 from sorvolo.survey.findings import ChangeKind, Verdict
+from sorvolo.survey.map_objects import MapObject
 
 
 def site_register(
     connection: Connection,
     flights: Collection[str] | None = None,
-    watched: Sequence[MissionSighting] = (),
+    others: Sequence[MissionSighting] = (),
+    their_looks: Sequence[SearchedDate] = (),
 ) -> Register:
-    """What all complete runs found, each thing once; as far as these flights know. `watched` is of no run of the site."""
+    """What all complete runs found, each thing once; as far as these flights know. `others` are of no run of the site."""
     searches = [each for each in load_searches(connection) if _is_of(each.flight_id, flights)]
     sightings = [
-        sighting_of(each) for each in load_objects(connection) if _is_of(each.flight_id, flights)
+        sighting_of(each.thing, each.flight_id, float(each.rank))
+        for each in load_objects(connection)
+        if _is_of(each.flight_id, flights)
     ]
     versions = list_versions(connection)
     flight_of = {each.id: each.flight_id for each in versions}
@@ -35,7 +39,7 @@ def site_register(
         if _is_of(change.flight_id, flights) and change.verdict is not Verdict.REJECTED:
             sightings += _of_change(change, before.get(change.flight_id, ""), dates)
     looks = [SearchedDate(each.flight_id, float(each.rank), each.frames) for each in searches]
-    return associate([*sightings, *watched], looks)
+    return associate([*sightings, *others], [*looks, *their_looks])
 
 
 def flown_flights(connection: Connection) -> list[tuple[str, int, int, int]]:
@@ -67,13 +71,12 @@ def present_objects(register: Register, objects: Sequence[StoredObject]) -> list
     ]
 
 
-def sighting_of(stored: StoredObject) -> MissionSighting:
+def sighting_of(thing: MapObject, flight_id: str, rank: float) -> MissionSighting:
     """An object that a flight's map or comparison found."""
-    thing = stored.thing
     return MissionSighting(
-        stored.flight_id,
-        float(stored.rank),
-        f"{stored.flight_id} objects",
+        flight_id,
+        rank,
+        f"{flight_id} objects",
         thing.id,
         KnownBy.DETECTED,
         thing.label,
