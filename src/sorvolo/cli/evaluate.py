@@ -345,7 +345,7 @@ def _add(table: Table, name: str, spread: "Spread") -> None:
 
 def _show_scores(console: Console, scores: "SetScores") -> None:
     table = Table(title=scores.name, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for name in ("class", "labels", "AP", "AP50", "precision", "recall", "from", "thesis AP"):
+    for name in ("class", "labels", "AP", "AP50", "precision", "recall", "from"):
         table.add_column(name, no_wrap=True, justify="left" if name == "class" else "right")
     for row in scores.classes:
         table.add_row(
@@ -356,7 +356,6 @@ def _show_scores(console: Console, scores: "SetScores") -> None:
             _share(row.reported.precision),
             _share(row.reported.recall),
             f"{row.reported.score:.2f}",
-            _share(row.thesis_ap),
         )
     table.add_section()
     table.add_row(
@@ -364,10 +363,7 @@ def _show_scores(console: Console, scores: "SetScores") -> None:
         "",
         _between(scores.intervals["AP"]),
         _between(scores.intervals["AP50"]),
-        "",
-        "",
-        "",
-        _share(scores.thesis_map),
+        _share(scores.intervals["thesis_map"].value),
     )
     console.print(table)
     if scores.groups > 1:

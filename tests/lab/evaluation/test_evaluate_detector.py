@@ -86,7 +86,8 @@ def test_a_model_is_measured_and_its_report_stands_alone(toy, labelled, tmp_path
     assert person.coco.ap50 == pytest.approx(67 * (2 / 3) / 101)
     # cars by score: the person called a car, one right, one missed: precision 1/2 at recall 1/2
     assert car.coco.ap50 == pytest.approx(51 * 0.5 / 101)
-    assert scores.thesis_map == pytest.approx((2 / 3 + 1 / 2) / 2)
+    thesis_map = scores.intervals["thesis_map"].value
+    assert thesis_map == pytest.approx((2 / 3 + 1 / 2) / 2)
     assert scores.confusion.tolist() == [[2, 1, 0], [0, 1, 1], [1, 0, 0]]
     assert {row.kind for row in scores.mistakes} == {"false alarm", "miss", "confusion"}
     assert [(row.low, row.count) for row in scores.by_size_m["car"]] == [(2.0, 2)]
@@ -98,7 +99,7 @@ def test_a_model_is_measured_and_its_report_stands_alone(toy, labelled, tmp_path
     assert "person reported as car" in page and "car missed" in page
     numbers = json.loads((tmp_path / "out" / NUMBERS).read_text())
     assert numbers["sets"][0]["mistakes"] == {"false alarm": 1, "miss": 1, "confusion": 1}
-    assert numbers["sets"][0]["thesis_map"] == pytest.approx(scores.thesis_map)
+    assert numbers["sets"][0]["intervals"]["thesis_map"]["value"] == pytest.approx(thesis_map)
     assert numbers["sets"][0]["classes"][0]["coco"]["ap_large"] is None
     again = evaluate_detector([[str(tmp_path / "out" / FOUND)]], [labelled], QUICK)
     mine, its = (evaluation_numbers(each, {}) for each in (evaluation, again))

@@ -7,11 +7,12 @@ from typing import TypeVar
 
 import cv2
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, Mask, PointsM, TimesNs, frozen
-from sorvolo.geometry.polygons import gap, points_inside, signed_area
+from sorvolo.geometry.polygons import gap, points_inside
 from sorvolo.survey.findings import ChangeKind
 
 VIDEO_VIEWS = 3
@@ -410,16 +411,12 @@ def _delay_s(found: FoundEvent, truth: TrueEvent) -> float:
 
 def _offset_m(found: FoundEvent, truth: TrueEvent) -> Floats:
     """(2,) from the true place to the report's centre; for something that moves, from the nearest point of its path."""
-    centre = _centroid(found.outline_m)
-    if not len(truth.path_m):
-        return centre - _centroid(truth.outline_m)
-    start = truth.path_m
-    along = np.roll(start, -1, axis=0) - start
-    along[-1] = 0.0
-    squares = np.maximum((along**2).sum(axis=1), 1e-12)
-    share = np.clip(((centre - start) * along).sum(axis=1) / squares, 0, 1)
-    offsets = centre - (start + share[:, None] * along)
-    return np.asarray(offsets[np.argmin((offsets**2).sum(axis=1))])
+    centre = shapely.Polygon(found.outline_m).centroid
+    place = shapely.Polygon(truth.outline_m).centroid
+    if len(truth.path_m):
+        path = shapely.LineString([*truth.path_m, truth.path_m[-1]])
+        place = path.interpolate(path.project(centre))
+    return np.array([centre.x - place.x, centre.y - place.y])
 
 
 def _is_near(found: FoundEvent, truth: TrueEvent, offset_m: Floats) -> bool:
@@ -428,17 +425,6 @@ def _is_near(found: FoundEvent, truth: TrueEvent, offset_m: Floats) -> bool:
     if len(truth.path_m):
         return bool(points_inside([found.outline_m], truth.path_m).any())
     return gap(found.outline_m, truth.outline_m) == 0
-
-
-def _centroid(ring: PointsM) -> Floats:
-    """(2,) the centre of a ring's area; of its corners where it has none."""
-    middle = ring.mean(axis=0)
-    area = signed_area(ring)
-    if abs(area) < 1e-12:
-        return np.asarray(middle)
-    here, there = ring - middle, np.roll(ring, -1, axis=0) - middle
-    cross = here[:, 0] * there[:, 1] - there[:, 0] * here[:, 1]
-    return np.asarray(middle + ((here + there) * cross[:, None]).sum(axis=0) / (6 * area))
 
 
 def _ratio(part: float, whole: float) -> float:

@@ -18,9 +18,11 @@ from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import BoxesPx, Counts, Floats, Mask, Rows
+from sorvolo.geometry.arrays import BoxesPx, Floats, Mask, Rows
+from sorvolo.geometry.arrays import Counts as CountTable
 from sorvolo.geometry.box_overlap import iou_matrix
 from sorvolo.geometry.summary import CalibrationBin, calibration_bins
+from sorvolo.lab.evaluation.change_metrics import Counts
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import Detections
 
@@ -195,12 +197,12 @@ def match_pictures(
     return matches, _numbers(precision), each
 
 
-def counts_at(match: ClassMatch, score: float) -> tuple[int, int, int]:
+def counts_at(match: ClassMatch, score: float) -> Counts:
     """True positives, false positives and misses of what scores at least this, at IoU 0.5."""
     reported = match.scores >= score
     right = int((reported & match.right[0]).sum())
     wrong = int((reported & ~match.right[0] & ~match.ignored[0]).sum())
-    return right, wrong, len(match.true_scores) - right
+    return Counts(right, wrong, len(match.true_scores) - right)
 
 
 def right_by_score(match: ClassMatch) -> list[CalibrationBin]:
@@ -212,25 +214,6 @@ def right_by_score(match: ClassMatch) -> list[CalibrationBin]:
     return calibration_bins(match.scores[counted].astype(float), match.right[0][counted], TENTHS)
 
 
-def thesis_ap(match: ClassMatch, score: float) -> float:
-    """The thesis's AP of a class (eq. 4.3): TP / (TP + FP) of what is reported at this score.
-
-    It is precision at one threshold, not the area under a curve, and does not count what was missed. 0 where labels
-    exist and nothing was reported; NaN without labels.
-    """
-    right, wrong, _ = counts_at(match, score)
-    if not len(match.true_scores):
-        return float("nan")
-    return right / (right + wrong) if right + wrong else 0.0
-
-
-def thesis_map(matches: Sequence[ClassMatch], thresholds: Mapping[str, float]) -> float:
-    """The thesis's mAP (eq. 4.4): the mean of eq. 4.3 over the classes that have labels."""
-    values = [thesis_ap(match, thresholds[match.label]) for match in matches]
-    known = [value for value in values if not np.isnan(value)]
-    return float(np.mean(known)) if known else float("nan")
-
-
 def precision_recall(match: ClassMatch) -> tuple[Floats, Floats, Floats]:
     """Score, precision and recall (N,) after each detection that counts, best first, at IoU 0.5."""
     counted = ~match.ignored[0]
@@ -239,18 +222,23 @@ def precision_recall(match: ClassMatch) -> tuple[Floats, Floats, Floats]:
     return match.scores[counted], right / total, right / max(len(match.true_scores), 1)
 
 
+def _every_threshold(match: ClassMatch) -> Floats:
+    """(N, 4) the fields of `Threshold` at each detection that counts; F1 is 0 where equal scores would be parted."""
+    scores, precision, recall = precision_recall(match)
+    f1 = 2 * precision * recall / np.maximum(precision + recall, 1e-12)
+    f1[:-1][scores[:-1] == scores[1:]] = 0.0
+    return np.column_stack([scores, precision, recall, f1])
+
+
 def best_threshold(match: ClassMatch) -> Threshold:
     """The score from which on F1 is highest; NaN where nothing is right.
 
     It is optimistic: the threshold is chosen on the pictures it is measured on.
     """
-    scores, precision, recall = precision_recall(match)
     if not match.right[0].any():
         return Threshold(*[float("nan")] * 4)
-    f1 = 2 * precision * recall / np.maximum(precision + recall, 1e-12)
-    f1[:-1][scores[:-1] == scores[1:]] = 0.0  # a threshold cannot part equal scores
-    best = int(np.argmax(f1))
-    return Threshold(*(float(each[best]) for each in (scores, precision, recall, f1)))
+    rows = _every_threshold(match)
+    return Threshold(*rows[np.argmax(rows[:, 3])].tolist())
 
 
 def reporting_threshold(match: ClassMatch) -> Threshold:
@@ -262,22 +250,15 @@ def reporting_threshold(match: ClassMatch) -> Threshold:
     best = best_threshold(match)
     if not np.isfinite(best.score):
         return best
-    scores, precision, recall = precision_recall(match)
-    f1 = 2 * precision * recall / np.maximum(precision + recall, 1e-12)
-    f1[:-1][scores[:-1] == scores[1:]] = 0.0
+    rows = _every_threshold(match)
     margin = min(0.1, 0.5 / np.sqrt(len(match.true_pictures)))
-    row = int(np.flatnonzero(f1 >= best.f1 - margin)[-1])
-    return Threshold(*(float(each[row]) for each in (scores, precision, recall, f1)))
+    return Threshold(*rows[rows[:, 3] >= best.f1 - margin][-1].tolist())
 
 
 def at_score(match: ClassMatch, score: float) -> Threshold:
-    """What reporting from a given score on gives; NaN where nothing is labelled or nothing scores so high."""
-    scores, precision, recall = precision_recall(match)
-    reported = int((scores >= score).sum())
-    if not reported or not len(match.true_scores):
-        return Threshold(score, *[float("nan")] * 3)
-    p, r = float(precision[reported - 1]), float(recall[reported - 1])
-    return Threshold(score, p, r, 2 * p * r / max(p + r, 1e-12))
+    """What reporting from a given score on gives, at IoU 0.5; rates as those of `Counts`."""
+    counts = counts_at(match, score)
+    return Threshold(score, counts.precision, counts.recall, counts.f1)
 
 
 def recall_by_size(
@@ -308,14 +289,14 @@ def recall_by_size(
 
 def confusion(
     matches: Sequence[ClassMatch], thresholds: Mapping[str, float]
-) -> tuple[Counts, tuple[Mistake, ...]]:
+) -> tuple[CountTable, tuple[Mistake, ...]]:
     """(C + 1, C + 1) true class by reported class, the last row and column being background; and every mistake.
 
     First each class's own matches at IoU 0.5; then what is left, best first, takes what is left of other classes at IoU
     0.5 or more. The rest of the reported are false alarms (last row), the rest of the labels are missed (last column).
     """
     size = len(matches)
-    table: Counts = np.zeros((size + 1, size + 1), np.int64)
+    table: CountTable = np.zeros((size + 1, size + 1), np.int64)
     wrong: list[tuple[float, int, int]] = []  # score, class, detection
     missed: dict[int, list[tuple[int, int]]] = {}  # picture -> class, label
     for k, match in enumerate(matches):

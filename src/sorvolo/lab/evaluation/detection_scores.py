@@ -17,16 +17,14 @@ from sorvolo.lab.evaluation.detection_metrics import (
     Mistake,
     SizeRow,
     Threshold,
+    at_score,
     best_threshold,
     confusion,
-    counts_at,
     judged_classes,
     match_pictures,
     precision_recall,
     recall_by_size,
     right_by_score,
-    thesis_ap,
-    thesis_map,
 )
 from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import Detections
@@ -249,14 +247,13 @@ class ClassScores:
     """One class: COCO's numbers, what reporting at the model's own threshold gives, the best threshold in hindsight.
 
     `curve` (N, 3) is score, precision and recall at IoU 0.5, thinned; `by_score` has what share of each tenth of the
-    score is right. `thesis_ap` is eq. 4.3 at `reported.score`.
+    score is right. The thesis's AP (eq. 4.3) is `reported.precision`.
     """
 
     label: str
     labels: int
     coco: CocoNumbers
     reported: Threshold
-    thesis_ap: float
     best: Threshold
     curve: Floats
     by_score: tuple[CalibrationBin, ...]
@@ -277,7 +274,6 @@ class SetScores:
     ignored_regions: int
     left_out: tuple[str, ...]
     coco: CocoNumbers
-    thesis_map: float
     intervals: Mapping[str, Interval]
     classes: tuple[ClassScores, ...]
     confusion: Counts
@@ -339,17 +335,12 @@ def score_set(
     tables = group_tables(matches, _groups(labelled), thresholds)
     scores = []
     for match in matches:
-        right, wrong, missed = counts_at(match, thresholds[match.label])
-        precision = right / (right + wrong) if right + wrong else float("nan")
-        recall = right / (right + missed) if right + missed else float("nan")
-        f1 = 2 * right / (2 * right + wrong + missed) if right + wrong + missed else float("nan")
         scores.append(
             ClassScores(
                 match.label,
                 len(match.true_scores),
                 by_class[match.label],
-                Threshold(thresholds[match.label], precision, recall, f1),
-                thesis_ap(match, thresholds[match.label]),
+                at_score(match, thresholds[match.label]),
                 best_threshold(match),
                 _thinned(np.column_stack(precision_recall(match))),
                 tuple(right_by_score(match)),
@@ -363,7 +354,6 @@ def score_set(
         sum(len(each.ignored_px) for each in labelled.pictures),
         tuple(name for name in classes if name not in judged),
         coco,
-        thesis_map(matches, thresholds),
         intervals(tables, draws=draws, seed=seed),
         tuple(scores),
         table,

@@ -45,7 +45,6 @@ _CLASS_NAMES = (
     "precision",
     "recall",
     "F1",
-    "thesis AP",
     "best F1",
     "from",
 )
@@ -115,7 +114,6 @@ def _set(scores: Any, worst: Sequence[tuple[Any, str, ImageRGB]]) -> dict[str, A
                     _share(value)
                     for value in (row.reported.precision, row.reported.recall, row.reported.f1)
                 ),
-                _share(row.thesis_ap),
                 _share(row.best.f1),
                 _number(row.best.score),
             ]

@@ -4,6 +4,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -176,10 +177,8 @@ def correlation(a: Floats | ImageGray, b: Floats | ImageGray, mask: Mask) -> flo
     """
     if not mask.any():
         return float("nan")
-    da, db = a[mask].astype(np.float64), b[mask].astype(np.float64)
-    da, db = da - da.mean(), db - db.mean()
-    scale = np.sqrt((da**2).sum() * (db**2).sum())
-    return float((da * db).sum() / scale) if scale > 0 else float("nan")
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return float(np.corrcoef(a[mask], b[mask])[0, 1])
 
 
 def residual_shift(a: Floats | ImageGray, b: Floats | ImageGray, mask: Mask) -> Shift:
@@ -231,7 +230,7 @@ class MapDeviation:
 
     def __init__(self, tiles: Mapping[TileIndex, ImageRGBA], site_grid: SiteGrid) -> None:
         self._tiles, self._site_grid = tiles, site_grid
-        self._recent: dict[TileIndex, ImageRGBA] = {}
+        self._tile = lru_cache(_RECENT)(tiles.__getitem__)
 
     def of(self, image: ImageRGB, site_from_image: Matrix3) -> Deviation:
         """The deviation of one undistorted frame, (H, W, 3), from the map under it."""
@@ -298,15 +297,6 @@ class MapDeviation:
                     left - column * side : right - column * side,
                 ]
         return result
-
-    def _tile(self, index: TileIndex) -> ImageRGBA:
-        tile = self._recent.pop(index, None)
-        if tile is None:
-            tile = self._tiles[index]
-            if len(self._recent) >= _RECENT:
-                del self._recent[next(iter(self._recent))]
-        self._recent[index] = tile
-        return tile
 
 
 def frames_to_compare(count: int, most: int) -> list[int]:

@@ -118,15 +118,12 @@ def frames_against_times(
             continue
         there = is_changed(int(name))
         changed, unknown = read_mask(path, may_be_unknown=True)
-        if there is None or unknown.all():
-            counts = Counts(unknown=1)
-        elif there:
-            counts = Counts(tp=1) if changed.any() else Counts(fn=1)
-        else:
-            counts = Counts(fp=1) if changed.any() else Counts(tn=1)
-        nothing = np.zeros(changed.shape, bool)
-        pixels = pixel_counts(changed, nothing, unknown) if there is False else Counts()
-        yield ComparedMask(name, path, pixels, counts)
+        pixels, frame = Counts(), Counts(unknown=1)
+        if there is not None:
+            truth = np.full(changed.shape, there)
+            frame = frame_counts(changed, truth, unknown)
+            pixels = Counts() if there else pixel_counts(changed, truth, unknown)
+        yield ComparedMask(name, path, pixels, frame)
 
 
 def has_masks(folder: Path) -> bool:

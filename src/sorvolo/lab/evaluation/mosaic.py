@@ -7,11 +7,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from rasterio.enums import Resampling
+from rasterio.transform import Affine
+from rasterio.warp import reproject
 
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Floats, ImageGray, Mask, PointsPx
-from sorvolo.geometry.geodesy import Projection
+from sorvolo.geometry.arrays import Floats, ImageGray, Mask
 from sorvolo.lab.evaluation.frame_rows import (
     map_frames,
     refuse_simulation,
@@ -114,7 +115,6 @@ def _outlines_m(
 
 
 _LEAST_PX = 1000  # of common ground
-_LATTICE_PX = 64  # between the points that are taken from CRS to CRS
 
 
 @dataclass(frozen=True)
@@ -154,35 +154,25 @@ def match_reference(mine: Raster, other: Raster) -> ReferenceMatch | None:
 
 
 def _resampled(raster: Raster, onto: Raster) -> tuple[ImageGray, Mask]:
-    """A raster's gray in the pixels of another, and where it knows them; CRS to CRS by a lattice of points."""
-    places = _places(raster, onto)
-    source, m_per_px = raster.rgba, raster.m_per_px
-    while onto.m_per_px > 2 * m_per_px and min(source.shape[:2]) > 32:
-        source = cv2.pyrDown(source)  # type: ignore[assignment]
-        places = np.asarray(places / 2, np.float32)
-        m_per_px *= 2
-    moved = cv2.remap(  # type: ignore[call-overload]
-        source, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
+    """A raster's gray in the pixels of another, and where it knows them."""
+    moved = np.zeros((4, *onto.rgba.shape[:2]), np.uint8)
+    reproject(
+        np.moveaxis(raster.rgba, 2, 0),
+        moved,
+        src_transform=_transform(raster),
+        src_crs=raster.crs,
+        dst_transform=_transform(onto),
+        dst_crs=onto.crs,
+        resampling=Resampling.bilinear,
+        tolerance=0.0,
     )
-    return gray_from_rgb(np.ascontiguousarray(moved[..., :3])), moved[..., 3] > 254
+    return gray_from_rgb(np.ascontiguousarray(np.moveaxis(moved[:3], 0, 2))), moved[3] > 254
 
 
-def _places(raster: Raster, onto: Raster) -> NDArray[np.float32]:
-    """(H, W, 2) where the pixels of `onto` lie in the raster."""
-    height, width = onto.rgba.shape[:2]
-    step = _LATTICE_PX
-    columns, rows = np.arange(0, width + step, step), np.arange(0, height + step, step)
-    x, y = (each.ravel().astype(np.float64) for each in np.meshgrid(columns, rows))
-    points_m = np.column_stack([x, -y]) * onto.m_per_px + onto.origin_m
-    if raster.crs != onto.crs:
-        latitude_deg, longitude_deg = Projection(onto.crs).wgs84_from_projected(points_m)
-        points_m = Projection(raster.crs).projected_from_wgs84(latitude_deg, longitude_deg)
-    lattice: PointsPx = (points_m - raster.origin_m) / raster.m_per_px * [1.0, -1.0]
-    # OpenCV's own enlargements round places to 1/32 of the lattice's step, which is pixels here
-    down = np.maximum(0.0, 1 - abs(np.arange(height)[:, None] - rows) / step)
-    across = np.maximum(0.0, 1 - abs(np.arange(width)[:, None] - columns) / step)
-    places = np.einsum("hr,rcd->hcd", down, lattice.reshape(len(rows), len(columns), 2))
-    return np.einsum("wc,hcd->hwd", across, places, optimize=True).astype(np.float32)
+def _transform(raster: Raster) -> Affine:
+    """Of GDAL, from the outer corner of the first pixel, whose centre is at the raster's origin."""
+    west_m, north_m = raster.origin_m + raster.m_per_px * np.array([-0.5, 0.5])
+    return Affine(raster.m_per_px, 0, west_m, 0, -raster.m_per_px, north_m)
 
 
 _DEVIATION_FRAMES = 120  # at most, spread over the flight: it bounds the time

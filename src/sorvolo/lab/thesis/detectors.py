@@ -142,7 +142,7 @@ def measure_model(model: str, labelled: LabelledSet) -> dict[str, Any]:
         "set": labelled.name,
         "pictures": scores.pictures,
         "videos": scores.groups,
-        "thesis_map": scores.thesis_map,
+        "thesis_map": scores.intervals["thesis_map"].value,
         "ap50": scores.coco.ap50,
         "ap": scores.coco.ap,
         "labels": {row.label: row.labels for row in scores.classes},

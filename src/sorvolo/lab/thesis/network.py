@@ -73,10 +73,10 @@ class InceptionB(nn.Module):
         inner = _scaled(128, scale)
         self.first = convolution(channels, out, 1)
         self.second = nn.Sequential(
-            convolution(channels, inner, 1), _line(inner, inner, 1, 7), _line(inner, out, 7, 1)
+            convolution(channels, inner, 1), convolution(inner, inner, (1, 7)), convolution(inner, out, (7, 1))
         )
         self.third = nn.Sequential(
-            convolution(channels, inner, 1), _line(inner, inner, 7, 1), _line(inner, out, 1, 7)
+            convolution(channels, inner, 1), convolution(inner, inner, (7, 1)), convolution(inner, out, (1, 7))
         )
         self.channels = 3 * out
 
@@ -99,7 +99,7 @@ class InceptionC(nn.Module):
         self.near = convolution(channels, out, 1)
         self.far = nn.Sequential(convolution(channels, inner, 1), convolution(inner, out, 3))
         self.branches = nn.ModuleList(
-            _line(out, out, *kernel) for kernel in ((1, 3), (3, 1), (1, 3), (3, 1))
+            convolution(out, out, kernel) for kernel in ((1, 3), (3, 1), (1, 3), (3, 1))
         )
         self.channels = narrow + 4 * out
 
@@ -152,15 +152,6 @@ def thesis_network(
     head = StageHead(stage, 2048, len(classes))
     return FasterRCNN(
         backbone, torch.nn.Identity(), proposals, head, Reach(before=2000, regions=_REGIONS)
-    )
-
-
-def _line(channels: int, out: int, rows: int, columns: int) -> nn.Sequential:
-    """A convolution of rows x columns, batch norm, ReLU."""
-    return nn.Sequential(
-        nn.Conv2d(channels, out, (rows, columns), padding=(rows // 2, columns // 2), bias=False),
-        nn.BatchNorm2d(out),
-        nn.ReLU(inplace=True),
     )
 
 

@@ -385,10 +385,11 @@ def _load(module: nn.Module, weights: Mapping[str, Tensor], prefix: str) -> None
     module.load_state_dict(own, strict=False)
 
 
-def convolution(channels: int, out: int, kernel: int) -> nn.Sequential:
-    """Convolution, batch norm, ReLU; size kept."""
+def convolution(channels: int, out: int, kernel: int | tuple[int, int]) -> nn.Sequential:
+    """Convolution of a kernel of odd sides, (rows, columns) or square, batch norm, ReLU; size kept."""
+    rows, columns = kernel if isinstance(kernel, tuple) else (kernel, kernel)
     return nn.Sequential(
-        nn.Conv2d(channels, out, kernel, padding=kernel // 2, bias=False),
+        nn.Conv2d(channels, out, (rows, columns), padding=(rows // 2, columns // 2), bias=False),
         nn.BatchNorm2d(out),
         nn.ReLU(inplace=True),
     )
