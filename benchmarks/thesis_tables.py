@@ -22,14 +22,11 @@ from provenance import commit, machine, note_scoring, seeds_or_drawn
 from sorvolo.lab.thesis.report import write_reproduction
 from sorvolo.lab.thesis.rows import Row
 from sorvolo.lab.thesis.run import reproduce
-from sorvolo.lab.thesis.settings import (
-    DetectorSettings,
-    ReproductionSettings,
-    SimulatedSize,
-)
+from sorvolo.lab.thesis.settings import ReproductionSettings, SimulatedSize
 from sorvolo.lab.thesis.sheets import reproduction_sheets
 from sorvolo.lab.thesis.simulated import simulated_dataset
 from sorvolo.lab.thesis.tables import tables_of
+from sorvolo.lab.training.settings import TrainSettings
 from sorvolo.store.exports.plain import plain_json
 
 RESULTS = Path(__file__).parent / "results" / "thesis_tables.json"
@@ -51,15 +48,13 @@ def main() -> None:
     options = parser.parse_args()
     seeds = seeds_or_drawn("thesis_tables", options.seeds, 1)
     size = SimulatedSize(options.length)
+    steps = options.train_steps
+    training = TrainSettings(rpn="standard", steps=steps, patience=0) if steps else None
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as scratch:
         work = options.work or Path(scratch)
         for seed in seeds:
-            settings = ReproductionSettings(
-                options.videos,
-                seed=seed,
-                detector=DetectorSettings(options.train_steps, weights="auto"),
-            )
+            settings = ReproductionSettings(options.videos, seed=seed, training=training)
             rows += reproduced(work / str(seed), settings, size)
     scoring = note_scoring(f"thesis_tables, seeds {' '.join(map(str, seeds))}")
     tables = plain_json(tables_of(rows))

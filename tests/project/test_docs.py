@@ -148,6 +148,19 @@ def test_functions_and_rooms_of_an_explanation_exist() -> None:
     assert wrong == []
 
 
+def test_source_files_that_a_page_names_exist() -> None:
+    roots = SOURCE, SOURCE / "lab" / "thesis", ROOT
+    wrong = []
+    for page in (ROOT / "docs").rglob("*.md"):
+        files = re.findall(r"`([a-z_]+(?:/\w+)*\.py)`", page.read_text(encoding="utf-8"))
+        wrong += [
+            f"{page.name}: {file}"
+            for file in files
+            if not any((root / file).is_file() for root in roots)
+        ]
+    assert wrong == []
+
+
 def test_the_page_of_commands_names_them_all() -> None:
     page = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
     assert [name for name in commands_by_name() if f"`{name}`" not in page] == []

@@ -69,16 +69,14 @@ def reproduce(
     Example, without the dataset: sorvolo reproduce --simulated --videos 1
     """
     from sorvolo.lab.thesis.report import PAGE
-    from sorvolo.lab.thesis.settings import (
-        DetectorSettings,
-        ReproductionSettings,
-        SimulatedSize,
-    )
+    from sorvolo.lab.thesis.settings import ReproductionSettings, SimulatedSize
     from sorvolo.lab.thesis.settings import quick as quick_sizes
+    from sorvolo.lab.training.settings import TrainSettings
 
-    settings = ReproductionSettings(
-        videos, detector=DetectorSettings(train_steps, preset, schedule=schedule)
-    )
+    training = None
+    if train_steps:
+        training = TrainSettings(preset, "standard", schedule, steps=train_steps, patience=0)
+    settings = ReproductionSettings(videos, training=training)
     simulation = SimulatedSize()
     if quick:
         settings, simulation = quick_sizes(settings, simulation)

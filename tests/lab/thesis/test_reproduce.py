@@ -30,7 +30,6 @@ from sorvolo.lab.thesis.report import MARKDOWN, NUMBERS, PAGE, write_reproductio
 from sorvolo.lab.thesis.rows import Row
 from sorvolo.lab.thesis.run import ReproductionUpdate, _Work, reproduce
 from sorvolo.lab.thesis.settings import (
-    DetectorSettings,
     ReproductionSettings,
     SimulatedSize,
     quick,
@@ -51,7 +50,7 @@ from sorvolo.store.exports.map_pictures import picture
 from sorvolo.store.site.archive import Archive
 
 SETTINGS, SIZE = quick(
-    ReproductionSettings(views_per_second=2.5, detector=DetectorSettings(steps=0)),
+    ReproductionSettings(views_per_second=2.5),
     SimulatedSize(bare_videos=0),
 )
 SMALL = replace(SIZE, length_m=8.0, size_px=(320, 180))

@@ -124,31 +124,24 @@ def test_a_lost_frame_is_named_and_the_region_stays():
 
 def test_the_region_is_around_the_last_frame_only():
     """Ground that the mosaic shows, but farther than the region reaches, is not found again."""
-    settings = RoiStitchingSettings(roi_frames=1.0)
-    stitcher = RoiStitcher(settings)
+    stitcher = RoiStitcher()
     for number, x in enumerate((0, 150, 300, 450, 600)):
         assert isinstance(stitcher.add(number, photographed(pose(x, 200))), Stitched)
     assert isinstance(stitcher.add(9, photographed(pose(0, 200))), str)
 
 
-def test_low_contrast_needs_the_low_threshold():
+def test_ground_of_low_contrast_is_stitched():
     faint = ground(3, contrast=6)
     a, b = faint[100:340, 100:420], faint[120:360, 160:480]
-    for threshold, wanted in ((8e-5, Stitched), (1e-3, str)):
-        stitcher = RoiStitcher(RoiStitchingSettings(akaze_threshold=threshold))
-        stitcher.add(0, a)
-        assert isinstance(stitcher.add(1, b), wanted)
+    stitcher = RoiStitcher()
+    stitcher.add(0, a)
+    assert isinstance(stitcher.add(1, b), Stitched)
+    assert len(cv2.xfeatures2d.AKAZE_create(threshold=1e-3).detect(a)) < 12  # by OpenCV's own
 
 
 @pytest.mark.parametrize(
     "options",
-    [
-        {"akaze_threshold": 0.0},
-        {"roi_frames": 0.5},
-        {"min_inliers": 2},
-        {"max_features": 0},
-        {"transform": "affine"},
-    ],
+    [{"max_features": 0}, {"transform": "affine"}],
 )
 def test_impossible_settings_are_refused(options):
     with pytest.raises(SettingsError):

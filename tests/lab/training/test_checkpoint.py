@@ -23,6 +23,7 @@ from sorvolo.lab.training.progress import (
     seconds_left,
 )
 from sorvolo.lab.training.samples import Augmentation, Share, TrainingSample, batches_from, draws
+from sorvolo.lab.training.settings import TrainSettings
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 
 _CLASSES = ("person", "car")
@@ -185,7 +186,7 @@ def test_the_second_step_begins_from_the_first_weights_and_the_first_steps_propo
 
 def test_too_few_steps_for_four() -> None:
     with pytest.raises(SettingsError, match="at least 4 steps"):
-        FourStepSettings(steps=3)
+        TrainSettings(schedule="four-steps", steps=3)
 
 
 def _copies(learner: FourStepTraining) -> dict[str, dict[str, "torch.Tensor"]]:

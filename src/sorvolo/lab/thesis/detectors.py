@@ -14,7 +14,7 @@ from sorvolo.errors import InputError
 from sorvolo.lab.datasets.parsed import read_text
 from sorvolo.lab.datasets.umcd import read_umcd_metadata
 from sorvolo.lab.evaluation.detector import EvaluationSettings, evaluate_detector, read_sets
-from sorvolo.lab.thesis.settings import FIGURE_PX, DetectorSettings
+from sorvolo.lab.thesis.settings import FIGURE_PX
 from sorvolo.lab.thesis.umcd_folder import UmcdVideo
 from sorvolo.lab.training.settings import TrainSettings
 from sorvolo.mosaic.selection import every
@@ -92,9 +92,7 @@ def extract_frames(
     )
 
 
-def train_network(
-    labels: Labels, out: Path, rpn: str, settings: DetectorSettings, seed: int
-) -> str:
+def train_network(labels: Labels, out: Path, settings: TrainSettings) -> str:
     """Train one network of Table 4.6 on what is not held out; the file of the model, which is left in `out`.
 
     Raises InputError as `train_detector`, and where torch is not installed; SettingsError for a device.
@@ -106,20 +104,10 @@ def train_network(
         raise InputError(
             f"training needs packages that are not installed ({error.name}): pip install 'sorvolo[training]'"
         ) from error
-    wanted = TrainSettings(
-        settings.preset,
-        "extended" if rpn == "extended" else "standard",
-        settings.schedule,
-        weights=settings.weights,
-        steps=settings.steps,
-        side_px=settings.side_px,
-        seed=seed,
-        patience=0,
-    )
     with writing(out):
         shutil.rmtree(out, ignore_errors=True)
     options = DataOptions(val=str(labels.test or HELD_OUT), form=labels.form)
-    for _ in train_detector([labels.place], out, wanted, options, device=settings.device):
+    for _ in train_detector([labels.place], out, settings, options):
         pass
     return str(out / MODEL)
 

@@ -15,7 +15,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from sorvolo.errors import SettingsError
 from sorvolo.lab.training.faster_rcnn import FasterRCNN, Proposed
 from sorvolo.lab.training.joint import (
     Answer,
@@ -41,12 +40,6 @@ class FourStepSettings:
     anchors: int = 256  # per picture for the proposals, half of them positives at most (Ren et al. 2015, 3.1.3)
     regions: int = 128  # per picture for the classifier, a quarter of them positives at most
     proposed: int = 300  # regions per picture out of which those are drawn
-
-    def __post_init__(self) -> None:
-        if self.steps < 4:
-            raise SettingsError(
-                f"the four-step schedule needs at least 4 steps, one of each kind; got {self.steps}"
-            )
 
 
 class FourStepTraining:

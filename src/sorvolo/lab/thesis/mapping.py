@@ -15,7 +15,13 @@ from sorvolo.errors import GeometryError, InputError
 from sorvolo.geometry.arrays import Floats, ImageRGB, Matrix3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import apply_homography, resized
-from sorvolo.lab.thesis.stitching import RoiStitcher, RoiStitchingSettings, Stitched, georeference
+from sorvolo.lab.thesis.stitching import (
+    SIDE_PX,
+    RoiStitcher,
+    RoiStitchingSettings,
+    Stitched,
+    georeference,
+)
 from sorvolo.missions.flight.log import Ending, Stage, nothing_placed
 from sorvolo.missions.flight.map_objects import ObjectFinder, crops_of
 from sorvolo.missions.flight.report import FlightResult, build_report
@@ -186,7 +192,7 @@ class ThesisRun(FlightRun):
     ) -> None:
         super().__init__(setup, archive, settings, finder=finder, request=request)
         full = setup.source.camera.camera
-        scale = min(1.0, stitching.side_px / max(full.width_px, full.height_px))
+        scale = min(1.0, SIDE_PX / max(full.width_px, full.height_px))
         small = full.resized(round(full.width_px * scale), round(full.height_px * scale))
         self._lens, self._small_lens = Undistorter(full), Undistorter(small)
         self._camera = self._small_lens.camera

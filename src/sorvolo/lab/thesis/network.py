@@ -73,10 +73,14 @@ class InceptionB(nn.Module):
         inner = _scaled(128, scale)
         self.first = convolution(channels, out, 1)
         self.second = nn.Sequential(
-            convolution(channels, inner, 1), convolution(inner, inner, (1, 7)), convolution(inner, out, (7, 1))
+            convolution(channels, inner, 1),
+            convolution(inner, inner, (1, 7)),
+            convolution(inner, out, (7, 1)),
         )
         self.third = nn.Sequential(
-            convolution(channels, inner, 1), convolution(inner, inner, (7, 1)), convolution(inner, out, (1, 7))
+            convolution(channels, inner, 1),
+            convolution(inner, inner, (7, 1)),
+            convolution(inner, out, (1, 7)),
         )
         self.channels = 3 * out
 

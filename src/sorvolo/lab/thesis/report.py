@@ -88,5 +88,4 @@ def _size_words(rows: Sequence[Row], size: SimulatedSize | None) -> str:
     )
     if size is None:
         return words
-    length = "their whole length" if size.length_m is None else f"{size.length_m:g} m"
-    return f"Simulated: paths of {length} at {size.size_px[0]} x {size.size_px[1]} px; {words}"
+    return f"Simulated: paths of {size.length_m:g} m at {size.size_px[0]} x {size.size_px[1]} px; {words}"

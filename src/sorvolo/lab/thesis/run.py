@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from sorvolo.build import build
 from sorvolo.errors import GeometryError, InputError, StoreError
@@ -195,7 +195,7 @@ class _Work:
     def detector_tasks(self, okutama: Path | None) -> Iterator[_Task]:
         """Section 4.3: Table 4.6 and Figure 4.6."""
         videos = self._chosen(self._dataset.change_detection)
-        models = ("standard", "extended") if self._settings.detector.steps else ()
+        models = ("standard", "extended") if self._settings.training else ()
         for model in (*models, "packaged"):
             yield self._task(
                 "detector", f"UMCD/{model}", videos, partial(self._detect, videos, model)
@@ -235,7 +235,7 @@ class _Work:
         of_kind = {
             "comparison": wanted.views_per_second,
             "seconds": wanted.repeats,
-            "detector": (wanted.detector, wanted.views_per_second, wanted.seed),
+            "detector": (wanted.training, wanted.views_per_second, wanted.seed),
         }
         return content_sha256(build(), task.id, files, of_kind.get(task.kind))
 
@@ -324,12 +324,15 @@ class _Work:
 
     def _measured(self, labels: detectors.Labels, model: str, places: str = "") -> _Made:
         """Train the model, unless it is the packaged one, measure it on what is held out, and show it at work."""
-        wanted, seed = self._settings.detector, self._settings.seed
+        wanted, seed = self._settings.training, self._settings.seed
         tested = detectors.held_out(labels, seed)
         file, trained = "default", {}
-        if model != "packaged":
+        if wanted and model != "packaged":
             out = self._out / "models" / f"{labels.form}-{model}"
-            file = detectors.train_network(labels, out, model, wanted, seed)
+            stem: Literal["standard", "extended"] = (
+                "extended" if model == "extended" else "standard"
+            )
+            file = detectors.train_network(labels, out, replace(wanted, rpn=stem, seed=seed))
             trained = {
                 name: getattr(wanted, name) for name in ("preset", "steps", "schedule", "side_px")
             }
@@ -341,9 +344,7 @@ class _Work:
             **detectors.measure_model(file, tested),
         }
         shown = (
-            detectors.example_pictures(file, tested)
-            if model == "extended" or not wanted.steps
-            else []
+            detectors.example_pictures(file, tested) if model == "extended" or not wanted else []
         )
         return values, {str(number): jpeg for number, jpeg in enumerate(shown, start=1)}
 

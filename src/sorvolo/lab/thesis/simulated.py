@@ -64,15 +64,12 @@ def simulation_of(
     """A preset at this size: every video by one camera, as the dataset has one calibration."""
     wanted = preset(name)
     imaging = replace(wanted.imaging, width_px=size.size_px[0], height_px=size.size_px[1])
-    length_m = (
-        wanted.path.length_m if size.length_m is None else min(size.length_m, wanted.path.length_m)
-    )
     step = max(1, round(imaging.fps / settings.views_per_second))
     return replace(
         wanted,
         seed=settings.seed,
         imaging=imaging,
-        path=replace(wanted.path, length_m=length_m),
+        path=replace(wanted.path, length_m=min(size.length_m, wanted.path.length_m)),
         output=replace(wanted.output, truth_step=step),
     )
 

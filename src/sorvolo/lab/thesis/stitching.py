@@ -36,12 +36,18 @@ _MOST_OVERLAPS = (
 )
 
 
+SIDE_PX = 1024
+"""Longest side of a picture: the thesis stitches at half HD (section 4.1.2)."""
+
+_AKAZE_THRESHOLD = 8e-5  # OpenCV's 1e-3 finds next to nothing on low-contrast ground
+_MIN_INLIERS = 12
+_ROI_FRAMES = 3.0  # side of the region, in frames ("three times the size of a frame")
+
+
 @dataclass(frozen=True)
 class RoiStitchingSettings:
-    """The choices of section 3.1.1, and those that it leaves open."""
+    """What section 3.1.1 leaves open."""
 
-    side_px: int = 1024  # longest side of a picture: the thesis stitches at half HD (section 4.1.2)
-    akaze_threshold: float = 8e-5  # OpenCV's 1e-3 finds next to nothing on low-contrast ground
     max_features: int = (
         6000  # the strongest, in frame and region each: matching costs their product
     )
@@ -49,23 +55,12 @@ class RoiStitchingSettings:
         "similarity"  # homography: the thesis's Figure 3.12a
     )
     ransac_px: float = 3.0  # OpenCV's own for homographies
-    min_inliers: int = 12
-    roi_frames: float = 3.0  # side of the region, in frames ("three times the size of a frame")
 
     def __post_init__(self) -> None:
         if self.transform not in ("similarity", "homography"):
             raise SettingsError(f"transform is {self.transform!r}; give similarity or homography")
-        for name, least in (
-            ("side_px", 256),
-            ("akaze_threshold", 1e-9),
-            ("max_features", 1),
-            ("min_inliers", 4),
-            ("roi_frames", 1),
-        ):
-            if not getattr(self, name) >= least:
-                raise SettingsError(
-                    f"method thesis: {name} is {getattr(self, name)}; give {least:g} or more"
-                )
+        if self.max_features < 1:
+            raise SettingsError(f"max_features is {self.max_features}; give 1 or more")
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +104,7 @@ class RoiStitcher:
         # by frames a and b: pixels that both show (share of a frame), and mean levels in a and in b
         self._overlaps: dict[tuple[int, int], tuple[float, float, float]] = {}
         self._detector: Any = cv2.xfeatures2d.AKAZE_create(  # type: ignore[attr-defined]
-            threshold=settings.akaze_threshold, max_points=settings.max_features
+            threshold=_AKAZE_THRESHOLD, max_points=settings.max_features
         )
 
     def add(self, frame_id: int, image: ImageRGB) -> Stitched | str:
@@ -172,12 +167,12 @@ class RoiStitcher:
         roi, mask, origin = self._roi(last.barycentre_px, width, height)
         in_mosaic = self._features(roi, mask)
         in_frame = self._features(gray, None)
-        if min(len(in_mosaic[0]), len(in_frame[0])) < self._settings.min_inliers:
+        if min(len(in_mosaic[0]), len(in_frame[0])) < _MIN_INLIERS:
             return f"too few features: {len(in_frame[0])} in the frame, {len(in_mosaic[0])} in the mosaic"
         # "identical patterns", each with one partner: two pictures have none, but mutually nearest ones
         found = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(in_frame[1], in_mosaic[1])
         pairs = np.array([(m.trainIdx, m.queryIdx) for m in found], dtype=np.int64).reshape(-1, 2)
-        if len(pairs) < self._settings.min_inliers:
+        if len(pairs) < _MIN_INLIERS:
             return f"only {len(pairs)} matches with the mosaic around the last frame"
         mosaic_px, frame_px = in_mosaic[0][pairs[:, 0]] + origin, in_frame[0][pairs[:, 1]]
         # both estimators seed their own generator, so the same points give the same answer
@@ -188,7 +183,7 @@ class RoiStitcher:
         else:
             matrix, kept = cv2.findHomography(frame_px, mosaic_px, *method, None, *limits)
         inliers = np.zeros(0, bool) if matrix is None else kept.ravel().astype(bool)
-        if inliers.sum() < self._settings.min_inliers:
+        if inliers.sum() < _MIN_INLIERS:
             return f"only {int(inliers.sum())} of {len(pairs)} matches agree"
         mosaic_from_image = np.asarray(matrix, np.float64)
         miss = apply_homography(mosaic_from_image, frame_px[inliers]) - mosaic_px[inliers]
@@ -204,7 +199,7 @@ class RoiStitcher:
         self, centre_px: Floats, width: int, height: int
     ) -> tuple[ImageGray, NDArray[np.uint8], Floats]:
         """The mosaic around a point as gray, where it is painted, and its origin in mosaic coordinates."""
-        half = self._settings.roi_frames * np.array([width, height]) / 2
+        half = _ROI_FRAMES * np.array([width, height]) / 2
         low = np.floor(centre_px - half)
         size: tuple[int, int] = tuple((np.ceil(centre_px + half) - low).astype(int).tolist())
         roi, painted = np.zeros((2, *size[::-1]), np.uint8)

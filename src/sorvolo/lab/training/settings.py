@@ -39,6 +39,10 @@ class TrainSettings:
         ):
             if not low <= number <= high:
                 raise SettingsError(f"{name} must lie in {low} to {high}, got {number}")
+        if self.schedule == "four-steps" and self.steps < 4:
+            raise SettingsError(
+                f"the four-step schedule needs at least 4 steps, one of each kind; got {self.steps}"
+            )
         if self.preset == "thesis" and self.rpn == "extended-residual":
             raise SettingsError("the preset thesis has the rpn standard or extended")
         if self.side_px % 32:
