@@ -7,9 +7,11 @@ from typing import TypedDict, Unpack
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.lab.datasets.checking import labelled_set, naming, plain
 from sorvolo.lab.datasets.coco import read_coco
+from sorvolo.lab.datasets.okutama import read_okutama
 from sorvolo.lab.datasets.parsed import ParsedSet, Reader
 from sorvolo.lab.datasets.recognising import form_of
 from sorvolo.lab.datasets.splits import compiled
+from sorvolo.lab.datasets.umcd import read_umcd
 from sorvolo.lab.datasets.visdrone import read_visdrone
 from sorvolo.lab.datasets.voc import read_voc
 from sorvolo.lab.datasets.yolo import read_yolo
@@ -17,26 +19,13 @@ from sorvolo.paths import AnyPath
 from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import CLASSES
 
-
-def _read_okutama(place: Path) -> ParsedSet:
-    from sorvolo.lab.datasets.okutama import read_okutama
-
-    return read_okutama(place)
-
-
-def _read_umcd(place: Path) -> ParsedSet:
-    from sorvolo.lab.datasets.umcd import read_umcd
-
-    return read_umcd(place)
-
-
 READERS: Mapping[str, Reader] = {
     "coco": read_coco,
     "yolo": read_yolo,
     "voc": read_voc,
     "visdrone": read_visdrone,
-    "okutama": _read_okutama,
-    "umcd": _read_umcd,
+    "okutama": read_okutama,
+    "umcd": read_umcd,
 }
 """Every form by the name that a user gives it."""
 

@@ -3,7 +3,9 @@
 from pathlib import Path
 
 from sorvolo.lab.datasets.coco import coco_files
+from sorvolo.lab.datasets.okutama import looks_like_okutama
 from sorvolo.lab.datasets.parsed import files_below, is_label_file, read_text
+from sorvolo.lab.datasets.umcd import looks_like_umcd
 from sorvolo.lab.datasets.visdrone import looks_like_visdrone
 from sorvolo.lab.datasets.voc import looks_like_voc
 from sorvolo.lab.datasets.yolo import looks_like_yolo
@@ -35,9 +37,6 @@ def _label_texts(folder: Path) -> list[Path]:
 
 
 def _form_of_text(path: Path) -> str | None:
-    from sorvolo.lab.datasets.okutama import looks_like_okutama
-    from sorvolo.lab.datasets.umcd import looks_like_umcd
-
     line = next((line for line in read_text(path).splitlines() if line.strip()), "")
     for form, looks_like in (
         ("visdrone", looks_like_visdrone),
