@@ -106,6 +106,7 @@ def _pooled(rows: Iterable[Row], kind: str) -> list[dict[str, Any]]:
                     "compared": sum(each["compared"] for each in parts),
                     **asdict(whole),
                     **rates(whole),
+                    "f1_by_video": [rates(Counts(**each[kind]))["f1"] for each in parts],
                     "cpu_seconds_per_view": _mean([each["cpu_seconds_per_view"] for each in parts]),
                 }
             )
