@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_forest import Forest, fly, make_forest, photograph
 
 from sorvolo.canopy.finds import Finds, find_people, look_under_trees
 from sorvolo.canopy.integral import Floor, UnderTrees, against_surroundings, focus, integrate
 from sorvolo.errors import InputError
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.views import View
+from sorvolo.lab.simulation.forest import Forest, fly, make_forest, photograph
 
 _CELL_M = 0.12
 _SIDE = 250

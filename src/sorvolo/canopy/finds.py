@@ -26,7 +26,7 @@ from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.views import View
 
 # by choice, after looks at simulated forests and at one real one
-_LEAST_ANOMALY = 5.0  # sigmas
+LEAST_ANOMALY = 5.0  # sigmas
 _APART_M = 1.5  # finds that are nearer are one
 _REACH_M = 3.0  # of the ground that is looked at around a find
 _AREA_M2 = (0.08, 2.0)  # at half the contrast
@@ -42,13 +42,14 @@ _BEST_PICTURES = 3
 class Find:
     """Something of a person's size on the floor.
 
-    `anomaly` is in sigmas of the ground around. `weakest_half` and `faded` are shares of its contrast: what the weakest
+    `size_m` is its length and width at half the contrast. `anomaly` is in sigmas of the ground around, `contrast` in the pictures' own levels. `weakest_half` and `faded` are shares of its contrast: what the weakest
     half of the views shows, and what is left above or below the floor. `pictures` names those that show it best.
     """
 
     place_m: PointsM  # (3,) site
     anomaly: float
-    area_m2: float
+    contrast: float
+    size_m: tuple[float, float]
     views: int
     weakest_half: float
     faded: float
@@ -68,10 +69,14 @@ def find_people(under: UnderTrees, views: Sequence[View], picture: Picture) -> F
     lattice, anomaly = under.lattice, np.nan_to_num(under.anomaly)
     side = 2 * round(_APART_M / lattice.cell_m) + 1
     highest = cv2.dilate(anomaly, np.ones((side, side), np.uint8))
-    rows, columns = np.nonzero((anomaly == highest) & (anomaly >= _LEAST_ANOMALY))
+    rows, columns = np.nonzero((anomaly == highest) & (anomaly >= LEAST_ANOMALY))
     people, refused = [], Counter[str]()
     for at in np.argsort(-anomaly[rows, columns]):
-        found = _judge(under, (int(columns[at]), int(rows[at])), views, picture)
+        cell = int(columns[at]), int(rows[at])
+        window = spot_window(under, cell)
+        numbers = seeing(views, window, float(under.floor_m[cell[1], cell[0]]))
+        images = [levelled(picture(k)) for k in numbers]
+        found = judge(under, cell, [views[k] for k in numbers], images)
         if isinstance(found, Find):
             people.append(found)
         else:
@@ -79,17 +84,21 @@ def find_people(under: UnderTrees, views: Sequence[View], picture: Picture) -> F
     return Finds(tuple(people), MappingProxyType(dict(refused)))
 
 
-def _judge(
-    under: UnderTrees, cell: tuple[int, int], views: Sequence[View], picture: Picture
-) -> Find | str:
-    """A find, or why the spot is none."""
+def spot_window(under: UnderTrees, cell: tuple[int, int]) -> Lattice:
+    """The cells around one, (column, row)."""
     reach = round(_REACH_M / under.lattice.cell_m)
-    window = under.lattice.window(*(n - reach for n in cell), *(n + reach + 1 for n in cell))
+    return under.lattice.window(*(n - reach for n in cell), *(n + reach + 1 for n in cell))
+
+
+def judge(
+    under: UnderTrees, cell: tuple[int, int], views: Sequence[View], images: Sequence[Floats32]
+) -> Find | str:
+    """A find, or why the spot is none, by the views that see it and their levelled pictures."""
+    window = spot_window(under, cell)
+    reach = window.width // 2
     up_m = float(under.floor_m[cell[1], cell[0]])
     place_m = np.append(window.points_m()[reach, reach], up_m)
-    numbers = seeing(views, window, up_m)
-    images = [levelled(picture(k)) for k in numbers]
-    mean, laid = _mean(views, numbers, images, window, up_m)
+    mean, laid = _mean(views, images, window, up_m)
     spot = against_surroundings(mean, window.cell_m)
     direction = spot[reach, reach] / np.linalg.norm(spot[reach, reach])
     spot = spot @ direction
@@ -102,7 +111,7 @@ def _judge(
     if not _AREA_M2[0] <= area_m2 <= _AREA_M2[1] or max(sides) * window.cell_m > _LONGEST_M:
         return "not a person's size"
 
-    eyes_m = np.array([views[k].site_from_camera.translation_m for k in numbers]) - place_m
+    eyes_m = np.array([each.site_from_camera.translation_m for each in views]) - place_m
     slopes = eyes_m[:, :2] / eyes_m[:, 2:]
     shows = np.isfinite(laid[:, reach, reach, 0])
     spread = np.sqrt(slopes[shows].var(axis=0).sum())
@@ -115,7 +124,7 @@ def _judge(
         seen = against_surroundings(mean, window.cell_m) @ direction
         return float(np.nanmax(seen[near], initial=-np.inf) / full)
 
-    turns = np.arange(len(numbers)) % 2 == 0
+    turns = np.arange(len(views)) % 2 == 0
     splits = [turns, *(slopes > np.median(slopes[shows], axis=0)).T]
     halves = [
         each
@@ -123,14 +132,13 @@ def _judge(
         for each in (split, ~split)
         if (each & shows).sum() >= LEAST_VIEWS // 3
     ]
-    weakest = min(share(np.nanmean(laid[each], axis=0)) for each in halves)
+    weakest = min(share(_average(laid[each])) for each in halves)
     if weakest < _HALF:
         return "not in each half of the views"
 
     step_m = _APART_BY_M / spread
     profile = [
-        share(_mean(views, numbers, images, window, up_m + k * step_m)[0])
-        for k in (-1, -0.5, 0.5, 1)
+        share(_mean(views, images, window, up_m + k * step_m)[0]) for k in (-1, -0.5, 0.5, 1)
     ]
     faded = max(profile[0], profile[3])
     if faded > _FADED or max(profile) > 1:
@@ -141,24 +149,27 @@ def _judge(
     return Find(
         place_m,
         float(under.anomaly[cell[1], cell[0]]),
-        area_m2,
+        float(full),
+        (max(sides) * window.cell_m, min(sides) * window.cell_m),
         int(shows.sum()),
         weakest,
         faded,
-        tuple(views[numbers[k]].name for k in best),
+        tuple(views[k].name for k in best),
     )
 
 
 def _mean(
-    views: Sequence[View],
-    numbers: Sequence[int],
-    images: Sequence[Floats32],
-    window: Lattice,
-    up_m: float,
+    views: Sequence[View], images: Sequence[Floats32], window: Lattice, up_m: float
 ) -> tuple[Floats32, Numbers]:
     """(H, W, bands) the views' mean on a window at one height, and (N, H, W, bands) each of them."""
-    laid = np.stack([lay(views[k], image, window, up_m) for k, image in zip(numbers, images)])
-    return np.nanmean(laid, axis=0), laid
+    laid = np.stack([lay(view, image, window, up_m) for view, image in zip(views, images)])
+    return _average(laid), laid
+
+
+def _average(laid: Floats32) -> Floats32:
+    """(H, W, bands) the mean of N, NaN where none shows anything."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.nansum(laid, axis=0) / np.isfinite(laid).sum(axis=0), np.float32)
 
 
 def look_under_trees(

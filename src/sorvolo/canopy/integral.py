@@ -3,7 +3,6 @@
 Levoy et al., "Synthetic aperture confocal imaging" (2004); Schedl, Kurmi and Bimber (2020), doi 10.1038/s42256-020-00261-3.
 """
 
-import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -34,7 +33,6 @@ _FOCUS_STEP_M = 1.5
 _CLEAR = 1.25  # times the sharpness below and above the floor
 _NEAR_LEVEL_M = 6.0  # the floor is no farther from its own usual level
 _MANY_VIEWS = 32.0
-_ALL = [0, 1, 2, 3]
 _SPARE = 0.05  # weight of that level beside what a place shows
 
 
@@ -42,7 +40,6 @@ _SPARE = 0.05  # weight of that level beside what a place shows
 class UnderTrees:
     """What the floor shows, arrays (H, W) of the lattice's cells, NaN where fewer than `LEAST_VIEWS` see it.
 
-    `trimmed` is the mean without the warmest and the coldest of the four quarters from which the floor is seen.
     `contrast` is the mean minus its surroundings. `anomaly` is the contrast of all bands in sigmas of the ground around
     (Reed and Xiaoli 1990); with one band it has the contrast's sign.
     """
@@ -50,7 +47,6 @@ class UnderTrees:
     lattice: Lattice
     floor_m: Floats32
     mean: Floats32
-    trimmed: Floats32
     contrast: Floats32
     anomaly: Floats32
     views: Numbers
@@ -76,17 +72,20 @@ def lay(view: View, picture: Floats32, lattice: Lattice, floor_m: Floats32 | flo
     """(H, W, bands) a view's picture on the floor, one height or (H, W), NaN where it does not show it."""
     size, border = (lattice.width, lattice.height), (np.nan,) * 4
     if isinstance(floor_m, float):
-        turn = view.site_from_camera.rotation.T
-        plane = np.insert(lattice.site_from_cells, 2, [0, 0, floor_m], axis=0)[:3]
-        plane[:, 2] -= view.site_from_camera.translation_m
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        laid = cv2.warpPerspective(
-            picture, view.camera.matrix @ turn @ plane, size, flags=flags, borderValue=border
-        )
+        warp = pixels_from_cells(view, lattice, floor_m)
+        laid = cv2.warpPerspective(picture, warp, size, flags=flags, borderValue=border)
     else:
         x, y = laid_pixels(view, lattice.site_from_cells, floor_m)
         laid = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderValue=border)
     return np.asarray(_banded(laid), np.float32)
+
+
+def pixels_from_cells(view: View, lattice: Lattice, up_m: float) -> Floats:
+    """(3, 3) from cells on level ground to a view's pixels."""
+    plane = np.insert(lattice.site_from_cells, 2, [0, 0, up_m], axis=0)[:3]
+    plane[:, 2] -= view.site_from_camera.translation_m
+    return view.camera.matrix @ view.site_from_camera.rotation.T @ plane
 
 
 def levelled(picture: Numbers) -> Floats32:
@@ -99,23 +98,18 @@ def integrate(
     views: Sequence[View], picture: Picture, lattice: Lattice, floor_m: Floats32
 ) -> UnderTrees:
     """All views laid on the floor, (H, W) metres up, and put together, tile by tile."""
-    bands = bands_of(picture(0))
-    mean = np.full((*lattice.shape, bands), np.nan, np.float32)
-    trimmed, count = mean.copy(), np.zeros(lattice.shape, np.uint16)
+    mean = np.full((*lattice.shape, bands_of(picture(0))), np.nan, np.float32)
+    count = np.zeros(lattice.shape, np.uint16)
     for x0, y0, x1, y1 in lattice.windows(_TILE_CELLS):
         box = np.s_[y0:y1, x0:x1]
-        total, quarters = _sums(views, picture, lattice.window(x0, y0, x1, y1), [floor_m[box]])[0]
-        count[box] = quarters.sum(axis=0)
+        total, halves = _sums(views, picture, lattice.window(x0, y0, x1, y1), [floor_m[box]])[0]
+        count[box] = halves.sum(axis=0)
         mean[box] = _mean(total.sum(axis=0), count[box], LEAST_VIEWS)
-        ranked = np.sort([_mean(*quarter, 1) for quarter in zip(total, quarters)], axis=0)
-        inner = np.where(np.isfinite(ranked[3]), (ranked[1] + ranked[2]) / 2, np.nan)
-        trimmed[box] = np.where(count[box][..., None] < LEAST_VIEWS, np.nan, inner)
     contrast = against_surroundings(mean, lattice.cell_m)
     return UnderTrees(
         lattice,
         floor_m,
         mean.mean(axis=2),
-        trimmed.mean(axis=2),
         contrast.mean(axis=2),
         _anomaly(contrast, lattice.cell_m),
         count,
@@ -136,29 +130,25 @@ def seeing(views: Sequence[View], lattice: Lattice, floor_m: Floats32 | float) -
 def _sums(
     views: Sequence[View], picture: Picture, lattice: Lattice, floors_m: Sequence[Floats32 | float]
 ) -> list[tuple[Floats32, Numbers]]:
-    """For each floor (4, H, W, bands) sums and (4, H, W) counts of views, by the quarter where the camera stands.
-
-    The quarters are north-west, north-east, south-west, south-east.
-    """
+    """For each floor (2, H, W, bands) sums and (2, H, W) counts of views, of the northern and the southern ones."""
     sums: list[tuple[Floats32, Numbers]] = []
     for number in seeing(views, lattice, floors_m[len(floors_m) // 2]):
         view, image = views[number], levelled(picture(number))
-        column, row = lattice.cells_from_site(view.site_from_camera.translation_m[None, :2])[0]
-        row, column = int(np.clip(row, 0, lattice.height)), int(np.clip(column, 0, lattice.width))
-        sides = [(slice(row, None), slice(0, row)), (slice(column, None), slice(0, column))]
+        row = lattice.cells_from_site(view.site_from_camera.translation_m[None, :2])[0, 1]
+        row = int(np.clip(row, 0, lattice.height))
         for k, floor_m in enumerate(floors_m):
             laid = lay(view, image, lattice, floor_m)
             shown = np.isfinite(laid[..., 0])
             laid[~shown] = 0
             if len(sums) <= k:
                 sums.append(
-                    (np.zeros((4, *laid.shape), np.float32), np.zeros((4, *shown.shape), np.uint16))
+                    (np.zeros((2, *laid.shape), np.float32), np.zeros((2, *shown.shape), np.uint16))
                 )
-            for quarter, at in enumerate(itertools.product(*sides)):
-                sums[k][0][quarter][at] += laid[at]
-                sums[k][1][quarter][at] += shown[at]
-    empty = np.zeros((4, *lattice.shape, bands_of(picture(0))), np.float32)
-    return sums or [(empty, np.zeros((4, *lattice.shape), np.uint16))] * len(floors_m)
+            for half, at in enumerate((slice(row, None), slice(0, row))):
+                sums[k][0][half][at] += laid[at]
+                sums[k][1][half][at] += shown[at]
+    empty = np.zeros((2, *lattice.shape, bands_of(picture(0))), np.float32)
+    return sums or [(empty, np.zeros((2, *lattice.shape), np.uint16))] * len(floors_m)
 
 
 def bands_of(picture: Numbers) -> int:
@@ -233,9 +223,9 @@ def focus(
             shape = x1 - x0, y1 - y0
             seen = count.sum(axis=0).astype(np.float32)
             often[y0:y1, x0:x1] = cv2.resize(seen, shape, interpolation=cv2.INTER_AREA)
-            for part, quarters in enumerate((_ALL, _ALL[:2], _ALL[2:])):
-                seen = count[quarters].sum(axis=0)
-                mean = _mean(total[quarters].sum(axis=0), seen, LEAST_VIEWS // 2)
+            for part, halves in enumerate(([0, 1], [0], [1])):
+                seen = count[halves].sum(axis=0)
+                mean = _mean(total[halves].sum(axis=0), seen, LEAST_VIEWS // 2)
                 sharp = np.nan_to_num(against_surroundings(mean, fine.cell_m)) ** 2
                 # few views leave noise; squared once more, for a floor may show little but what lies on it
                 sharp = (sharp.sum(axis=2) * np.minimum(seen / _MANY_VIEWS, 1)) ** 2

@@ -118,7 +118,7 @@ def search_command(
             f"{', '.join(unused)}: --through-trees looks below all that the flight saw, and measures nothing; leave it out"
         )
     settings = SearchSettings(plants, wanted_classes(classes), model, enough, through_crowns)
-    with opened_site(site or _map_of(inputs), writes=bool(site)) as place:
+    with opened_site(site or _map_of(inputs), writes=bool(site) or through_trees) as place:
         outputs = SearchOutputs(
             out or place.results("search"),
             area,
@@ -128,7 +128,7 @@ def search_command(
             dji_drone,
         )
         if through_trees:
-            _look_through_trees(place, outputs, as_json=as_json)
+            _look_through_trees(place, outputs, plants, as_json=as_json)
             return
         if site:
             if flight:
@@ -157,27 +157,38 @@ def search_command(
         raise typer.Exit(TO_CHECK)
 
 
-def _look_through_trees(place: "OpenedSite", outputs: "SearchOutputs", *, as_json: bool) -> None:
+def _look_through_trees(
+    place: "OpenedSite", outputs: "SearchOutputs", plants: int, *, as_json: bool
+) -> None:
     from sorvolo.missions.search.through_trees import search_under_trees
-    from sorvolo.survey.wording import counted
 
     flight = outputs.flights[0] if outputs.flights else ""
-    report = search_under_trees(place.folder, outputs.folder, flight=flight)
+    report: Mapping[str, Any] = {}
+    with ProgressReport(Console(stderr=True)) as progress:
+        for update in search_under_trees(
+            place.folder, outputs.folder, flight=flight, plants=plants
+        ):
+            if isinstance(update, dict):
+                report = update
+            else:
+                progress.show(f"under the trees of {update.flight}: {update.stage},", update.number, update.total)  # fmt: skip
     if as_json:
         print_json({"folder": str(outputs.folder), **report})
-        return
-    console = Console()
-    found = counted(len(report["people"]), "possible person")
-    seen = f"{report['seen_m2']:,.0f} m2 of floor, {report['views_median']:.0f} views of each spot"
-    console.print(f"{found} under trees; {seen}", style="bold", highlight=False, soft_wrap=True)
+    else:
+        _show_under_trees(report, outputs.folder, Console())
+    if not report["headline"]["complete"]:
+        raise typer.Exit(TO_CHECK)
+
+
+def _show_under_trees(report: Mapping[str, Any], folder: Path, console: Console) -> None:
+    console.print(escape(report["headline"]["text"]), style="bold", highlight=False, soft_wrap=True)
     for row in report["people"]:
         where = f"{row['latitude_deg']:.6f}, {row['longitude_deg']:.6f}"
         pictures = escape(", ".join(row["pictures"]))
         console.print(f"  {where}  {row['anomaly']:.0f} sigmas, see {pictures}", highlight=False)
-    for notice in report["notices"]:
-        console.print(f"[yellow]notice[/yellow] {escape(notice)}", highlight=False)
+    show_notices_and_warnings(report, console)
     for name, file in (("GeoTIFF", "under_trees.tif"), ("places", "under_trees.geojson")):
-        show_path(name, outputs.folder / file, console)
+        show_path(name, folder / file, console)
 
 
 def _map_all(

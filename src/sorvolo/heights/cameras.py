@@ -230,7 +230,16 @@ def solve_cameras(
     gray: Callable[[int], ImageGray],
 ) -> Cameras3D:
     """The cameras of a flight in 3D. Raises InputError where photos share too little for it."""
-    tracks = find_tracks(views, gray)
+    return solve_tracks(views, find_tracks(views, gray))
+
+
+def solve_tracks(
+    views: Sequence[View], tracks: Tracks, attitude_sigma_deg: float | None = None
+) -> Cameras3D:
+    """The cameras of a flight by points found before; None: attitudes may lean as the map's do on a slope.
+
+    Raises InputError where photos share too little for it.
+    """
     held = np.bincount(tracks.view, minlength=len(views)) >= _LEAST_INLIERS
     if held.sum() < 3:
         raise InputError(
@@ -239,7 +248,7 @@ def solve_cameras(
         )
     # the attitudes lean alike on a slope: N of them know no more of its tilt than one
     alike_deg = AdjustmentSettings().attitude_sigma_deg * float(np.sqrt(len(views)))
-    settings = AdjustmentSettings(attitude_sigma_deg=alike_deg)
+    settings = AdjustmentSettings(attitude_sigma_deg=attitude_sigma_deg or alike_deg)
     priors = _priors(views)
     scene = _first(views, tracks)
     for limit_px in (*_REJECTED_PX, None):

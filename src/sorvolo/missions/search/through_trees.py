@@ -1,17 +1,19 @@
 """`sorvolo search --through-trees`: a mapped flight's pictures put together on the floor below crowns, and its finds."""
 
-from collections.abc import Sequence
-from dataclasses import asdict, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from sorvolo.canopy.finds import Find, look_under_trees
-from sorvolo.canopy.integral import LEAST_VIEWS
+from sorvolo.canopy.finds import Find, Finds, look_under_trees
+from sorvolo.canopy.integral import LEAST_VIEWS, Floor, Picture, UnderTrees, lay, levelled
+from sorvolo.canopy.planting import PlantedFloor, free_share, plant_on_floor
 from sorvolo.errors import InputError
-from sorvolo.heights.cameras import solve_cameras
+from sorvolo.geometry.arrays import Numbers
+from sorvolo.heights.cameras import Cameras3D, find_tracks, solve_tracks
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.views import View, ground_outlines_m
 from sorvolo.missions.heights.run import FlightPictures, flight_views, height_grid, newest_flight
@@ -19,32 +21,48 @@ from sorvolo.paths import AnyPath
 from sorvolo.store.atomic import atomic_write_bytes, make_folder
 from sorvolo.store.exports.places import place_deg
 from sorvolo.store.exports.plain import feature, feature_collection, geojson_bytes, json_bytes
-from sorvolo.store.images import ImageCache
+from sorvolo.store.images import ImageCache, jpeg_from_image
 from sorvolo.store.rasters.height_model import write_height_cog
 from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.catalogue import StoredKeyframe
 from sorvolo.survey.flight import Site
+from sorvolo.survey.map_objects import MapObject
+from sorvolo.survey.objects import PERSON
+from sorvolo.survey.wording import counted
 
 _PICTURES_BYTES = 160 << 20
 _LEAST_CELL_M = 0.08  # a body is ten cells long; finer ones cost more and show no more
 _GRAY = 12  # levels between the colours of a pixel in a thermal picture, at most
+_FLOOR_M = -30.0, 5.0  # where the floor is looked for, above the map's level ground
+_ATTITUDE_SIGMA_DEG = 0.5  # of the map's attitudes where points alone do not hold the cameras
+_MOST_STRETCH = 0.06  # of the focal length, three sigmas of what it may be off
+_CROP_M, _CROP_CELL_M = 8.0, 0.04
+
+
+@dataclass(frozen=True)
+class UnderTreesUpdate:
+    """What a look below the trees does next: stage `number` of `total`."""
+
+    flight: str
+    stage: str
+    number: int
+    total: int = 3
 
 
 def search_under_trees(
-    site_folder: AnyPath,
-    folder: AnyPath,
-    *,
-    flight: str = "",
-    floor_m: tuple[float, float] = (-30.0, 5.0),
-) -> dict[str, Any]:
-    """Put a flight's pictures together on the floor below the trees; return the report, with files in `folder`.
+    site_folder: AnyPath, folder: AnyPath, *, flight: str = "", plants: int = 80
+) -> Iterator[UnderTreesUpdate | dict[str, Any]]:
+    """Put a flight's pictures together on the floor below the trees, yielding progress and last the report.
 
-    The floor is looked for between two heights, `floor_m`, above the map's level ground. Files: under_trees.tif
-    (mean, anomaly, number of views, floor's height), under_trees.geojson and under_trees.json.
-    Raises InputError for a flight without GPS, with too few pictures or without a floor in focus.
+    `plants` bodies are planted on the floor of thermal pictures for the probability of detection.
+    Files in `folder`: under_trees.tif (mean, anomaly, number of views, free share, floor's height), under_trees.geojson and
+    under_trees.json; the finds become objects of the flight. Raises InputError for a flight without GPS, with too few
+    pictures or without a floor in focus.
     """
-    folder, notices = Path(folder), []
-    with Archive.open(Path(site_folder), write=False) as archive:
-        name = flight or newest_flight(archive)
+    folder = Path(folder)
+    Archive.open(Path(site_folder), write=False).close()  # to write would make a folder
+    with Archive.open(Path(site_folder), write=True) as archive:
+        name, site = flight or newest_flight(archive), archive.site()
         keyframes = [each for each in archive.sound_keyframes(name) if each.site_from_camera]
         views: Sequence[View] = flight_views(archive, name, keyframes)
         if len(views) < LEAST_VIEWS:
@@ -52,24 +70,15 @@ def search_under_trees(
                 f"flight {name} has {len(views)} pictures with a place; to look through trees each spot needs "
                 f"{LEAST_VIEWS} or more: map photos of strips side by side (of a video only few frames are kept)"
             )
-        radial = 0.0, 0.0
-        try:
-            solved = solve_cameras(views, FlightPictures(archive, keyframes).gray)
-        except InputError as error:
-            notices.append(f"cameras are as mapped, not solved in space: {error}")
-        else:
+        yield UnderTreesUpdate(name, "cameras", 0)
+        solved, warning = _solved(views, FlightPictures(archive, keyframes))
+        radial = (0.0, 0.0)
+        if solved is not None:
             views, radial = solved.views, solved.radial
             keyframes = [each for each in keyframes if each.name not in set(solved.lost)]
-        site = archive.site()
+        yield UnderTreesUpdate(name, "floor", 1)
         pictures = FlightPictures(archive, keyframes, radial)
-        height_m = float(np.median([each.site_from_camera.translation_m[2] for each in views]))
-        pixel_m = height_m / views[0].camera.fx_px
-        cell_m = float(f"{max(pixel_m, _LEAST_CELL_M):.3g}")
-        share = min(1.0, pixel_m / cell_m * 1.25)
-        views = [
-            replace(v, camera=v.camera.resized(*(max(32, round(n * share)) for n in (v.camera.width_px, v.camera.height_px))))
-            for v in views
-        ]  # fmt: skip
+        views, cell_m = _at_body_size(views)
         colours = pictures.colour(0).astype(np.int16)
         is_thermal = int(np.ptp(colours, axis=2).max()) <= _GRAY
 
@@ -78,38 +87,110 @@ def search_under_trees(
             image = cv2.resize(pictures.colour(number), size, interpolation=cv2.INTER_AREA)
             return image[..., 1] if is_thermal else image
 
-        grid = height_grid(site, cell_m)
-        lattice = Lattice.over(ground_outlines_m(views), grid)
-        under, floor, finds = look_under_trees(
-            views, ImageCache(load, _PICTURES_BYTES).get, lattice, *floor_m
-        )
-    zero_m = site.origin.height_m
+        picture = ImageCache(load, _PICTURES_BYTES).get
+        lattice = Lattice.over(ground_outlines_m(views), height_grid(site, cell_m))
+        under, floor, finds = look_under_trees(views, picture, lattice, *_FLOOR_M)
+        planted = None
+        if is_thermal:
+            yield UnderTreesUpdate(name, "planted bodies", 2)
+            planted = plant_on_floor(under, views, picture, finds.people, plants)
+        free = free_share(under, views, picture)
+        archive.keep_under_trees(name, _objects(name, finds, views, keyframes, picture))
+        report = _report(name, site, under, floor, finds, planted)
+        report |= {"pictures": len(views), "warnings": [warning] if warning else []}
+        report["headline"]["complete"] = not warning
+        report["notices"] = [asdict(each) for each in archive.notices]
     make_folder(folder)
-    bands = under.mean, under.anomaly, under.views.astype(np.float32), under.floor_m + zero_m
-    names = "mean", "anomaly, sigmas", "views", f"floor, {site.height_reference}"
-    write_height_cog(bands, names, lattice.first, grid.grid, folder / "under_trees.tif")
-    seen = under.views >= LEAST_VIEWS
-    rows = [_properties(each, site) for each in finds.people]
-    report = {
-        "flight": name,
-        "people": rows,
-        "refused": dict(finds.refused),
-        "pictures": len(views),
-        "seen_m2": float(seen.sum()) * cell_m**2,
-        "views_median": float(np.median(under.views[seen])),
-        "floor_m": float(np.median(floor.up_m)) + zero_m,
-        "floor_sigma_m": float(np.median(floor.sigma_m)),
-        "height_reference": site.height_reference,
-        "notices": [*notices, *(each.text for each in archive.notices)],
-    }
+    zero_m = site.origin.height_m
+    bands = under.mean, under.anomaly, under.views.astype(np.float32), free, under.floor_m + zero_m
+    names = "mean", "anomaly, sigmas", "views", "free share", f"floor, {site.height_reference}"
+    write_height_cog(
+        bands, names, lattice.first, height_grid(site, cell_m).grid, folder / "under_trees.tif"
+    )
     features = [
         feature({"type": "Point", "coordinates": place_deg(find.place_m, site)}, row)
-        for find, row in zip(finds.people, rows)
+        for find, row in zip(finds.people, report["people"])
     ]
     collection = feature_collection("under_trees", features, is_local=False)
     atomic_write_bytes(folder / "under_trees.geojson", geojson_bytes(collection))
     atomic_write_bytes(folder / "under_trees.json", json_bytes(report))
-    return report
+    yield report
+
+
+def _solved(views: Sequence[View], pictures: FlightPictures) -> tuple[Cameras3D | None, str]:
+    """The cameras in space, else none, and a warning where they are not what they should be.
+
+    Where crowns share few points, cameras that are free end anywhere; then the map's attitudes hold them.
+    """
+    try:
+        tracks = find_tracks(views, pictures.gray)
+        for sigma_deg, most_lost in ((None, 0.1), (_ATTITUDE_SIGMA_DEG, 0.3)):
+            solved = solve_tracks(views, tracks, sigma_deg)
+            why = (
+                f"points hold {len(solved.views)} of {len(views)} pictures, and a focal length "
+                f"{solved.focal_scale:.2f} times the map's"
+            )
+            if (
+                len(solved.lost) <= most_lost * len(views)
+                and abs(np.log(solved.focal_scale)) < _MOST_STRETCH
+            ):
+                held = f"{why}: people may be missed; fly slower and with narrower strips"
+                return solved, "" if sigma_deg is None else held
+    except InputError as error:
+        why = str(error)
+    return None, (
+        f"cameras are as mapped, not solved in space ({why}): 0.5 m or 1 degree of error hides people"
+    )
+
+
+def _at_body_size(views: Sequence[View]) -> tuple[list[View], float]:
+    """The views with pixels no finer than the cells, and the cells' side, m."""
+    height_m = float(np.median([each.site_from_camera.translation_m[2] for each in views]))
+    pixel_m = height_m / views[0].camera.fx_px
+    cell_m = float(f"{max(pixel_m, _LEAST_CELL_M):.3g}")
+    share = min(1.0, pixel_m / cell_m * 1.25)
+    smaller = [
+        each.camera.resized(
+            *(max(32, round(n * share)) for n in (each.camera.width_px, each.camera.height_px))
+        )
+        for each in views
+    ]
+    return [replace(view, camera=camera) for view, camera in zip(views, smaller)], cell_m
+
+
+def _report(
+    name: str,
+    site: Site,
+    under: UnderTrees,
+    floor: Floor,
+    finds: Finds,
+    planted: PlantedFloor | None,
+) -> dict[str, Any]:
+    seen = under.views >= LEAST_VIEWS
+    seen_m2 = float(seen.sum()) * under.lattice.cell_m**2
+    text = (
+        f"{counted(len(finds.people), 'possible person')} under trees on {seen_m2:,.0f} m2 of floor"
+    )
+    pod = None
+    if planted is not None and len(planted.found):
+        pod = dict(zip(("pod", "pod_low", "pod_high"), planted.pod))
+        pod |= {"planted": len(planted.found), "free_share": float(planted.free_share.mean())}
+        text += (
+            f"; probability of detection of a person lying there: {pod['pod']:.2f} (90 % interval "
+            f"{pod['pod_low']:.2f} to {pod['pod_high']:.2f})"
+        )
+    return {
+        "flight": name,
+        "headline": {"text": text},
+        "people": [_properties(each, site) for each in finds.people],
+        "refused": dict(finds.refused),
+        "seen_m2": seen_m2,
+        "views_median": float(np.median(under.views[seen])),
+        "detection": pod,
+        "floor_m": float(np.median(floor.up_m)) + site.origin.height_m,
+        "floor_sigma_m": float(np.median(floor.sigma_m)),
+        "height_reference": site.height_reference,
+    }
 
 
 def _properties(find: Find, site: Site) -> dict[str, Any]:
@@ -120,3 +201,54 @@ def _properties(find: Find, site: Site) -> dict[str, Any]:
         "pictures": list(find.pictures),
         "place_m": find.place_m.tolist(),
     }
+
+
+def _objects(
+    name: str,
+    finds: Finds,
+    views: Sequence[View],
+    keyframes: Sequence[StoredKeyframe],
+    picture: Picture,
+) -> list[MapObject]:
+    """The finds as objects of the flight."""
+    times_ns = {each.name: each.time_ns for each in keyframes}
+    return [
+        MapObject(
+            f"{name}-u{number}",
+            PERSON,
+            float(np.clip(find.weakest_half, 0, 1)),
+            find.place_m[:2],
+            float(np.median([each.sigma_m for each in keyframes])),
+            *find.size_m,
+            find.views,
+            find.views,
+            min(times_ns[each] for each in find.pictures),
+            max(times_ns[each] for each in find.pictures),
+            class_scores={PERSON: 1.0},
+            best_frame=find.pictures[0],
+            crop_jpeg=jpeg_from_image(_crop(find, views, picture)),
+        )
+        for number, find in enumerate(finds.people, start=1)
+    ]
+
+
+def _crop(find: Find, views: Sequence[View], picture: Picture) -> Any:
+    """(H, 2 W, 3) the floor around a find, in the picture that shows it best and in the mean of all."""
+    half, cells = _CROP_M / 2, round(_CROP_M / _CROP_CELL_M)
+    east_m, north_m, up_m = find.place_m
+    corner = [[_CROP_CELL_M, 0, east_m - half], [0, -_CROP_CELL_M, north_m + half], [0, 0, 1]]
+    window = Lattice(np.array(corner), cells, cells, _CROP_CELL_M)
+    laid: list[Numbers] = [
+        lay(view, levelled(picture(number)), window, float(up_m))
+        for number, view in enumerate(views)
+    ]
+    numbers = {view.name: number for number, view in enumerate(views)}
+    shown = [laid[numbers[find.pictures[0]]], np.nanmean(laid, axis=0)]
+    return np.hstack([_stretched(each) for each in shown])
+
+
+def _stretched(levels: Numbers) -> Any:
+    """(H, W, 3) uint8 between the darkest and the brightest of a hundred."""
+    low, high = np.nanpercentile(levels, [1, 99.5])
+    grey = np.clip((np.nan_to_num(levels, nan=low) - low) / max(high - low, 1e-6) * 255, 0, 255)
+    return np.broadcast_to(grey, (*grey.shape[:2], 3)).astype(np.uint8)

@@ -19,6 +19,7 @@ from sorvolo.findings.register import MissionSighting, Register, SearchedDate
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.paths import AnyPath
+from sorvolo.store.exports.change_files import object_crops
 from sorvolo.store.exports.plain import features_name, plain_json
 from sorvolo.store.images import image_from_jpeg
 from sorvolo.store.nofollow import MOST_BYTES, open_below, read_below, sha256_of
@@ -58,9 +59,11 @@ from sorvolo.store.site.upkeep import (
     remove_unused,
     repair,
     stopped_flights,
+    write_object_files,
 )
 from sorvolo.survey.findings import Verdict
 from sorvolo.survey.flight import Notice, Site
+from sorvolo.survey.map_objects import MapObject
 
 __all__ = ["Archive", "FlightWriter"]
 
@@ -221,6 +224,13 @@ class Archive:
     def objects(self, flight_id: str | None = None) -> list[StoredObject]:
         """The objects that complete runs found, by flight rank and number; of one flight."""
         return self.catalogue_rows(change_records.load_objects, flight_id)
+
+    def keep_under_trees(self, flight_id: str, found: Sequence[MapObject]) -> None:
+        """Keep what a look below the crowns of a mapped flight found, in place of an earlier look's; the lists follow."""
+        self._require_writable()
+        with self.catalogue.changing() as connection:
+            change_records.put_under_trees(connection, flight_id, found)
+        write_object_files(self, flight_id, object_crops(found))
 
     def searches(self) -> list[StoredSearch]:
         """Which ground each complete run searched for objects, by flight rank."""

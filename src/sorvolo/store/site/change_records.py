@@ -307,6 +307,36 @@ def add_search(connection: Connection, run_id: int, search: ObjectSearch) -> Non
         else {name: np.asarray(rows, int).tolist() for name, rows in searched_for.items()},
     }
     schema.add_rows(connection, schema.searches, [row])
+    _add_objects(connection, run_id, search.objects, 1)
+
+
+def put_under_trees(connection: Connection, flight_id: str, found: Sequence[MapObject]) -> None:
+    """Note what a look below the crowns found in a flight's complete run, in place of what an earlier look found."""
+    runs, objects = schema.runs, schema.objects
+    query = select(runs.c.id).where(runs.c.flight_id == flight_id, runs.c.status == "complete")
+    (run_id,) = connection.execute(query).scalars()
+    rows = connection.execute(select(objects).where(objects.c.run_id == run_id)).all()
+    earlier = [row.number for row in rows if is_under_trees(row.id)]
+    connection.execute(
+        delete(objects).where(objects.c.run_id == run_id, objects.c.number.in_(earlier))
+    )
+    if not is_searched(connection, run_id):  # in no frame for no class: nothing is gone by it
+        add_search(
+            connection,
+            run_id,
+            ObjectSearch("", (), (), SearchedFrames(np.zeros((0, 4, 2)), {}), 0, 0, 0),
+        )
+    _add_objects(connection, run_id, found, 1 + max((row.number for row in rows), default=0))
+
+
+def is_under_trees(object_id: str) -> bool:
+    """Whether a look below crowns found an object, by its id."""
+    return "-u" in object_id and object_id.rsplit("-u", 1)[1].isdecimal()
+
+
+def _add_objects(
+    connection: Connection, run_id: int, objects: Sequence[MapObject], first: int
+) -> None:
     names = [each.name for each in fields(MapObject) if each.name not in ("id", "crop_jpeg")]
     rows = [
         {
@@ -315,7 +345,7 @@ def add_search(connection: Connection, run_id: int, search: ObjectSearch) -> Non
             "id": each.id,
             "properties": plain_json({name: getattr(each, name) for name in names}),
         }
-        for number, each in enumerate(search.objects, start=1)
+        for number, each in enumerate(objects, start=first)
     ]
     schema.add_rows(connection, schema.objects, rows)
 

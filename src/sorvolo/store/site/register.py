@@ -10,6 +10,7 @@ from sorvolo.store.site.catalogue import list_versions
 from sorvolo.store.site.change_records import (
     StoredChange,
     StoredObject,
+    is_under_trees,
     load_changes,
     load_objects,
     load_searches,
@@ -76,7 +77,7 @@ def sighting_of(thing: MapObject, flight_id: str, rank: float) -> MissionSightin
     return MissionSighting(
         flight_id,
         rank,
-        f"{flight_id} objects",
+        f"{flight_id} {'under trees' if is_under_trees(thing.id) else 'objects'}",
         thing.id,
         KnownBy.DETECTED,
         thing.label,

@@ -274,6 +274,20 @@ def write_change_files(files: "Archive", flight_id: str, version: VersionEntry |
     atomic_write_bytes(folder / "changes.html", page.encode())
 
 
+def write_object_files(files: "Archive", flight_id: str, crops: Mapping[str, bytes]) -> None:
+    """Write a flight's and the site's lists of objects again, and these crops of the flight's by name."""
+    folder = files.flight_folder(flight_id)
+    make_folder(folder / CROPS)
+    paths = [
+        f"{place}{OBJECTS}{end}" for place in ("", f"flights/{flight_id}/") for end in LIST_ENDINGS
+    ]
+    with files.replacing(f"flights/{flight_id}/{CROPS}", *paths):
+        for name, data in crops.items():
+            atomic_write_bytes(folder / CROPS / name, data)
+        _write_objects(files, folder, files.objects(flight_id))
+        _write_objects(files, files.folder, files.newest_objects())
+
+
 def _write_objects(files: "Archive", folder: Path, found: Sequence[StoredObject] | None) -> None:
     """Write objects.geojson of a flight's folder or the site's; remove it where nothing was searched for."""
     if found is None:

@@ -1,11 +1,11 @@
 """A made-up thermal forest: warm bodies on a floor, below crowns of leafy discs at their own heights."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, ImageGray, PointsM
+from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, PointsM
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.pose import NADIR_CAMERA_NORTH_UP, Pose, rotation_from_vector
 from sorvolo.heights.views import View
@@ -20,7 +20,7 @@ class Forest:
 
     side_m: float
     floor_m: float
-    ground: Floats
+    ground: Floats32
     leaves: Floats
     people_m: PointsM
 
@@ -60,17 +60,22 @@ def make_forest(
 
 
 def fly(
-    forest: Forest, strips_m: Floats, steps_m: Floats, height_m: float = 45.0, seed: int = 1
+    forest: Forest,
+    strips_m: Floats,
+    steps_m: Floats,
+    height_m: float = 45.0,
+    seed: int = 1,
+    camera: Camera = CAMERA,
 ) -> list[View]:
     """Cameras along strips from south to north, at a height above the floor."""
     draw = np.random.default_rng(seed)
-    views = []
+    views: list[View] = []
     for east in strips_m:
         for north in steps_m:
             lean = rotation_from_vector(draw.normal(0, 0.02, 3))
             place = np.array([east, north, forest.floor_m + height_m]) + draw.normal(0, 0.3, 3)
             pose = Pose(NADIR_CAMERA_NORTH_UP @ lean, place)
-            views.append(View(f"{len(views):03d}.jpg", CAMERA, pose, np.full(3, np.nan)))
+            views.append(View(f"{len(views):03d}.jpg", camera, pose, np.full(3, np.nan)))
     return views
 
 
@@ -92,3 +97,12 @@ def photograph(forest: Forest, view: View) -> ImageGray:
         cv2.circle(picture, (round(x), round(y)), max(1, round(wide)), float(warmth), -1)
     grain = np.random.default_rng(int(view.name[:3])).normal(0, 2, picture.shape)
     return np.clip(picture + grain, 0, 255).astype(np.uint8)
+
+
+def hidden_share(forest: Forest, view: View) -> float:
+    """The share of the floor that crowns hide in a view."""
+    leaves = forest.leaves.copy()
+    leaves[:, 4] = 255
+    return float(
+        (photograph(replace(forest, ground=forest.ground * 0, leaves=leaves), view) > 128).mean()
+    )
