@@ -53,7 +53,7 @@ class TruthErrors:
 
 @dataclass(frozen=True)
 class PositionErrors:
-    """Camera positions against a table: as they lie, and after the best similarity."""
+    """Camera positions against a table: as they lie, and after the best similarity; `missing` of its frames have none."""
 
     absolute: Spread
     shape: Spread
@@ -87,20 +87,6 @@ def truth_errors(
     )
 
 
-def table_errors(
-    cameras: Sequence[FrameRow], places_m: Sequence[Sequence[float]], missing: int, m_per_px: float
-) -> PositionErrors:
-    """Cameras against a table's places (east, north, height of each); heights count where all are known.
-
-    `missing` of the table's frames have no camera.
-    """
-    mine = np.array([[*each.camera_m, each.camera_height_m] for each in cameras])
-    reference = np.array(places_m, np.float64)
-    if not (np.isfinite(mine).all() and np.isfinite(reference).all()):
-        mine, reference = mine[:, :2], reference[:, :2]
-    return PositionErrors(*position_errors(mine, reference, m_per_px), missing)
-
-
 def _outlines_m(
     pairs: Sequence[tuple[FrameRow, FrameRow]], status: Status
 ) -> tuple[Floats, Floats]:
@@ -128,29 +114,6 @@ class ReferenceMatch:
     shift_north_m: float
     m_per_px: float
     area_m2: float
-
-
-def match_reference(mine: Raster, other: Raster) -> ReferenceMatch | None:
-    """A map beside a reference; None where they show hardly any common ground."""
-    gray, known = _resampled(other, mine)
-    mask = known & (mine.rgba[..., 3] > 0)
-    if mask.sum() < _LEAST_PX:
-        return None
-    own = gray_from_rgb(np.ascontiguousarray(mine.rgba[..., :3]))
-    shift = residual_shift(gray, own, mask)
-    moved = np.array([[1, 0, -shift.x_px], [0, 1, -shift.y_px]])
-    size = own.shape[1], own.shape[0]
-    back = np.asarray(cv2.warpAffine(own, moved, size, borderMode=cv2.BORDER_REPLICATE), np.uint8)
-    still = mask & (cv2.warpAffine(mask.astype(np.uint8), moved, size, flags=cv2.INTER_NEAREST) > 0)
-    return ReferenceMatch(
-        correlation(gray, own, mask),
-        correlation(gray, back, still),
-        shift,
-        shift.x_px * mine.m_per_px,
-        -shift.y_px * mine.m_per_px,
-        mine.m_per_px,
-        float(mask.sum()) * mine.m_per_px**2,
-    )
 
 
 def _resampled(raster: Raster, onto: Raster) -> tuple[ImageGray, Mask]:
@@ -205,15 +168,6 @@ class MosaicEvaluation:
     deviation: DeviationSummary
     reference: ReferenceMatch | None
     positions: PositionErrors | None
-
-
-@dataclass(frozen=True)
-class _TablePlace:
-    """A row of a table of camera places: degrees, metres, NaN for a height that it has not."""
-
-    longitude_deg: float
-    latitude_deg: float
-    height_m: float
 
 
 def evaluate_mosaic(
@@ -332,48 +286,62 @@ def _against_reference(mosaic_path: Path, reference: Path) -> ReferenceMatch:
         raise InputError(
             f"{reference}: has no coordinate system; a reference map needs one (a GeoTIFF)"
         )
-    found = match_reference(mine, other)
-    if found is None:
+    gray, known = _resampled(other, mine)
+    mask = known & (mine.rgba[..., 3] > 0)
+    if mask.sum() < _LEAST_PX:
         raise InputError(
             f"{reference}: shows hardly any ground of this map; give a map of the same place"
         )
-    return found
+    own = gray_from_rgb(np.ascontiguousarray(mine.rgba[..., :3]))
+    shift = residual_shift(gray, own, mask)
+    moved = np.array([[1, 0, -shift.x_px], [0, 1, -shift.y_px]])
+    size = own.shape[1], own.shape[0]
+    back = np.asarray(cv2.warpAffine(own, moved, size, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+    still = mask & (cv2.warpAffine(mask.astype(np.uint8), moved, size, flags=cv2.INTER_NEAREST) > 0)
+    return ReferenceMatch(
+        correlation(gray, own, mask),
+        correlation(gray, back, still),
+        shift,
+        shift.x_px * mine.m_per_px,
+        -shift.y_px * mine.m_per_px,
+        mine.m_per_px,
+        float(mask.sum()) * mine.m_per_px**2,
+    )
 
 
 def _against_positions(
     flights: Mapping[str, Sequence[FrameRow]], path: Path, described: Site
 ) -> PositionErrors:
     known = _positions(path)
-    mine: list[FrameRow] = []
-    places_m: list[tuple[float, float, float]] = []
-    cameras = {(flight, row.name): row for flight, rows in flights.items() for row in rows}
-    for (flight, name), place in known.items():
-        found = _rows_of(cameras, flight, name, path)
+    cameras_m: list[list[float]] = []
+    places_m: list[list[float]] = []
+    for (flight, name), (longitude_deg, latitude_deg, height_m) in known.items():
+        found = [
+            row
+            for of, rows in flights.items()
+            for row in rows
+            if row.name == name and flight in ("", of)
+        ]
+        if len(found) > 1:
+            raise InputError(f"{path}: frame {name} is in several flights; add a column flight")
         if found and found[0].has_camera:
-            east_m, north_m = described.frame.ground_from_lonlat(
-                [[place.longitude_deg, place.latitude_deg]]
-            )[0]
-            mine.append(found[0])
-            places_m.append((float(east_m), float(north_m), place.height_m))
-    if not mine:
+            cameras_m.append([*found[0].camera_m, found[0].camera_height_m])
+            place_m = described.frame.ground_from_lonlat([[longitude_deg, latitude_deg]])[0]
+            places_m.append([*place_m, height_m])
+    if not places_m:
         raise InputError(
             f"{path}: none of its {len(known)} frames has a camera in this map; check the names"
         )
-    return table_errors(mine, places_m, len(known) - len(mine), described.m_per_px)
+    # heights count where all are known
+    axes = 3 if np.isfinite(cameras_m).all() and np.isfinite(places_m).all() else 2
+    errors = position_errors(
+        np.array(cameras_m)[:, :axes], np.array(places_m)[:, :axes], described.m_per_px
+    )
+    return PositionErrors(*errors, len(known) - len(places_m))
 
 
-def _rows_of(
-    cameras: Mapping[tuple[str, str], FrameRow], flight: str, name: str, path: Path
-) -> list[FrameRow]:
-    """The frame of this name, of this flight or ("") of any; raises InputError where several flights have one."""
-    found = [row for (of, each), row in cameras.items() if each == name and flight in ("", of)]
-    if len(found) > 1:
-        raise InputError(f"{path}: frame {name} is in several flights; add a column flight")
-    return found
-
-
-def _positions(path: Path) -> dict[tuple[str, str], _TablePlace]:
-    """The places of a table by flight ("": any) and frame; raises InputError where it cannot be read."""
+def _positions(path: Path) -> dict[tuple[str, str], tuple[float, float, float]]:
+    """Longitude and latitude, deg, and height, m, of a table by flight ("": any) and frame; raises InputError where it cannot be read."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             table = csv.DictReader(file)
@@ -386,7 +354,7 @@ def _positions(path: Path) -> dict[tuple[str, str], _TablePlace]:
                 f"{path}: no column {', '.join(missing)}, but {there}; {_POSITIONS_NEED}"
             )
         return {
-            ((row.get("flight") or "").strip(), row["frame"].strip()): _TablePlace(
+            ((row.get("flight") or "").strip(), row["frame"].strip()): (
                 float(row["longitude_deg"]),
                 float(row["latitude_deg"]),
                 float(row.get("height_m") or "nan"),
