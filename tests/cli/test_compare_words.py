@@ -14,6 +14,7 @@ from sorvolo.store.site.archive import Archive
 from sorvolo.survey.flight import Site
 
 COVERED = {
+    "in_short": "1 car came",
     "headline": {"quality": "compared", "text": "1 change in 100 m2; 20 m2 could not be compared"},
     "coverage": {
         "compared_m2": 100.0,
@@ -128,6 +129,8 @@ def test_a_map_without_metres_is_not_shown_in_metres(
         "properties": {
             "id": "b-1",
             "kind": "appeared",
+            "rank": 1,
+            "group": "b-1",
             "length_m": 1.0,
             "sigma_m": 2.0,
             "views": 9,
@@ -162,6 +165,8 @@ def test_places_are_written_as_asked_for(tmp_path: Path, form: str, place: str) 
         "properties": {
             "id": "b-1",
             "kind": "appeared",
+            "rank": 1,
+            "group": "b-1",
             "length_m": 1.0,
             "sigma_m": 2.0,
             "views": 9,

@@ -80,6 +80,14 @@ UpdatesMap = Annotated[
     bool,
     typer.Option("--update/--no-update", help="Update the map where the ground changed or is new."),
 ]
+Sort = Annotated[
+    Literal["importance", "size", "score"],
+    typer.Option(help="Order of the printed changes; importance: people, vehicles, large things."),
+]
+Least = Annotated[
+    float,
+    typer.Option(min=0, help="Print only changes of this length or more, m, and what has a class."),
+]
 TrustsMap = Annotated[
     bool, typer.Option("--trust-map", help="Compare even with a map that contradicts itself.")
 ]
@@ -103,6 +111,8 @@ def compare(
     classes: Classes = None,
     enough_looked_at: EnoughLookedAt = 0.9,
     give_up: GiveUp = 30.0,
+    sort: Sort = "importance",
+    least: Least = 0.0,
     coordinates: PlaceFormatOption = "latlon",
     again: Again = False,
     as_json: AsJson = False,
@@ -162,7 +172,7 @@ def compare(
         if as_json:
             print_json({"site": str(place.folder), "flights": results})
         else:
-            show_results(results, place.folder, Console(), coordinates)
+            show_results(results, place.folder, Console(), coordinates, sort, least)
     if not all(is_good(result["comparison"]["headline"]) for result in results):
         raise typer.Exit(TO_CHECK)
 
@@ -222,12 +232,14 @@ def show_results(
     site: Path,
     console: Console,
     form: PlaceFormat = "latlon",
+    sort: str = "importance",
+    least_m: float = 0.0,
 ) -> None:
     """Print what changed, what could not be compared, and where the files are."""
     from sorvolo.store.exports.plain import features_path
 
     for result in results:
-        _show_result(result, console, form)
+        _show_result(result, console, form, sort, least_m)
         announce_people(result["objects"], site, console)
         folder = site / "flights" / result["flight"]
         show_path("page", folder / "changes.html", console)
@@ -276,7 +288,9 @@ def _class_words(kind: str, before: str | None, after: str | None) -> str:
     return words or ("" if kind == "area" else "unknown object")
 
 
-def _show_result(result: Mapping[str, Any], console: Console, form: PlaceFormat) -> None:
+def _show_result(
+    result: Mapping[str, Any], console: Console, form: PlaceFormat, sort: str, least_m: float
+) -> None:
     comparison, features = result["comparison"], result["changes"]["features"]
     dark = " (too dark: most changes would be missed)" if comparison.get("most_missed") else ""
     console.print(
@@ -286,7 +300,8 @@ def _show_result(result: Mapping[str, Any], console: Console, form: PlaceFormat)
     )
     is_local = result["changes"].get("crs", "WGS84") is None  # no place on Earth, no metres
     if features:
-        _show_changes(features, console, form, is_local=is_local)
+        console.print(escape(comparison["in_short"]), highlight=False, soft_wrap=True)
+        _show_changes(_in_rows(features, sort, least_m), console, form, is_local=is_local)
     views = comparison["views"]
     console.print(
         f"{views['compared']:,} of {counted(sum(views.values()), 'view')} compared in {result['seconds']:.1f} s; "
@@ -339,8 +354,27 @@ def _show_coverage(coverage: Mapping[str, Any], console: Console, *, is_local: b
     console.print(f"test objects drawn into these views: {words}", highlight=False)
 
 
+def _in_rows(features: Sequence[Any], sort: str, least_m: float) -> list[list[Any]]:
+    """The groups of changes that are printed, each by rank, in the order asked for."""
+    groups: dict[str, list[Any]] = {}
+    for feature in sorted(features, key=lambda each: each["properties"]["rank"]):
+        groups.setdefault(feature["properties"]["group"], []).append(feature)
+
+    def is_shown(change: Mapping[str, Any]) -> bool:
+        return bool(
+            change["length_m"] >= least_m or change["class_before"] or change["class_after"]
+        )
+
+    rows = [
+        each for each in groups.values() if any(is_shown(feature["properties"]) for feature in each)
+    ]
+    if column := {"size": "length_m", "score": "score"}.get(sort):
+        rows.sort(key=lambda row: -max(each["properties"][column] for each in row))
+    return rows
+
+
 def _show_changes(
-    features: Sequence[Any], console: Console, form: PlaceFormat, *, is_local: bool
+    rows: Sequence[Sequence[Any]], console: Console, form: PlaceFormat, *, is_local: bool
 ) -> None:
     from sorvolo.geometry.coordinates import Coordinates, place_text
 
@@ -354,15 +388,16 @@ def _show_changes(
             overflow="fold",
             min_width=max(map(len, name.split())),
         )
-    for feature in features[:_MAX_ROWS]:
+    for feature, *others in rows[:_MAX_ROWS]:
         change = feature["properties"]
         # the middle of the outline's box: the place that pages, exports and `review` print
         xs, ys = zip(*(point[:2] for point in feature["geometry"]["coordinates"][0]))
         x, y = (min(xs) + max(xs)) / 2, (min(ys) + max(ys)) / 2
         what = _class_words(change["kind"], change["class_before"], change["class_after"])
+        more = f"and {len(others)} more" if others else ""
         table.add_row(
             escape(change["id"]),
-            f"{change['kind']}\n{what}" if what else str(change["kind"]),
+            "\n".join(filter(None, (change["kind"], what, more))),
             f"{change['length_m']:.2f}",
             f"{x:.1f}, {y:.1f}" if is_local else place_text(y, x, Coordinates(form)),
             f"{change['sigma_m']:.2f}",
@@ -370,8 +405,9 @@ def _show_changes(
             f"{change['score']:.2f}",
         )
     console.print(table)
-    if len(features) > _MAX_ROWS:
-        console.print(f"and {len(features) - _MAX_ROWS:,} more in changes.geojson")
+    if len(rows) > _MAX_ROWS:
+        console.print(f"and {len(rows) - _MAX_ROWS:,} more in changes.geojson")
+    features = [each for row in rows for each in row]
     single = sum(bool(feature["properties"].get("single_view")) for feature in features)
     alone = f"; {counted(single, 'change')} by one view alone, where no other saw the ground"
     console.print(

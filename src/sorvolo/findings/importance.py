@@ -3,11 +3,23 @@
 import math
 from collections import Counter
 from collections.abc import Sequence
+from typing import TypeVar
+
+import numpy as np
+import shapely
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from sorvolo.findings.register import GroundFinding, Register, begun_and_ended
-from sorvolo.survey.findings import ChangeKind
+from sorvolo.survey.findings import ChangeFacts, ChangeKind
 from sorvolo.survey.objects import PERSON
-from sorvolo.survey.wording import counted
+from sorvolo.survey.wording import counted, plural
+
+_HAS_BEFORE = (ChangeKind.DISAPPEARED, ChangeKind.REPLACED)
+_NEAR = 0.5  # of the shorter of two things: nearer, one carries the other, or is its shadow
+_IN_A_ROW = 1.5  # of the shorter of two like things: nearer, they are of one row
+_LIKE_LENGTHS = 1.6  # times the other's, at most
+_LARGE_M = 4.0  # a car
 
 VEHICLES = frozenset({"car", "truck", "bus", "van", "motorcycle", "bicycle", "boat", "tractor"})
 
@@ -17,9 +29,8 @@ def ordered(findings: Sequence[GroundFinding]) -> list[GroundFinding]:
 
     def key(found: GroundFinding) -> tuple[object, ...]:
         newest, label = found.newest, found.label
-        group = 0 if label == PERSON else 1 if label in VEHICLES else 2
         length_m = 0.0 if math.isnan(newest.length_m) else newest.length_m
-        return group, bool(found.gone), -length_m, -newest.score, -found.first_ns, found.id
+        return _rank({label}), bool(found.gone), -length_m, -newest.score, -found.first_ns, found.id
 
     return sorted(findings, key=key)
 
@@ -33,11 +44,110 @@ def between(register: Register, before: str, after: str) -> str:
     parts = []
     for label in dict.fromkeys(each.label for each in ordered(register.findings)):
         came, left = (counts[label, kind] for kind in (ChangeKind.APPEARED, ChangeKind.DISAPPEARED))
-        words = [counted(came, label) + " came"] if came else []
-        if left:
-            words.append(f"{left} left" if words else counted(left, label) + " left")
-        parts += [", ".join(words)] if words else []
+        parts += [_came_and_left(label, came, left)] if came or left else []
     unsearched = [date for date in (before, after) if date not in known]
     if not parts and unsearched:
         return f"no telling what came or left: no objects were searched for on {' and '.join(unsearched)}"
     return "; ".join(parts) or "nothing known came or left"
+
+
+Seen = TypeVar("Seen", bound=ChangeFacts)
+
+
+def grouped(changes: Sequence[Seen]) -> list[list[Seen]]:
+    """The changes of one flight as a person sees them: each in one group, what matters most first in and among them.
+
+    A group is what lies in or against one thing or area, the largest first (a lorry, its load, its shadow), with the
+    rows of like things that it touches. What is small, alone and of no class is the last group. A person is alone:
+    nothing hides one.
+    """
+    if not changes:
+        return []
+    shapes = np.array([shapely.Polygon(each.outline_m) for each in changes])
+    shapes = shapely.make_valid(shapes)
+    lengths_m = np.array([each.length_m for each in changes])
+    is_area = np.array([each.kind is ChangeKind.AREA for each in changes])
+    is_person = np.array([PERSON in (each.class_before, each.class_after) for each in changes])
+    names = np.array([_name(each) for each in changes])
+    tree = shapely.STRtree(shapes)
+    one, other = tree.query(shapes, predicate="dwithin", distance=_IN_A_ROW * lengths_m)
+    one, other = (each[~(is_person[one] | is_person[other])] for each in (one, other))
+    apart_m = shapely.distance(shapes[one], shapes[other])
+    shorter_m = np.minimum(lengths_m[one], lengths_m[other])
+    is_like = np.maximum(lengths_m[one], lengths_m[other]) <= _LIKE_LENGTHS * shorter_m
+    is_like &= (names[one] == names[other]) & ~is_area[one] & (apart_m <= _IN_A_ROW * shorter_m)
+    size = (len(changes), len(changes))
+    _, rows = connected_components(
+        coo_array((is_like[is_like], (one[is_like], other[is_like])), size), directed=False
+    )
+    against = coo_array((apart_m <= _NEAR * shorter_m, (one, other)), size).tocsr()
+    heads = np.full(len(changes), -1)
+    for head in np.argsort(-lengths_m, kind="stable"):
+        if heads[head] < 0:
+            taken = np.append(np.flatnonzero(against[[head]].toarray()[0]), head)
+            taken = taken[heads[taken] < 0]
+            heads[taken] = head
+            heads[(heads < 0) & np.isin(rows, rows[taken[~is_area[taken]]])] = head
+    is_small = (names == [each.kind.value for each in changes]) & ~is_area & (lengths_m < _LARGE_M)
+    alone, counts = np.unique(heads, return_counts=True)
+    heads[is_small & np.isin(heads, alone[counts == 1])] = len(changes)
+    groups: dict[int, list[Seen]] = {}
+    for head, each in sorted(zip(heads.tolist(), changes), key=lambda pair: _importance(pair[1])):
+        groups.setdefault(head, []).append(each)
+    small = groups.pop(len(changes), None)
+    return [*groups.values(), *([small] if small else [])]
+
+
+def in_short(changes: Sequence[ChangeFacts], *, is_local: bool = False) -> str:
+    """Changes in a sentence: "12 cars left, 9 came; changed ground in 3 places, up to 210 m long; 14 small things".
+    Lengths are left out of a map without metres."""
+    came: Counter[str] = Counter()
+    left: Counter[str] = Counter()
+    others: Counter[str] = Counter()
+    labels: dict[str, None] = {}  # in order of importance
+    areas = [each.length_m for each in changes if each.kind is ChangeKind.AREA]
+    for each in sorted(changes, key=_importance):
+        if each.kind is ChangeKind.AREA:
+            continue
+        before = each.class_before if each.kind in _HAS_BEFORE else ""
+        after = each.class_after if each.kind is not ChangeKind.DISAPPEARED else ""
+        for label, counts in ((before, left), (after, came)):
+            counts.update([label] if label else [])
+            labels |= {label: None} if label else {}
+        if not before and not after:
+            size = "" if is_local else "large " if each.length_m >= _LARGE_M else "small "
+            others[
+                f"{size}thing that {'moves' if each.kind is ChangeKind.MOVING else 'changed'}"
+            ] += 1
+    parts = [_came_and_left(label, came[label], left[label]) for label in labels]
+    if areas:
+        size = "" if is_local else f", {'up to ' if len(areas) > 1 else ''}{max(areas):.0f} m long"
+        parts.append(f"changed ground in {counted(len(areas), 'place')}{size}")
+    parts += [_counted_that(count, what) for what, count in others.items()]
+    return "; ".join(parts) or "nothing changed"
+
+
+def _came_and_left(label: str, came: int, left: int) -> str:
+    """ "12 cars came, 9 left"; not both zero."""
+    if not came:
+        return f"{counted(left, label)} left"
+    return f"{counted(came, label)} came" + (f", {left} left" if left else "")
+
+
+def _counted_that(count: int, what: str) -> str:
+    noun, _, did = what.partition(" that ")
+    return f"{counted(count, noun)} that {plural(did, count) if did == 'moves' else did}"
+
+
+def _name(change: ChangeFacts) -> str:
+    return change.class_after or change.class_before or change.kind.value
+
+
+def _rank(labels: set[str]) -> int:
+    return 0 if PERSON in labels else 1 if labels & VEHICLES else 2
+
+
+def _importance(change: ChangeFacts) -> tuple[object, ...]:
+    """For sorting: people, vehicles, the rest; the large and sure first."""
+    labels = {change.class_before, change.class_after}
+    return _rank(labels), -change.length_m * change.score, len(change.id), change.id

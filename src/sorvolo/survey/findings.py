@@ -180,7 +180,7 @@ class ChangeFacts:
     `id` is the flight's name and a number, the same whenever the flight is compared again. `outline_m` (N, 2), N >= 3,
     is its outline on the ground in site metres, not closed. `length_m` is the longer side of the smallest rectangle
     around it. `sigma_m` is the one-sigma error of its place in the world, per axis, the map's own included. `views`
-    counts the frames that showed it.
+    counts the frames that showed it. Classes are "" where nobody looked.
     """
 
     id: str
@@ -193,6 +193,8 @@ class ChangeFacts:
     area_m2: float
     length_m: float
     sigma_m: float
+    class_before: str = field(default="", kw_only=True)
+    class_after: str = field(default="", kw_only=True)
 
     @property
     def is_single_view(self) -> bool:
@@ -204,15 +206,12 @@ class ChangeFacts:
 class Change(ChangeFacts):
     """One thing that happened to the ground, however many frames saw it, with its pictures.
 
-    `velocity_m_s` (2,) east, north: zero unless it moves. Classes are "" where nobody looked. `sigma_in_map_m` is the
-    one-sigma error of its place on the map, per axis: NaN until the change is reported, for then `sigma_m` has
-    nothing of the map's in it. `height_change` is None where it was not measured.
+    `velocity_m_s` (2,) east, north: zero unless it moves. `sigma_in_map_m` is the one-sigma error of its place on the
+    map, per axis: NaN until the change is reported, for then `sigma_m` has nothing of the map's in it. `height_change` is None where it was not measured.
     """
 
     patch: Patch
     velocity_m_s: Floats = field(default_factory=lambda: np.zeros(2))
-    class_before: str = ""
-    class_after: str = ""
     announced_ns: int = -1  # when it was announced; -1: only after the last frame
     sigma_in_map_m: float = float("nan")
     height_change: HeightChange | None = None

@@ -3,7 +3,14 @@
 from collections import Counter
 from collections.abc import Iterable, Mapping
 
-_PLURALS = {"person": "people", "bus": "buses", "is": "are", "was": "were", "shows": "show"}
+_PLURALS = {
+    "person": "people",
+    "bus": "buses",
+    "is": "are",
+    "was": "were",
+    "shows": "show",
+    "moves": "move",
+}
 
 
 def plural(noun: str, count: int) -> str:

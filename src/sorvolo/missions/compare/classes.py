@@ -1,5 +1,6 @@
 """What a change is, before and after: by objects that stand there, by sightings, by its own pictures."""
 
+import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -11,7 +12,7 @@ from sorvolo.geometry.arrays import Floats, ImageRGB, ImageRGBA, PointsM
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.survey.findings import Change, ChangeKind, Patch
 from sorvolo.survey.map_objects import MapObject
-from sorvolo.survey.objects import Detections, Sighting
+from sorvolo.survey.objects import TYPICAL_SIZE_M, Detections, Sighting
 
 # When an object, a sighting or a detection names what a change is.
 # an object's place may lie so far outside of the outline, beside a part of its own length
@@ -20,6 +21,8 @@ _LONGEST_S = 5.0  # before or after the time at which a moving change was where 
 _TURN = 0.4  # of the way it goes meanwhile: people turn
 _LEAST_SIDE_PX = 160  # of a picture that a detector is shown
 _LEAST_SHARE = 0.5  # of the box or of the change, whichever is smaller, that both have in common
+# of a class's usual longest side, upright too, and what edges add, m: a change that is longer is more than it
+_MOST_LENGTHS, _EDGES_M = 2.5, 1.0
 _LIKE_LENGTHS = 1.6  # times the other's, at most
 LENIENT = 0.4  # times each class's score: that something is there is known already
 
@@ -125,6 +128,12 @@ def _outside_m(outline_m: PointsM, place_m: Floats) -> float:
     return -float(cv2.pointPolygonTest(ring, (float(east), float(north)), True))
 
 
+def _can_be(change: Change, name: str) -> bool:
+    """Whether a thing of a class may be all of a change: a person in front of a heap is not what the heap is."""
+    usual_m = TYPICAL_SIZE_M.get(name, (math.inf,))
+    return not change.length_m > _MOST_LENGTHS * max(usual_m) + _EDGES_M
+
+
 _HAS_BEFORE = (ChangeKind.DISAPPEARED, ChangeKind.REPLACED)
 _HAS_AFTER = (ChangeKind.APPEARED, ChangeKind.REPLACED, ChangeKind.MOVING)
 
@@ -167,6 +176,7 @@ class ChangeClasses:
             after = (
                 after or seen_at(change, sightings) or self._in_picture(change, change.patch.after)
             )
+        before, after = (name if _can_be(change, name) else "" for name in (before, after))
         return replace(change, class_before=before, class_after=after)
 
     def _in_picture(self, change: Change, rgba: ImageRGBA) -> str:

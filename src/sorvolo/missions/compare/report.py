@@ -15,6 +15,7 @@ from sorvolo.change.coverage import (
 from sorvolo.change.flight_on_map import FlightFit
 from sorvolo.change.planting import recall_curve
 from sorvolo.change.views import ViewMaker, ViewOutcome
+from sorvolo.findings.importance import in_short
 from sorvolo.geometry.arrays import PointsM
 from sorvolo.geometry.summary import median_of_known, percentile_of_known
 from sorvolo.heights.volumes import height_changes
@@ -132,6 +133,7 @@ def comparison_summary(
         "method": settings.method_name,
         **counts.summary(),
         "changes": {kind.value: kinds[kind] for kind in ChangeKind},
+        "in_short": in_short(changes, is_local=is_local),
         "single_view": sum(each.is_single_view for each in changes),
         "suppressed": suppressed,
         "compared_area_m2": coverage["compared_m2"],

@@ -13,7 +13,7 @@ from sorvolo.store.atomic import atomic_write_bytes, make_folder
 from sorvolo.store.exports.places import Placemark, place_deg, ring
 from sorvolo.store.exports.plain import feature, feature_collection, rounded, time_words, utc_text
 from sorvolo.store.images import png_from_rgba
-from sorvolo.store.site.change_records import StoredChange, StoredObject
+from sorvolo.store.site.change_records import StoredChange, StoredObject, grouped_changes
 from sorvolo.survey.findings import Change, Verdict
 from sorvolo.survey.flight import Site
 from sorvolo.survey.map_objects import MapObject
@@ -32,9 +32,15 @@ def changes_geojson(changes: Iterable[StoredChange], site: Site) -> dict[str, An
     Rings turn counter-clockwise, ten decimals. Longitudes run on beyond 180 degrees where a site meets the
     antimeridian. For a local site it is plain JSON with coordinates in pixels of the site.
     """
-    return feature_collection(
-        "changes", [_feature(change, site) for change in changes], is_local=site.is_local
-    )
+    stored = list(changes)
+    places = {
+        each.id: {"rank": rank, "group": group[0].id}
+        for rank, (group, each) in enumerate(
+            ((group, each) for group in grouped_changes(stored) for each in group), start=1
+        )
+    }
+    features = [_feature(change, site, places[change.id]) for change in stored]
+    return feature_collection("changes", features, is_local=site.is_local)
 
 
 def change_placemarks(changes: Iterable[StoredChange], site: Site) -> list[Placemark]:
@@ -100,13 +106,14 @@ def boxes_json(boxes: Boxes) -> list[list[int]]:
     return [[int(number) for number in box] for box in np.asarray(boxes).reshape(-1, 4)]
 
 
-def _feature(change: StoredChange, site: Site) -> dict[str, Any]:
+def _feature(change: StoredChange, site: Site, of_list: Mapping[str, Any]) -> dict[str, Any]:
     east_m, north_m = change.centre_m
     is_still, risen = not np.any(change.velocity_m_s), change.height_change
     properties = {
         "id": change.id,
         "number": change.number,
         "kind": change.kind.value,
+        **of_list,
         "score": rounded(change.score, 4),
         "first_seen": utc_text(change.first_seen_ns),
         "last_seen": utc_text(change.last_seen_ns),

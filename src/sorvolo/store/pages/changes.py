@@ -29,7 +29,7 @@ from sorvolo.store.pages.words import (
     render,
     with_unit,
 )
-from sorvolo.store.site.change_records import StoredChange
+from sorvolo.store.site.change_records import StoredChange, grouped_changes
 from sorvolo.survey.coverage import GAP_WORDS, Gap
 from sorvolo.survey.findings import ChangeKind, Verdict, ViewStatus
 from sorvolo.survey.flight import Site
@@ -81,12 +81,20 @@ def changes_page(
         if before is not None and after is not None and after.rgba.size > 0
         else None
     )
-    listed = [
-        _listed(
-            each, site, crops.get(each.id, (None, None)), most_bytes, shown[1] if shown else None
-        )
-        for each in changes
+    groups = [
+        [
+            _listed(
+                each,
+                site,
+                crops.get(each.id, (None, None)),
+                most_bytes,
+                shown[1] if shown else None,
+            )
+            for each in group
+        ]
+        for group in grouped_changes(changes)
     ]
+    listed = [each for group in groups for each in group]
     is_reviewed = any(each.verdict is not None for each in changes)
     page = render(
         "changes.html",
@@ -103,6 +111,7 @@ def changes_page(
         after_words=after_words,
         **_compared_ground(report, coverage, site, shown),
         changes=listed,
+        groups=groups,
         is_reviewed=is_reviewed,
         has_metres=not site.is_local,
         systems=() if site.is_local else tuple(SYSTEMS.items()),
@@ -239,7 +248,11 @@ def _summary(report: Mapping[str, Any], changes: Sequence[StoredChange]) -> list
     views = at(report, "comparison", "views") or {}
     votes, voters = at(report, "comparison", "votes"), at(report, "comparison", "voters")
     unknown = number_at(report, "comparison", "unknown_share")
-    sentences = []
+    sentences = (
+        [f"{short[:1].upper()}{short[1:]}."]
+        if (short := at(report, "comparison", "in_short"))
+        else []
+    )
     if views:
         sentences.append(
             f"{views.get(ViewStatus.COMPARED.value, 0)} of {sum(views.values())} views were compared."

@@ -9,6 +9,7 @@ import numpy as np
 from sqlalchemy import Connection, Row, delete, func, select
 
 from sorvolo.errors import StoreError
+from sorvolo.findings.importance import grouped
 from sorvolo.findings.register import GroundFinding
 from sorvolo.geometry.arrays import Floats, PointsM, frozen
 from sorvolo.store.exports.plain import plain_json
@@ -41,8 +42,6 @@ class StoredChange(ChangeFacts):
     flight_id: str
     number: int
     velocity_m_s: Floats
-    class_before: str
-    class_after: str
     announced_ns: int
     crop: CropPlace
     verdict: Verdict | None = None
@@ -93,6 +92,18 @@ def stored_changes(flight_id: str, changes: Sequence[Change]) -> list[StoredChan
         numbers = list(range(1, len(ids) + 1))
     result = [_stored(flight_id, number, each) for number, each in zip(numbers, changes)]
     return sorted(result, key=lambda change: change.number)
+
+
+def grouped_changes(changes: Iterable[StoredChange]) -> list[list[StoredChange]]:
+    """The groups of each flight's changes, what matters most first; one that a person rejected is in no group."""
+    by_flight: dict[str, list[StoredChange]] = {}
+    rejected = []
+    for each in changes:
+        if each.verdict is Verdict.REJECTED:
+            rejected.append([each])
+        else:
+            by_flight.setdefault(each.flight_id, []).append(each)
+    return [group for each in by_flight.values() for group in grouped(each)] + rejected
 
 
 def add_comparison(
@@ -217,8 +228,6 @@ def _centre(outline_m: PointsM) -> PointsM:
 _STORED = (
     *(each.name for each in fields(ChangeFacts)),
     "velocity_m_s",
-    "class_before",
-    "class_after",
     "announced_ns",
     "sigma_in_map_m",
     "height_change",
