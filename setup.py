@@ -14,7 +14,7 @@ native = Pybind11Extension(
     "sorvolo.kernels._native",
     [
         f"{FOLDER}/{name}.cpp"
-        for name in ("_native", "_regions", "_robust", "_differences", "_light")
+        for name in ("_native", "_regions", "_robust", "_differences", "_light", "_heights")
     ],
     depends=[f"{FOLDER}/_native.hpp", "setup.py"],
     cxx_std=17,

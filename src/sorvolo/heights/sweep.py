@@ -7,11 +7,11 @@ and one that cannot see a place does not decide about it.
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TypeAlias
 
 import cv2
 import numpy as np
 
+from sorvolo import kernels
 from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, Mask, Matrix3, PointsM
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.obstacles import Obstacles
@@ -80,10 +80,6 @@ _MORE = 3  # views beyond the wanted ones ...
 _LEFT_OUT = 0.04  # ... while two of those that are chosen leave out so much of the ground that two could show
 _ANGLES = 16  # directions in a picture that are distinguished, over half a turn
 _ANGLE_RAD = np.pi / _ANGLES
-
-Seen: TypeAlias = Mask | bool
-"""Where a photo sees the cells of a window: (H, W), or everywhere, or nowhere."""
-
 
 _VIEWS = 4  # laid over each other at a time
 _CONTRAST_PX = 9  # side of the surroundings that a pixel's gray is measured against
@@ -155,12 +151,12 @@ def sweep(
     level_m = max(finest_m, (high_m - low_m) / (_MOST_LEVELS - 1))
     levels: Floats = low_m + level_m * np.arange(int(np.ceil((high_m - low_m) / level_m)) + 1.0)
     eyes_m = np.array([views[k].site_from_camera.translation_m for k in chosen])
-    laid = [_Laid(views[k], pictures(k), lattice, bounds, eyes_m, settings) for k in chosen]
-    least, usual_m = min(settings.window_cells), np.array([bounds.usual_m])
-    seen = [np.broadcast_to(next(each.wholes(usual_m, least)), shape) for each in laid]
+    laid = [_Laid(views[k], pictures(k), lattice, bounds, eyes_m) for k in chosen]
+    least, usual_m = min(settings.window_cells), np.full(shape, bounds.usual_m, np.float32)
+    seen = [each.shows(usual_m, least) for each in laid]
     if obstacles is not None:
         for each, eye_m in zip(laid, eyes_m):
-            each.hide(obstacles.hidden_below_m(lattice, eye_m))
+            each.hidden_below_m = obstacles.hidden_below_m(lattice, eye_m)
     agreement = _agreements(laid, levels, settings)
     seen_by = np.sum(seen, axis=0).astype(np.float32)
     total = smoothed(_cost(agreement, settings.smoothing), settings.smoothing)
@@ -175,9 +171,7 @@ def sweep(
     up_m[~(score >= _LEAST_SCORE)] = (
         np.nan
     )  # no two photos see the height that fits, or they do not agree
-    shown_by = np.sum(
-        [each.shows(up_m, min(settings.window_cells)) for each in laid], axis=0
-    ).astype(np.float32)
+    shown_by = np.sum([each.shows(up_m, least) for each in laid], axis=0).astype(np.float32)
     return Swept(up_m, score, seen_by, _widest(seen, spreads), deviation, shown_by)
 
 
@@ -197,14 +191,19 @@ def likeness_on(
         return
     bounds = Bounds(float(up_m.min()), float(up_m.max()), float(np.median(up_m)))
     eyes_m = np.array([views[k].site_from_camera.translation_m for k in chosen])
-    laid = [_Laid(views[k], pictures(k), lattice, bounds, eyes_m, settings) for k in chosen]
+    laid = [_Laid(views[k], pictures(k), lattice, bounds, eyes_m) for k in chosen]
     shown = [each.shows(up_m, min(settings.window_cells)) for each in laid]
     on = [each.on(up_m) for each in laid]
     for i, j in itertools.combinations(range(len(laid)), 2):
         both = shown[i] & shown[j]
         if both.any():
-            alike = _likeness(on[i][j] * on[j][i], [both] * len(settings.window_cells), settings)
-            yield chosen[i], chosen[j], np.maximum(alike, 0)
+            product = on[i][j] * on[j][i]
+            alike = sum(
+                np.maximum(cv2.boxFilter(product, -1, (side, side)), 0)
+                for side in settings.window_cells
+            )
+            share = np.float32(1 / len(settings.window_cells))
+            yield chosen[i], chosen[j], np.asarray(alike * both * share, np.float32)
 
 
 def choose_views(
@@ -285,7 +284,12 @@ def _widest(seen: Sequence[Mask], spreads: Floats) -> Floats32:
 
 
 class _Laid:
-    """A photo that is laid on level planes over a lattice: of each pixel how it differs from its surroundings."""
+    """A photo that is laid on heights over a lattice: of each pixel how it differs from its surroundings.
+
+    `contrast` (C, h, w) is that along each of C directions, of the part of the picture that the cells see; `channel`
+    (N,) which of them counts against each of the others. `planes` (2, 3, 3) map cells to that part at height 0, and
+    what a metre of height adds; `frame` left, top, right, bottom is where the photo ends in it.
+    """
 
     def __init__(
         self,
@@ -294,162 +298,88 @@ class _Laid:
         lattice: Lattice,
         bounds: Bounds,
         others_m: PointsM,
-        settings: SweepSettings,
     ) -> None:
         self.shape = lattice.shape
-        self._hidden_below_m: Floats32 | None = None
-        self._clear_m = -np.inf  # nothing from here up is hidden
+        self.hidden_below_m: Floats32 | None = None  # it does not show what lies lower, (H, W)
         camera = view.camera.resized(picture.shape[1], picture.shape[0])
-        turn = view.site_from_camera.rotation.T
-        project = camera.matrix @ np.column_stack(
-            [turn, -turn @ view.site_from_camera.translation_m]
-        )
-        self._level = project[:, :2] @ lattice.site_from_cells[:2] + np.outer(
-            project[:, 3], [0, 0, 1]
-        )
-        self._up = np.outer(project[:, 2], [0, 0, 1])
+        eye_m, turn = view.site_from_camera.translation_m, view.site_from_camera.rotation.T
+        project = camera.matrix @ np.column_stack([turn, -turn @ eye_m])
+        level = project[:, :2] @ lattice.site_from_cells[:2] + np.outer(project[:, 3], [0, 0, 1])
+        self.planes: Floats = np.stack([level, np.outer(project[:, 2], [0, 0, 1])])
         right, bottom = lattice.width - 1, lattice.height - 1
-        self._corners = np.array([[0, right, 0, right], [0, 0, bottom, bottom], [1.0, 1, 1, 1]])
-        self._size = picture.shape[1], picture.shape[0]
-        piece = self._crop_to(picture, bounds, settings)
-        away_m = others_m - view.site_from_camera.translation_m
+        corners = np.array([[0, right, 0, right], [0, 0, bottom, bottom], [1.0, 1, 1, 1]])
+        low, high = np.zeros(2, int), np.array(picture.shape[::-1])
+        self.frame: Floats = np.concatenate([low, high - 1.0])
+        ends = np.concatenate(
+            [self._at(each) @ corners for each in (bounds.low_m, bounds.high_m)], 1
+        )
+        if (ends[2] > 1e-6).all():
+            places = (ends[:2] / ends[2]).T
+            low = np.clip(np.floor(places.min(axis=0)) - _CONTRAST_PX, 0, high - 2).astype(int)
+            high = np.clip(np.ceil(places.max(axis=0)) + _CONTRAST_PX + 1, low + 2, high).astype(
+                int
+            )
+        self.planes = np.array([[1.0, 0, -low[0]], [0, 1, -low[1]], [0, 0, 1]]) @ self.planes
+        self.frame -= np.tile(low, 2)
+        piece = picture[low[1] : high[1], low[0] : high[0]].astype(np.float32)
+        away_m = others_m - eye_m
         # (N,) in which direction of the picture, in steps, things move with their height against
         # other photos.
         cells_from_site = np.linalg.inv(lattice.site_from_cells)[:2, :2]
         middle = np.array([(lattice.width - 1) / 2, (lattice.height - 1) / 2])
         ends = np.concatenate([[middle], middle + _unit(away_m[:, :2] @ cells_from_site.T)])
-        seen = (
-            np.column_stack([ends, np.ones(len(ends))]) @ self._picture_from_cells(bounds.usual_m).T
-        )
+        seen = np.column_stack([ends, np.ones(len(ends))]) @ self._at(bounds.usual_m).T
         places = seen[:, :2] / np.maximum(np.abs(seen[:, 2:]), 1e-9)
         moved = places[1:] - places[0]
         angles = np.asarray(np.rint(np.arctan2(moved[:, 1], moved[:, 0]) / _ANGLE_RAD) % _ANGLES)
         others = (away_m != 0).any(axis=1)
-        channels, which = np.unique(angles[others], return_inverse=True)
-        self._contrast = [
-            _contrast(piece, each * _ANGLE_RAD, settings) for each in channels.tolist()
-        ]
-        self._channel = np.zeros(
-            len(others), int
-        )  # of each of the others; nobody asks for the photo's own
-        self._channel[others] = which
-        self._px_per_cell = (
-            lattice.cell_m
-            * camera.fx_px
-            / max(float(view.site_from_camera.translation_m[2]) - bounds.usual_m, 1e-3)
-        )
-
-    def at(self, up_m: float) -> list[Floats32]:
-        """The photo on the plane at a height, (H, W) float32, for each of the others; 0 outside of it."""
-        there = self._from_picture @ self._picture_from_cells(up_m)
-        laid = [
-            np.asarray(
-                cv2.warpPerspective(
-                    each,
-                    there,
-                    self.shape[::-1],
-                    flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-                ),
-                np.float32,
-            )
-            for each in self._contrast
-        ]
-        return [laid[each] for each in self._channel.tolist()]
+        directions, which = np.unique(angles[others], return_inverse=True)
+        self.contrast = np.stack([_contrast(piece, each * _ANGLE_RAD) for each in directions])
+        self.channel = np.zeros(len(others), int)  # nobody asks for the photo's own
+        self.channel[others] = which
+        above_m = max(float(eye_m[2]) - bounds.usual_m, 1e-3)
+        self._px_per_cell = lattice.cell_m * camera.fx_px / above_m
 
     def on(self, up_m: Floats32) -> list[Floats32]:
         """The photo on heights, (H, W), for each of the others; 0 outside of it."""
-        columns, rows = np.arange(self.shape[1]), np.arange(self.shape[0])[:, None]
-        level, up = self._from_picture @ self._level, self._from_picture @ self._up
-        x, y, z = (
-            each[0] * columns + (each[1] * rows + each[2]) + rise[2] * up_m
-            for each, rise in zip(level, up)
-        )
+        x, y, z = self._homogeneous(up_m)
         z = np.where(z > 1e-6, z, np.nan)
         u, v = (np.nan_to_num(each / z, nan=-1e6).astype(np.float32) for each in (x, y))
         laid = [
             np.asarray(cv2.remap(each, u, v, cv2.INTER_LINEAR), np.float32)
-            for each in self._contrast
+            for each in self.contrast
         ]
-        return [laid[each] for each in self._channel.tolist()]
+        return [laid[each] for each in self.channel.tolist()]
 
-    def wholes(self, levels_m: Floats, side: int) -> Iterator[Seen]:
-        """Where a patch lies in the photo as a whole when the ground is at each of some heights, (L,).
-
-        Beyond its border it would see the border, not the ground.
-        """
-        # (L, 4, 3) a photo's sides on level planes: positive on the inner side, where the
-        # picture's depth is.
-        inset = 0.5 * (side * self._px_per_cell + self._apron)
-        (w, h), planes = self._size, self._level + levels_m[:, None, None] * self._up
-        x, y, z = planes[:, 0], planes[:, 1], planes[:, 2]
-        lines = np.stack(
-            [x - inset * z, (w - 1 - inset) * z - x, y - inset * z, (h - 1 - inset) * z - y], axis=1
-        )
-        inside = lines @ self._corners >= 0
-        everywhere, nowhere = inside.all(axis=(1, 2)), ~inside.any(axis=2).all(axis=1)
-        for number, up_m in enumerate(levels_m.tolist()):
-            if nowhere[number] or (everywhere[number] and up_m >= self._clear_m):
-                yield bool(everywhere[number])
-                continue
-            known = self._within(lines[number][~inside[number].all(axis=1)])
-            if self._hidden_below_m is not None and up_m < self._clear_m:
-                known &= up_m >= self._hidden_below_m
-            yield known if known.any() else False
-
-    def hide(self, below_m: Floats32 | None) -> None:
-        """From here on the photo does not show what lies lower than (H, W) heights."""
-        if below_m is not None:
-            self._hidden_below_m, self._clear_m = below_m, float(below_m.max())
-
-    def _within(self, lines: Floats) -> Mask:
-        """(H, W) the cells on the inner side of lines, (K, 3)."""
-        columns, rows = np.arange(self.shape[1]), np.arange(self.shape[0])[:, None]
-        known = np.ones(self.shape, bool)
-        for line in lines:
-            known &= line[0] * columns + (line[1] * rows + line[2]) >= 0
-        return known
+    def inset_px(self, side: int) -> float:
+        """How far within the photo a patch lies as a whole: beyond its border it would see the border."""
+        return 0.5 * (side * self._px_per_cell + _CONTRAST_PX)
 
     def shows(self, up_m: Floats32, side: int) -> Mask:
         """(H, W) where a patch lies in the photo as a whole at each cell's own height, (H, W); nowhere for NaN."""
-        inset = 0.5 * (side * self._px_per_cell + self._apron)
+        (left, top, right, bottom), inset = self.frame.tolist(), self.inset_px(side)
+        x, y, z = self._homogeneous(up_m)
+        shown: Mask = (x >= (left + inset) * z) & (y >= (top + inset) * z)
+        shown &= (x <= (right - inset) * z) & (y <= (bottom - inset) * z)
+        return shown if self.hidden_below_m is None else shown & (up_m >= self.hidden_below_m)
+
+    def _homogeneous(self, up_m: Floats32) -> list[Floats]:
+        """x, y and depth, (H, W) each, of the cells at heights, (H, W), in the part of the picture."""
         columns, rows = np.arange(self.shape[1]), np.arange(self.shape[0])[:, None]
-        (w, h), (x, y, z) = (
-            self._size,
-            (
-                level[0] * columns + (level[1] * rows + level[2]) + up[2] * up_m
-                for level, up in zip(self._level, self._up)
-            ),
-        )
-        left, top = x - inset * z, y - inset * z
-        shown: Mask = (
-            (left >= 0) & (top >= 0) & (x <= (w - 1 - inset) * z) & (y <= (h - 1 - inset) * z)
-        )
-        return shown if self._hidden_below_m is None else shown & (up_m >= self._hidden_below_m)
-
-    def _picture_from_cells(self, up_m: float) -> Matrix3:
-        return np.asarray(self._level + up_m * self._up)
-
-    def _crop_to(self, picture: ImageGray, bounds: Bounds, settings: SweepSettings) -> Floats32:
-        """Keep of the picture what the cells see at all heights."""
-        apron = self._apron = _CONTRAST_PX
-        low, high = np.zeros(2, int), np.array(self._size)
-        seen = [
-            self._picture_from_cells(each) @ self._corners for each in (bounds.low_m, bounds.high_m)
+        return [
+            level[0] * columns + (level[1] * rows + level[2]) + up[2] * up_m
+            for level, up in zip(*self.planes)
         ]
-        ends = np.concatenate(seen, axis=1)
-        if (ends[2] > 1e-6).all():
-            places = (ends[:2] / ends[2]).T
-            low = np.clip(np.floor(places.min(axis=0)) - apron, 0, high - 1).astype(int)
-            high = np.clip(np.ceil(places.max(axis=0)) + apron + 1, low + 1, high).astype(int)
-        self._from_picture = np.array([[1.0, 0, -low[0]], [0, 1, -low[1]], [0, 0, 1]])
-        return picture[low[1] : high[1], low[0] : high[0]].astype(np.float32)
+
+    def _at(self, up_m: float) -> Matrix3:
+        return np.asarray(self.planes[0] + up_m * self.planes[1])
 
 
 def _unit(vectors: Floats) -> Floats:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-9)
 
 
-def _contrast(picture: Floats32, angle_rad: float, settings: SweepSettings) -> Floats32:
+def _contrast(picture: Floats32, angle_rad: float) -> Floats32:
     """(H, W) how a picture's gray differs from its mean along a line, over how much it does so around.
 
     Along the line between two photos, for an edge along that line fits itself at every height.
@@ -471,107 +401,24 @@ def _contrast(picture: Floats32, angle_rad: float, settings: SweepSettings) -> F
 
 
 def _agreements(laid: Sequence[_Laid], levels_m: Floats, settings: SweepSettings) -> Floats32:
-    """(H, L, W) how well the photos agree at each of L heights."""
-    wholes = [[each.wholes(levels_m, side) for each in laid] for side in settings.window_cells]
-    result = np.empty((laid[0].shape[0], len(levels_m), laid[0].shape[1]), np.float32)
-    for number, up_m in enumerate(levels_m.tolist()):
-        known = [[next(each) for each in of_side] for of_side in wholes]
-        result[:, number] = _agreement(laid, up_m, known, settings)
-    return result
+    """(H, L, W) how well the photos agree at each of L heights, 0 to 1; NaN where fewer than two see it.
 
-
-def _agreement(
-    laid: Sequence[_Laid], up_m: float, known: Sequence[Sequence[Seen]], settings: SweepSettings
-) -> Floats32:
-    """(H, W) how well the photos agree at a height, 0 to 1; NaN where fewer than two see it.
-
-    `known` is where each photo sees the patches of each size. The mean over the better half of the pairs that see a
-    cell, for a photo from which something hides it agrees with none (Kang, Szeliski and Chai 2001).
+    The mean over the better half of the pairs that see a cell, for a photo from which something hides it agrees with
+    none (Kang, Szeliski and Chai 2001).
     """
-    pairs = list(_pairs(known))
-    if not pairs:
-        return np.full(laid[0].shape, np.nan, np.float32)
-    pictures = {k: laid[k].at(up_m) for k in {k for i, j, _ in pairs for k in (i, j)}}
-    scores = [_likeness(pictures[i][j] * pictures[j][i], both, settings) for i, j, both in pairs]
-    is_whole = all(any(each is True for each in both) for _, _, both in pairs)
-    return (_better_mean if is_whole else _better_mean_of_known)(scores, _PAIR_SHARE)
-
-
-def _pairs(known: Sequence[Sequence[Seen]]) -> Iterator[tuple[int, int, list[Seen]]]:
-    """The photos that see patches together, two by two, and where they do, for each size of a patch."""
-    for i, j in itertools.combinations(range(len(known[0])), 2):
-        both = [_both(seen[i], seen[j]) for seen in known]
-        if any(each is not False for each in both):
-            yield i, j, both
-
-
-def _both(first: Seen, second: Seen) -> Seen:
-    """Where two photos see a patch."""
-    if first is False or second is False:
-        return False
-    if first is True or second is True:
-        return second if first is True else first
-    both = first & second
-    return both if both.any() else False
-
-
-def _likeness(product: Floats32, both: Sequence[Seen], settings: SweepSettings) -> Floats32:
-    """(H, W) how alike patches are in two photos, the mean over those of their sizes that both see; -1 for none."""
-    total, whole, partly = None, 0, []
-    for side, seen in zip(settings.window_cells, both):
-        if seen is False:
-            continue
-        alike = np.asarray(cv2.boxFilter(product, -1, (side, side)), np.float32)
-        np.maximum(alike, 0, out=alike)
-        if seen is True:
-            whole += 1
-        else:
-            alike *= seen
-            partly.append(seen)
-        total = alike if total is None else np.add(total, alike, out=total)
-    assert total is not None
-    if not partly:
-        return np.divide(total, np.float32(whole), out=total)
-    count = np.sum(partly, axis=0, dtype=np.float32) + np.float32(whole)
-    return np.where(count > 0, total / np.maximum(count, 1), np.float32(-1))
-
-
-def _better_mean(scores: list[Floats32], share: float) -> Floats32:
-    """(H, W) the mean over the best `share` of the scores."""
-    wanted = int(np.ceil(len(scores) * share))
-    total = np.zeros_like(scores[0])
-    for each in itertools.islice(_from_the_largest(scores), wanted):
-        total += each
-    total /= wanted
-    return total
-
-
-def _better_mean_of_known(scores: list[Floats32], share: float) -> Floats32:
-    """(H, W) the mean over the best `share` of the scores that are known (not -1); NaN where none is."""
-    counted = np.zeros(scores[0].shape, np.float32)
-    for each in scores:
-        counted += each >= 0
-    wanted = np.ceil(counted * share)
-    total = np.zeros_like(counted)
-    for rank, each in enumerate(
-        itertools.islice(_from_the_largest(scores), int(np.ceil(len(scores) * share)))
-    ):
-        total += each * (rank < wanted)
-    with np.errstate(invalid="ignore"):
-        return np.asarray(
-            np.where(counted > 0, total / np.maximum(wanted, 1), np.float32(np.nan)), np.float32
-        )
-
-
-def _from_the_largest(scores: list[Floats32]) -> Iterator[Floats32]:
-    """(H, W) of each cell its largest score, then its second, and so on; `scores` change."""
-    lower = np.empty_like(scores[0])
-    for left in range(len(scores) - 1, -1, -1):
-        for k in range(left):  # the largest of those left moves to their end
-            np.minimum(scores[k], scores[k + 1], out=lower)
-            np.maximum(scores[k], scores[k + 1], out=scores[k + 1])
-            scores[k], lower = lower, scores[k]
-        yield scores[left]
+    return kernels.agreements(
+        [each.contrast for each in laid],
+        np.array([each.channel for each in laid]),
+        np.array([each.planes for each in laid]),
+        np.array([each.frame for each in laid]),
+        np.array([[each.inset_px(side) for side in settings.window_cells] for each in laid]),
+        [each.hidden_below_m for each in laid],
+        levels_m,
+        settings.window_cells,
+        laid[0].shape,
+        _PAIR_SHARE,
+        cv2.getNumThreads(),
+    )
 
 
 def _cost(agreement: Floats32, settings: SmoothingSettings) -> Floats32:

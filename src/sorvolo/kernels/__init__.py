@@ -279,6 +279,53 @@ def flow_on_grid(
     return _native.flow_on_grid(flow, _bytes(details), rows, columns)
 
 
+def agreements(
+    pictures: Sequence[NDArray[np.float32]],
+    channel: NDArray[np.int64],
+    planes: Floats,
+    frames: Floats,
+    insets: NDArray[np.float32],
+    hidden: Sequence[NDArray[np.float32] | None],
+    heights: Floats,
+    sides: Sequence[int],
+    shape: tuple[int, int],
+    share: float,
+    threads: int = 1,
+) -> NDArray[np.float32]:
+    """How well V photos laid on L level planes agree, (h, L, w), 0 to 1: NaN where fewer than two show a patch.
+
+    `pictures` (channels, h', w') each, of which two photos compare those that `channel` (V, V) names; `planes`
+    (V, 2, 3, 3) map cells to a picture at height 0 and what a unit of height adds; a photo ends at its `frames` (V, 4)
+    left, top, right, bottom, and shows a patch of each of S odd `sides` as a whole `insets` (V, S) px within, where
+    `hidden` (h, w) does not say that it sees nothing so low. Agreement is the mean of products over patches, the mean
+    over the sizes, and over the best `share` of the pairs.
+    """
+    views = len(pictures)
+    fits = channel.shape == (views, views) and planes.shape == (views, 2, 3, 3) and views > 1
+    fits = fits and frames.shape == (views, 4) and insets.shape == (views, len(sides))
+    fits = fits and all(each is None or each.shape == shape for each in hidden)
+    _check(fits and len(hidden) == views, "agreements", planes=planes, frames=frames, insets=insets)
+    most = np.array([len(each) for each in pictures])
+    small = min(min(each.shape[1:]) for each in pictures) < 2 or min(shape) < 1
+    if small or (channel < 0).any() or (channel >= most[:, None]).any():
+        raise ValueError("agreements: expected pictures of 2 px a side and channels that they have")
+    if not sides or any(side % 2 == 0 or not 1 <= side <= LARGEST_WINDOW_PX for side in sides):
+        raise ValueError(f"agreements: sides are odd, 1 to {LARGEST_WINDOW_PX}, got {list(sides)}")
+    return _native.agreements(
+        [np.ascontiguousarray(each, np.float32) for each in pictures],
+        np.ascontiguousarray(channel, np.int64),
+        np.ascontiguousarray(planes, np.float64),
+        np.ascontiguousarray(frames, np.float64),
+        np.ascontiguousarray(insets, np.float32),
+        [None if each is None else np.ascontiguousarray(each, np.float32) for each in hidden],
+        np.ascontiguousarray(heights, np.float64),
+        list(sides),
+        *shape,
+        share,
+        threads,
+    )
+
+
 def _target(out: Bytes | None, shape: tuple[int, ...]) -> Bytes:
     if out is None:
         return np.empty(shape, np.uint8)

@@ -463,4 +463,5 @@ PYBIND11_MODULE(_native, module) {
     bind_robust(module);
     bind_differences(module);
     bind_light(module);
+    bind_heights(module);
 }

@@ -121,5 +121,6 @@ void bind_regions(pybind11::module_ &module);
 void bind_robust(pybind11::module_ &module);
 void bind_differences(pybind11::module_ &module);
 void bind_light(pybind11::module_ &module);
+void bind_heights(pybind11::module_ &module);
 
 }  // namespace sorvolo

@@ -79,3 +79,17 @@ def detail_products(
 def flow_on_grid(
     flow: NDArray[np.float32], details: Bytes, rows: int, columns: int
 ) -> NDArray[np.float32]: ...
+def agreements(
+    pictures: Sequence[NDArray[np.float32]],
+    channel: NDArray[np.int64],
+    planes: NDArray[np.float64],
+    frames: NDArray[np.float64],
+    insets: NDArray[np.float32],
+    hidden: Sequence[NDArray[np.float32] | None],
+    heights: NDArray[np.float64],
+    sides: Sequence[int],
+    rows: int,
+    columns: int,
+    share: float,
+    threads: int,
+) -> NDArray[np.float32]: ...
