@@ -2,10 +2,12 @@
 
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 import sorvolo
+from sorvolo.change.robust import compare_robust
 from sorvolo.errors import InputError, SettingsError
 
 
@@ -36,6 +38,20 @@ def test_the_thesis_compares_with_any_number_of_threads_and_any_layout() -> None
     again = sorvolo.compare_thesis(sorvolo.prepare_reference(before), wide[:, ::2], threads=3)
     np.testing.assert_array_equal(found.mask, again.mask)
     np.testing.assert_array_equal(found.boxes, again.boxes)
+
+
+def test_pictures_are_red_green_blue_as_everywhere_else() -> None:
+    before = np.full((96, 128, 3), 90, np.uint8)
+    after = before.copy()
+    after[30:60, 40:80] = (90, 90, 190)  # blue, of which a grey level has the least
+    flipped = [np.ascontiguousarray(each[..., ::-1]) for each in (before, after)]
+    robust = compare_robust(*flipped)
+    np.testing.assert_array_equal(sorvolo.compare_images(before, after).mask, robust.mask)
+    before, after = scene()
+    steps = sorvolo.thesis_steps(before, after)
+    assert np.corrcoef(steps.query_equalised[..., 0].ravel(), after[..., 0].ravel())[0, 1] > 0.7
+    gray = cv2.cvtColor(steps.query_averaged, cv2.COLOR_RGB2GRAY)
+    assert cv2.absdiff(gray, sorvolo.prepare_reference(after).gray).max() <= 1
 
 
 PICTURE = np.zeros((40, 50, 3), np.uint8)

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.change.robust import RobustSettings, compare_robust
+from sorvolo.change.robust import RobustSettings, as_bgr, compare_robust
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import Boxes, ImageGray, Mask
 
@@ -30,12 +30,12 @@ class PairMethod(Protocol):
     def compare(
         self, reference: NDArray[np.uint8], query: NDArray[np.uint8], valid: Mask
     ) -> Comparison:
-        """What changed between two BGR pictures (h, w, 3), where `valid` (h, w)."""
+        """What changed between two RGB pictures (h, w, 3), where `valid` (h, w)."""
 
     def steps(
         self, reference: NDArray[np.uint8], query: NDArray[np.uint8], valid: Mask
     ) -> Mapping[str, NDArray[np.uint8]]:
-        """Its intermediate pictures by name, BGR or gray."""
+        """Its intermediate pictures by name, RGB or gray."""
 
 
 def compare_images(
@@ -44,7 +44,7 @@ def compare_images(
     valid: Mask | None = None,
     settings: RobustSettings | None = None,
 ) -> Comparison:
-    """What changed from `reference` to `query`, two aligned BGR pictures (h, w, 3) uint8.
+    """What changed from `reference` to `query`, two aligned RGB pictures (h, w, 3) uint8.
 
     Where the bool mask `valid` (h, w) is False, as in a hole of a mosaic, the answer is unknown: never changed.
     Raises InputError and SettingsError.
@@ -56,7 +56,7 @@ def compare_images(
         raise InputError(
             f"the pictures are {_size(query)}; at least {_LEAST_PX} px are needed each way"
         )
-    found = compare_robust(reference, query, valid, settings)
+    found = compare_robust(as_bgr(reference), as_bgr(query), valid, settings)
     return Comparison(found.mask, found.boxes)
 
 
@@ -76,12 +76,12 @@ def checked_pair(
 def _checked(name: str, image: Any) -> NDArray[np.uint8]:
     if not isinstance(image, np.ndarray):
         raise InputError(
-            f"{name} is a {type(image).__name__}; give a NumPy array (height, width, 3) of uint8, BGR"
+            f"{name} is a {type(image).__name__}; give a NumPy array (height, width, 3) of uint8, RGB"
         )
     if image.dtype != np.uint8:
         raise InputError(f"{name} holds {image.dtype}; give uint8, 0 to 255")
     if image.ndim != 3 or image.shape[2] != 3:
-        raise InputError(f"{name} has the shape {image.shape}; give (height, width, 3), BGR")
+        raise InputError(f"{name} has the shape {image.shape}; give (height, width, 3), RGB")
     if image.size == 0:
         raise InputError(f"{name} is empty, {image.shape}; give at least one pixel")
     return np.ascontiguousarray(image)

@@ -22,7 +22,16 @@ from sorvolo.change.regions import (
 )
 from sorvolo.change.settling import Settling, settle
 from sorvolo.change.shade import ShadeSettings, shade_between
-from sorvolo.geometry.arrays import Boxes, Bytes, Floats, ImageGray, Ints32, Mask
+from sorvolo.geometry.arrays import (
+    Boxes,
+    Bytes,
+    Floats,
+    ImageBGR,
+    ImageGray,
+    ImageRGB,
+    Ints32,
+    Mask,
+)
 from sorvolo.kernels import held_parts, tree_margins
 from sorvolo.survey.findings import Shade
 
@@ -226,6 +235,11 @@ class RobustResult:
     settling: Settling
     noise: float
     known: float
+
+
+def as_bgr(image: ImageRGB) -> ImageBGR:
+    """The picture with its channels in OpenCV's order."""
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2BGR), np.uint8)
 
 
 def compare_robust(

@@ -23,7 +23,7 @@ from sorvolo.change.earlier_pictures import EarlierPictures
 from sorvolo.change.map_search import MapSearch
 from sorvolo.change.planting import Planted, Planting
 from sorvolo.change.reference import ReferenceMap
-from sorvolo.change.robust import RobustSettings, compare_robust
+from sorvolo.change.robust import RobustSettings, as_bgr, compare_robust
 from sorvolo.change.shade import shade_of_view
 from sorvolo.change.tuning import FlightTuning, PairMeasures
 from sorvolo.geometry.arrays import (
@@ -368,7 +368,7 @@ class ViewMaker:
             )
         image, valid = _laid(aligned, image, known)
         query = as_bgr(image)
-        found, measured = self._difference(as_bgr(reference), query, valid)
+        found, measured = self._difference(reference, image, query, valid)
         outcome = ViewOutcome(
             ViewStatus.COMPARED,
             "",
@@ -587,15 +587,15 @@ class ViewMaker:
         )
 
     def _difference(
-        self, reference: ImageBGR, query: ImageBGR, valid: Mask
+        self, reference: ImageRGB, image: ImageRGB, query: ImageBGR, valid: Mask
     ) -> tuple[Difference, PairMeasures | None]:
         """What differs from the map; the flight's tuning learns of it, by what was measured."""
         settings = self._settings_now()
         if self._tuning is None or settings is None:
             assert self._method is not None
-            other = self._method.compare(reference, query, valid)
+            other = self._method.compare(reference, image, valid)
             return Difference(other.mask, other.boxes, np.full(len(other.boxes), 0.5)), None
-        found = compare_robust(reference, query, valid, settings)
+        found = compare_robust(as_bgr(reference), query, valid, settings)
         measured = PairMeasures.of(found)
         self._tuning.observe(measured)
         return Difference(found.mask, found.boxes, found.scores), measured
@@ -621,8 +621,3 @@ def _doubted(found: Difference, kept: Difference, least_score: float) -> Mask:
     for x, y, w, h in found.boxes[found.scores >= least_score]:
         sure[y : y + h, x : x + w] = True
     return sure & (found.mask > 0) & (kept.mask == 0)
-
-
-def as_bgr(image: ImageRGB) -> ImageBGR:
-    """The picture with its channels in OpenCV's order."""
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2BGR), np.uint8)

@@ -83,7 +83,7 @@ def by_the_text(
         )
         equalised.append(equal)
         averaged.append(mean)
-    grays = [cv2.cvtColor(each, cv2.COLOR_BGR2GRAY).astype(int) for each in averaged]
+    grays = [cv2.cvtColor(each, cv2.COLOR_RGB2GRAY).astype(int) for each in averaged]
     difference = np.zeros((height, width), np.uint8)
     for y in range(height):
         for x in range(width):
@@ -114,7 +114,7 @@ def by_the_text(
     for x, y, w, h in list(boxes):
         counts = [
             np.bincount(
-                cv2.cvtColor(each, cv2.COLOR_BGR2GRAY)[y : y + h, x : x + w].ravel(), minlength=256
+                cv2.cvtColor(each, cv2.COLOR_RGB2GRAY)[y : y + h, x : x + w].ravel(), minlength=256
             )
             for each in equalised
         ]
@@ -168,7 +168,7 @@ def scene() -> tuple[Any, Any]:
     field = cv2.GaussianBlur(rng.normal(110, 60, (180, 240, 3)), (0, 0), 2) * 1.5 - 50
     before = np.clip(field, 0, 255).astype(np.uint8)
     after = before.copy()
-    after[60:90, 100:160] = (30, 30, 220)
+    after[60:90, 100:160] = (220, 30, 30)
     after[66:84, 115:145] = 240
     return before, after
 

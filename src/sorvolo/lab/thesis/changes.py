@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from sorvolo import kernels
 from sorvolo.change.compare import Comparison, checked_pair
+from sorvolo.change.robust import as_bgr
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Boxes, Floats, ImageGray, Mask
 from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
@@ -22,7 +23,7 @@ _TABLE_LEVEL, _TABLE_SHARE = 40, 0.3  # T_gray and T_H of Table 4.2
 _MOST_THREADS = 256  # a bound for typing errors, beyond any machine that this runs on
 
 Picture = NDArray[np.uint8]
-"""(height, width, 3) uint8, blue green red."""
+"""(height, width, 3) uint8, red green blue."""
 
 
 @dataclass(frozen=True)
@@ -97,8 +98,8 @@ class ThesisSettings:
 class ThesisReference:
     """A picture as the difference needs it: made once for the reference, used for every query.
 
-    `picture` (h, w, 3) as given; `known` (h, w) uint8, 0 where nothing is known, None where all is; `tables` (3, 256)
-    equalise it; `planes` (3, h, w) and `gray` (h, w) are the equalised picture after the micro-differences removal
+    `picture` (h, w, 3) BGR, as the kernels take it; `known` (h, w) uint8, 0 where nothing is known, None where all is;
+    `tables` (3, 256) equalise it; `planes` (3, h, w) and `gray` (h, w) are the equalised picture after the micro-differences removal
     with the window `averaging_px`.
     """
 
@@ -125,7 +126,7 @@ class ThesisSteps:
     boxes: Boxes
 
     def pictures(self) -> dict[str, NDArray[np.uint8]]:
-        """The pictures by name, such as "a-reference-equalised", in the figure's order; BGR or gray."""
+        """The pictures by name, such as "a-reference-equalised", in the figure's order; RGB or gray."""
         shown = [each.name for each in fields(self) if each.name != "boxes"]
         return {
             f"{letter}-{name.replace('_', '-')}": getattr(self, name)
@@ -139,12 +140,13 @@ def prepare_reference(
     settings: ThesisSettings | None = None,
     threads: int = 1,
 ) -> ThesisReference:
-    """The pre-processing of one BGR picture (h, w, 3): equalised by channel, then averaged over W_a.
+    """The pre-processing of one RGB picture (h, w, 3): equalised by channel, then averaged over W_a.
 
     Where `valid` (h, w) is False nothing is known: those pixels take no part in the equalisation.
     """
     settings = settings or ThesisSettings()
     known = None if valid is None or valid.all() else np.ascontiguousarray(valid).view(np.uint8)
+    picture = as_bgr(picture)
     tables = kernels.equalising_tables(picture, known, threads)
     planes, gray = kernels.averaged(picture, tables, *settings.averaging_px, threads)
     return ThesisReference(picture, known, tables, planes, gray, settings.averaging_px)
@@ -157,7 +159,7 @@ def compare_thesis(
     settings: ThesisSettings | None = None,
     threads: int = 1,
 ) -> Comparison:
-    """The changes between two aligned BGR pictures (h, w, 3), by section 3.2; the same with any number of threads.
+    """The changes between two aligned RGB pictures (h, w, 3), by section 3.2; the same with any number of threads.
 
     Where `valid` (h, w) is False, or was for a prepared reference, the answer is unknown: such pixels take no part in
     the equalisation, are never different (nor are those whose average reaches into them), are never in the mask and
@@ -180,10 +182,10 @@ def thesis_steps(
     )
     both = before, after
     equalised = [
-        np.asarray(cv2.LUT(each.picture, each.tables.T.reshape(1, 256, 3)), np.uint8)
+        np.asarray(cv2.LUT(each.picture, each.tables.T.reshape(1, 256, 3)), np.uint8)[..., ::-1]
         for each in both
     ]
-    averaged = [np.ascontiguousarray(each.planes.transpose(1, 2, 0)) for each in both]
+    averaged = [np.ascontiguousarray(each.planes[::-1].transpose(1, 2, 0)) for each in both]
     return ThesisSteps(
         equalised[0],
         equalised[1],
@@ -315,7 +317,7 @@ class ThesisComparison:
             )
 
     def compare(self, reference: Picture, query: Picture, valid: Mask) -> Comparison:
-        """The changes between two aligned BGR pictures (h, w, 3)."""
+        """The changes between two aligned RGB pictures (h, w, 3)."""
         return compare_thesis(reference, query, valid, self.settings, self.threads)
 
     def steps(

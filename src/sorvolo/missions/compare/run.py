@@ -15,7 +15,7 @@ from sorvolo.change.outlines import KnownPlace
 from sorvolo.change.reconcile import reported
 from sorvolo.change.reference import ReferenceMap
 from sorvolo.change.relief import ReliefMap
-from sorvolo.change.views import FlightCamera, ViewMaker, ViewOutcome, ViewRecord, as_bgr
+from sorvolo.change.views import FlightCamera, ViewMaker, ViewOutcome, ViewRecord
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Mask, PointsM
 from sorvolo.geometry.summary import median_of_known
@@ -348,7 +348,7 @@ class CompareRun:
             self._writer.save_masks(view.name, changed, valid, self._views.pixels.boxes(view))
         method = self._settings.method
         if self._steps is not None and method is not None:
-            steps = method.steps(as_bgr(view.reference), as_bgr(view.image), view.valid)
+            steps = method.steps(view.reference, view.image, view.valid)
             write_pictures(self._steps / view.name, steps)
 
     def _report(

@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Boxes, Floats, ImageBGR, ImageGray, Mask
+from sorvolo.geometry.arrays import Boxes, Floats, ImageGray, ImageRGB, Mask
 from sorvolo.geometry.polygons import signed_area
 from sorvolo.store.atomic import atomic_write_bytes, make_folder
 from sorvolo.store.exports.places import Placemark, place_deg, ring
@@ -86,11 +86,12 @@ def write_view_masks(folder: Path, name: str, changed: ImageGray, valid: Mask) -
     return path
 
 
-def write_pictures(folder: Path, pictures: Mapping[str, ImageBGR | ImageGray]) -> None:
-    """Write pictures, BGR or gray uint8, as `<name>.png` into the folder, which is made; StoreError on a full disk."""
+def write_pictures(folder: Path, pictures: Mapping[str, ImageRGB | ImageGray]) -> None:
+    """Write pictures, RGB or gray uint8, as `<name>.png` into the folder, which is made; StoreError on a full disk."""
     make_folder(folder)
     for name, picture in pictures.items():
-        _, data = cv2.imencode(".png", picture)
+        shown = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
+        _, data = cv2.imencode(".png", shown)
         atomic_write_bytes(folder / f"{name}.png", data.tobytes(), durable=False)
 
 
