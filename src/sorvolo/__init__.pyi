@@ -39,7 +39,6 @@ from sorvolo.missions.calibrate_camera import parse_board as parse_board
 from sorvolo.missions.calibrate_camera import write_calibration as write_calibration
 from sorvolo.missions.compare.flights import compare_flights as compare_flights
 from sorvolo.missions.flight.detector_protocol import FindsObjects as FindsObjects
-from sorvolo.missions.flight.request import AlreadyDone as AlreadyDone
 from sorvolo.missions.flight.settings import CompareSettings as CompareSettings
 from sorvolo.missions.flight.settings import MapSettings as MapSettings
 from sorvolo.missions.heights.measure import measure_profile as measure_profile
@@ -49,6 +48,8 @@ from sorvolo.missions.heights.run import HeightsUpdate as HeightsUpdate
 from sorvolo.missions.heights.run import make_heights as make_heights
 from sorvolo.missions.inspect import inspect_input as inspect_input
 from sorvolo.missions.map.flights import map_flights as map_flights
+from sorvolo.missions.mission import FlightOutcome as FlightOutcome
+from sorvolo.missions.mission import Mission as Mission
 from sorvolo.missions.plan_flight import PlanSettings as PlanSettings
 from sorvolo.missions.plan_flight import answer_questions as answer_questions
 from sorvolo.missions.plan_flight import camera_to_plan_with as camera_to_plan_with

@@ -1,6 +1,6 @@
 """Sites in stores: what each flight added is sent before the next one goes on, however quick the flights are."""
 
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,21 +28,15 @@ def test_a_flight_is_sent_when_the_next_one_begins_however_late(
         events.append(f"sent {address}, over: {is_over}")
         return iter(())
 
-    def mission() -> Generator[Update, None, str]:
+    def mission() -> Iterator[Update]:
         for flight, seconds in (("two", 0.1), ("two", 0.2), ("three", 0.5), ("three", 0.6)):
             yield Update(flight, seconds)
             events.append(f"{flight} {seconds}")
-        return "report"
 
     monkeypatch.setattr("sorvolo.missions.site.working_copy.send_site", send)
     monkeypatch.setattr(sites, "show_copy", lambda work, task: list(work))
-    passed = OpenedSite(Path("copy"), "s3://archive/site").sent(mission())
-    while True:
-        try:
-            next(passed)
-        except StopIteration as end:
-            assert end.value == "report"
-            break
+    for _ in OpenedSite(Path("copy"), "s3://archive/site").sent(mission()):
+        pass
     assert events == [
         "two 0.1",
         "two 0.2",

@@ -267,7 +267,7 @@ def test_stopping_half_way_leaves_the_site_as_it_was(flown, site):
     updates = compare_flights([flown / "flight2"], site, _COMPARE, camera=flown / "camera.xml")
     for _ in range(5):
         next(updates)
-    updates.close()
+    updates.cancel()
     with Archive.open(site, write=False) as archive:
         assert [each.id for each in archive.versions()] == before
         assert [each.id for each in archive.flights()] == ["flight1"]

@@ -186,7 +186,7 @@ def test_other_settings_begin_anew_and_report_it(
             camera=flown / "camera.xml",
         )
         assert not next(updates).is_resumed
-        updates.close()
+        updates.cancel()
     assert not (site / "flights" / "flight2").exists()
 
 
@@ -206,4 +206,4 @@ def test_another_flight_names_whose_run_it_ends(
             again=True,
         )
         next(updates)
-        updates.close()
+        updates.cancel()

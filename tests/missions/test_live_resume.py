@@ -104,7 +104,7 @@ def mapped(
             fly()
         if len(updates) == killed_at:
             copy_as_killed(site, site.with_name("amid"))
-            mapping.close()
+            mapping.cancel()
             shutil.rmtree(site)
             shutil.move(site.with_name("amid"), site)
             break
@@ -208,7 +208,7 @@ def test_a_comparison_of_a_stream_goes_on(
     comparing = compared()
     before = [each for _, each in zip(range(6), comparing)]
     copy_as_killed(site, tmp_path / "amid")
-    comparing.close()
+    comparing.cancel()
     shutil.rmtree(site)
     shutil.move(tmp_path / "amid", site)
     updates = list(compared())
@@ -268,7 +268,7 @@ def test_a_watch_of_a_growing_file_goes_on(
         lambda: (folder / "run.journal").read_bytes().count(b'"receiver"') == sent >= 1
     )  # noted once it is sent
     copy_as_killed(folder, tmp_path / "amid")
-    watching.close()
+    watching.cancel()
     shutil.rmtree(folder)
     shutil.move(tmp_path / "amid", folder)
     asked = detector.asked

@@ -225,7 +225,7 @@ def test_another_command_begins_anew(whole: tuple[Path, ...], filmed: Path, tmp_
     )
     assert not next(updates).is_resumed
     assert left and not set(site.glob("flights/*/keyframes/*/*"))
-    updates.close()
+    updates.cancel()
     assert not list(site.glob("flights/*"))
 
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import sorvolo
-from ended_work import ended
 from small_flights import simulate_into, small_flight
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import ImageRGB
@@ -31,7 +30,9 @@ def test_one_method_is_a_detector(tmp_path: Path) -> None:
     flight = simulate_into(tmp_path / "flown", small_flight(7, length_m=20)) / "flight1"
     settings = sorvolo.WatchSettings(classes=("deer",))
     outputs = sorvolo.WatchOutputs(folder=tmp_path / "seen")
-    ended(sorvolo.watch(next(flight.glob("*.mp4")), settings, outputs, detector=Middle()))
+    video = next(flight.glob("*.mp4"))
+    (outcome,) = sorvolo.watch(video, settings, outputs, detector=Middle()).result()
+    assert outcome.paths["tracks.geojson"].is_file() and outcome.frames["detected"] > 5
     report = (tmp_path / "seen" / "report.json").read_text()
     assert '"deer"' in report and "Middle" in report
 

@@ -30,7 +30,7 @@ def site(photo_map: Path) -> Path:
 def _report(
     site: Path, folder: Path, detector: Any, settings: SearchSettings, **outputs: Any
 ) -> dict[str, Any]:
-    *_, report = search_site(site, settings, SearchOutputs(folder, **outputs), detector)
+    report = search_site(site, settings, SearchOutputs(folder, **outputs), detector).result()
     assert isinstance(report, dict)
     return report
 

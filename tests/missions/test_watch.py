@@ -474,7 +474,7 @@ def test_closing_early_writes_what_was_found(
     watching = watch(_video(flown), outputs=outputs, camera=flown / "camera.xml", detector=detector)
     for _ in range(12):
         next(watching)
-    watching.close()
+    watching.cancel()
     report = _read(tmp_path / "watch" / "report.json")
     assert report["ended"] == "stopped on demand" and report["frames"]["detected"] == 12
     assert (tmp_path / "watch" / "annotated.mp4").exists() and (

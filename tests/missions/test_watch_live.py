@@ -207,7 +207,7 @@ def test_what_is_left_when_it_is_stopped_is_counted(tmp_path: Path) -> None:
         )
         for update in watching:
             if update.has_landed:
-                watching.close()
+                watching.cancel()
     report = json.loads((folder / "report.json").read_text())
     assert report["frames"]["skipped"] > 0 and report["objects"]["total"] == 1
     assert not report["headline"]["complete"]

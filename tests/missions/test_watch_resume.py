@@ -166,7 +166,7 @@ def test_other_settings_begin_anew_and_report_it(
     )
     next(updates)
     copy_as_killed(folder, tmp_path / "amid")
-    updates.close()
+    updates.cancel()
     assert not (folder / "run.journal").exists()
     with pytest.warns(
         SorvoloWarning, match="a watch that was stopped cannot continue: it was of other settings"
@@ -179,7 +179,7 @@ def test_other_settings_begin_anew_and_report_it(
             detector=detector,
         )
         assert not next(again).is_resumed
-        again.close()
+        again.cancel()
 
 
 def test_what_was_printed_is_not_printed_again(
@@ -195,7 +195,7 @@ def test_what_was_printed_is_not_printed_again(
     closing = watch(video, WatchSettings(), WatchOutputs(folder=folder), camera="aov=70")
     new = [track.id for _, each in zip(range(_KILLED_AT), closing) for track in each.new]
     copy_as_killed(folder, tmp_path / "amid")
-    closing.close()
+    closing.cancel()
     shutil.rmtree(folder)
     shutil.move(tmp_path / "amid", folder)
     assert main(command) == 3  # the pixels are too coarse for small objects

@@ -14,7 +14,7 @@ from statistics import median_low
 import cv2
 import numpy as np
 
-from sorvolo.capture.decoding import LARGEST_FRAME_PX, decode_photo
+from sorvolo.capture.decoding import LARGEST_FRAME_PX, decode_photo, is_same_shape, other_size
 from sorvolo.capture.photo_metadata import (
     APART_M,
     PhotoMetadata,
@@ -24,7 +24,6 @@ from sorvolo.capture.photo_metadata import (
     read_photo_metadata,
 )
 from sorvolo.capture.photo_positions import read_positions
-from sorvolo.capture.picture_sizes import is_same_shape, other_size
 from sorvolo.capture.telemetry.cleaning import clean, notice
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import ImageRGB

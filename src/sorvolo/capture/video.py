@@ -9,8 +9,7 @@ from typing import Any, cast
 import av
 import numpy as np
 
-from sorvolo.capture.decoding import is_heif
-from sorvolo.capture.picture_sizes import is_same_shape, other_size
+from sorvolo.capture.decoding import is_heif, is_same_shape, other_size
 from sorvolo.capture.telemetry.cleaning import notice
 from sorvolo.capture.video_spans import SparseReading, SparseVideo, UnevenStreamError
 from sorvolo.capture.video_stream import (

@@ -45,10 +45,8 @@ from sorvolo.cli.sites import OpenedSite, ended_by_signal, opened_site, run_on_s
 from sorvolo.survey.wording import area_text, counted, plural
 
 if TYPE_CHECKING:
-    from collections.abc import Generator
-
     from sorvolo.change.compare import PairMethod
-    from sorvolo.missions.flight.request import AlreadyDone
+    from sorvolo.missions.mission import FlightOutcome, Mission
     from sorvolo.survey.findings import CompareUpdate
 
 _COLOURS = {
@@ -128,7 +126,7 @@ def compare(
     """
     from sorvolo.capture.live.reconnect import LiveSettings
     from sorvolo.missions.compare.flights import compare_flights
-    from sorvolo.missions.flight.map_objects import is_good
+    from sorvolo.missions.mission import is_good
     from sorvolo.missions.flight.settings import CompareSettings
 
     settings = CompareSettings(
@@ -184,7 +182,7 @@ def _thesis() -> "PairMethod":
 
 
 def read_results(
-    comparing: "Generator[CompareUpdate, None, Sequence[AlreadyDone]]",
+    comparing: "Mission[CompareUpdate, tuple[FlightOutcome, ...]]",
     place: OpenedSite,
     form: PlaceFormat = "latlon",
 ) -> list[dict[str, Any]]:

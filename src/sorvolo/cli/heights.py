@@ -150,13 +150,12 @@ def make_and_read(
     from sorvolo.missions.heights.run import make_heights
     from sorvolo.store.site.files import HeightFile
 
-    flight_id = ""
+    making = make_heights(site, cell_m, flight=flight or None, catalogues=catalogues)
     with ProgressReport(Console(stderr=True)) as progress:
         progress.show("heights")
-        for update in make_heights(site, cell_m, flight=flight or None, catalogues=catalogues):
-            flight_id = update.flight_id
+        for update in making:
             progress.show(f"heights: {update.stage}, percent", round(100 * update.share), 100)
-    return read_json(site / "flights" / flight_id / HeightFile.REPORT)
+    return read_json(making.result().paths[HeightFile.REPORT])
 
 
 def show_heights(site: Path, report: Mapping[str, Any], console: Console) -> None:

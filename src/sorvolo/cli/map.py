@@ -125,7 +125,7 @@ def map_command(
     Example: sorvolo map rtsp://192.168.1.10/live --telemetry serial:/dev/ttyUSB0 --site field
     """
     from sorvolo.capture.live.reconnect import LiveSettings
-    from sorvolo.missions.flight.map_objects import is_good
+    from sorvolo.missions.mission import is_good
     from sorvolo.missions.flight.settings import MapSettings
     from sorvolo.missions.map.flights import map_flights
     from sorvolo.missions.site.copy import folder_of
@@ -169,7 +169,6 @@ def map_command(
                 place,
                 lambda updates: show_progress(updates, Console(stderr=True)),
                 "mapped",
-                catalogues,
             )
         reports = [read_json(folder / "report.json") for folder in folders]
         _print(reports, place.folder, catalogues, with_heights=bool(heights), as_json=as_json)

@@ -1,7 +1,6 @@
 """`sorvolo search`: what a flight's search would have found, measured, and where it could not see."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -136,19 +135,16 @@ def search_command(
                     "--flight names flights that the map has; flights that are mapped now are measured"
                 )
             _map_all(inputs, place, settings, outputs, telemetry, camera, give_up)
-        report: Mapping[str, Any] = {}
         measuring = search_site(place.folder, settings, outputs)
-        with ProgressReport(Console(stderr=True)) as progress, closing(measuring):
+        with ProgressReport(Console(stderr=True)) as progress, measuring:
             for update in measuring:
-                if isinstance(update, dict):
-                    report = update
-                    continue
                 progress.show(
                     f"searching planted pictures of {update.flight},",
                     update.done,
                     update.total,
                     f"{update.found} of {update.planted} found" if update.planted else "",
                 )
+            report = measuring.result()
     if as_json:
         print_json({"folder": str(outputs.folder), **report})
     else:

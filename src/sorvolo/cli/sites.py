@@ -3,7 +3,7 @@
 import signal
 import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
@@ -14,9 +14,8 @@ from sorvolo.cli.progress import ProgressReport, shown_work
 from sorvolo.errors import SorvoloError
 
 if TYPE_CHECKING:
-    from sorvolo.missions.flight.request import AlreadyDone
+    from sorvolo.missions.mission import FlightOutcome, Mission
     from sorvolo.store.copies.transfer import CopyUpdate
-    from sorvolo.store.site.catalogue_place import Catalogues
 
 
 class _OfFlight(Protocol):
@@ -41,19 +40,14 @@ class OpenedSite:
             return Path(f"{self.address.rstrip('/').rpartition('/')[2]}-{ending}")
         return self.folder.with_name(f"{self.folder.resolve().name}-{ending}")
 
-    def sent(self, updates: Generator[U, None, T], /) -> Generator[U, None, T]:
+    def sent(self, updates: Iterator[U], /) -> Iterator[U]:
         """Pass a mission's updates on; send each flight but the last to the store when the next begins."""
         flight = ""
-        with closing(updates):
-            while True:
-                try:
-                    update = next(updates)
-                except StopIteration as end:
-                    return end.value
-                if flight not in ("", update.flight):
-                    self._send()
-                flight = update.flight
-                yield update
+        for update in updates:
+            if flight not in ("", update.flight):
+                self._send()
+            flight = update.flight
+            yield update
 
     def _send(self) -> None:
         from sorvolo.missions.site.working_copy import send_site
@@ -97,41 +91,25 @@ def show_copy(work: "Generator[CopyUpdate, None, T]", task: str) -> T:
 
 
 def run_on_site(
-    mission: "Generator[U, None, Sequence[AlreadyDone]]",
+    mission: "Mission[U, tuple[FlightOutcome, ...]]",
     place: OpenedSite,
     show: Callable[[Iterator[U]], Any],
     done: str,
-    catalogues: "Catalogues | None" = None,
 ) -> list[Path]:
-    """Run a mission, showing its updates with `show`; return the folders of its flights, in order.
+    """Run a mission, showing its updates with `show`; return the folders of its flights.
 
     Flights that the site had already come last, and are named on stderr as `done` ("mapped").
     """
-    from sorvolo.store.site.archive import Archive
-    from sorvolo.store.site.catalogue_place import is_site
-
-    newest = 0
-    if is_site(place.folder):
-        with Archive.open(place.folder, write=False, catalogues=catalogues) as archive:
-            newest = max((entry.id for entry in archive.versions()), default=0)
-    updates = place.sent(mission)
-    repeated: list[AlreadyDone] = []
-
-    def passed_on() -> Iterator[U]:
-        repeated.extend((yield from updates))
-
-    with closing(updates):  # also where the bar is stopped: then the site is as it was
-        show(passed_on())
-    for flight in repeated:
-        moment = flight.done_utc[:16].replace("T", " ")
-        typer.echo(
-            f"{flight.flight} is {done} already ({moment} UTC); --again repeats it", err=True
-        )
-    with Archive.open(place.folder, write=False, catalogues=catalogues) as archive:
-        made = [entry.flight_id for entry in archive.versions() if entry.id > newest]
-        return [
-            archive.flight_folder(name) for name in (*made, *(each.flight for each in repeated))
-        ]
+    with mission:  # also where the bar is stopped: then the site is as it was
+        show(place.sent(mission))
+        outcomes = mission.result()
+    for outcome in outcomes:
+        if outcome.done_utc:
+            moment = outcome.done_utc[:16].replace("T", " ")
+            typer.echo(
+                f"{outcome.flight} is {done} already ({moment} UTC); --again repeats it", err=True
+            )
+    return [each.folder for each in sorted(outcomes, key=lambda each: bool(each.done_utc))]
 
 
 class SignalStop:

@@ -1,7 +1,7 @@
 """`sorvolo watch`: each object printed when it is found; in the end how many of what, where, and how sure."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -142,7 +142,7 @@ def watch_command(
     )
     folders: dict[Path, None] = {}
     # closed after a stop: then what was found is written
-    with stop.on_signals(), closing(watching) as updates, suppress(KeyboardInterrupt):
+    with stop.on_signals(), watching as updates, suppress(KeyboardInterrupt):
         for folder in _show_progress(updates, Console(stderr=True), coordinates, is_quiet=as_json):
             stop.is_running = True
             folders[folder] = None

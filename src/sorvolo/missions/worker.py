@@ -8,8 +8,8 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import closing, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
@@ -20,6 +20,7 @@ from sorvolo.capture.live.addresses import is_live_address, without_secret
 from sorvolo.errors import SorvoloError, UnavailableError
 
 if TYPE_CHECKING:
+    from sorvolo.missions.mission import FlightOutcome
     from sorvolo.missions.search.while_flying import SearchWhileFlying
     from sorvolo.missions.watch.run import EarlyFound, WatchUpdate
     from sorvolo.survey.findings import CompareUpdate
@@ -198,7 +199,6 @@ def run_map(
     from sorvolo.missions.map.flights import map_flights
 
     site = Path(order.site)
-    before = _newest_version(site)
     updates = map_flights(
         [order.source],
         site,
@@ -209,12 +209,11 @@ def run_map(
         until=until,
         search=search,
     )
-    known: list[str] = []
-    with closing(updates):
-        for update in _noting(updates, known):
+    with updates:
+        for update in updates:
             _add_frame(journal, update.view, update.frame_name, update.status.value)
             journal.progress(_flight_progress(update, update.keyframes, update.by_vision))
-    return _mapped(journal, site, before, known)
+        return _mapped(journal, site, updates.result())
 
 
 def run_compare(order: Order, journal: Journal, until: threading.Event) -> Done:
@@ -224,7 +223,6 @@ def run_compare(order: Order, journal: Journal, until: threading.Event) -> Done:
     from sorvolo.store.site.archive import Archive
 
     site = Path(order.site)
-    before = _newest_version(site)
     announced: dict[str, None] = {}  # their ids, in order
     with Archive.open(site, write=False) as archive:
         place = archive.site()
@@ -237,22 +235,22 @@ def run_compare(order: Order, journal: Journal, until: threading.Event) -> Done:
         live=_live_settings(order, keeps_all=True),
         until=until,
     )
-    known: list[str] = []
-    with closing(updates):
-        for update in _noting(updates, known):
+    with updates:
+        for update in updates:
             _add_frame(journal, update.view, update.frame_name, update.status.value)
             announced |= dict.fromkeys(each.id for each in update.announced)
             _add_changes(journal, update, place)
             progress = _flight_progress(update, update.views, update.compared)
             journal.progress(progress | {"changes": len(announced)})
+        outcomes = updates.result()
     with Archive.open(site, write=False) as archive:
-        flights = {each.flight_id for each in archive.versions() if each.id > before}
+        flights = {each.flight for each in outcomes if not each.done_utc}
         kept = {each.id for each in archive.changes() if each.flight_id in flights}
     for change_id in announced.keys() - kept:
         journal.add(
             "change.withdrawn", {"id": change_id, "why": "not confirmed by the whole flight"}
         )
-    return _mapped(journal, site, before, known)
+    return _mapped(journal, site, outcomes)
 
 
 def run_watch(order: Order, journal: Journal, until: threading.Event) -> Done:
@@ -272,7 +270,7 @@ def run_watch(order: Order, journal: Journal, until: threading.Event) -> Done:
         early=partial(_add_early, journal, order.stream) if order.stream else None,
     )
     last: WatchUpdate | None = None
-    with closing(updates):
+    with updates:
         for update in updates:
             last = update
             _add_frame(journal, update.view, update.frame_name, "watched")
@@ -308,12 +306,8 @@ def run_search(order: Order, journal: Journal, until: threading.Event) -> Done:
     mapped = Done("")
     if order.source:  # a flight to map first
         mapped = run_map(order, journal, until, SearchWhileFlying(settings, outputs))
-    report: Mapping[str, Any] = {}
-    with closing(search_site(Path(order.site), settings, outputs)) as measuring:
+    with search_site(Path(order.site), settings, outputs) as measuring:
         for each in measuring:
-            if isinstance(each, dict):
-                report = each
-                continue
             journal.progress(
                 {
                     "frames": each.done,
@@ -323,9 +317,8 @@ def run_search(order: Order, journal: Journal, until: threading.Event) -> Done:
                     "flight": each.flight,
                 }
             )
-    headline = report.get("headline") or {}
-    is_good = mapped.is_good and bool(headline.get("complete"))
-    return Done(str(headline.get("text", "measured")), mapped.flight, is_good)
+        headline = measuring.result()["headline"]
+    return Done(headline["text"], mapped.flight, mapped.is_good and headline["complete"])
 
 
 def run_inspect(order: Order, journal: Journal, _: threading.Event) -> Done:
@@ -374,48 +367,26 @@ def _live_settings(order: Order, *, keeps_all: bool = False) -> Any:
     return replace(settings, give_up_s=order.away_s) if order.stream else settings
 
 
-def _newest_version(site: Path) -> int:
-    from sorvolo.store.site.archive import Archive
-    from sorvolo.store.site.catalogue_place import is_site
-
-    if not is_site(site):
-        return 0
-    with Archive.open(site, write=False) as archive:
-        return max((each.id for each in archive.versions()), default=0)
-
-
-def _noting(updates: Generator[T, None, Any], known: list[str]) -> Iterator[T]:
-    """The updates of a mission; `known` gets the names of flights that the site had already."""
-    known += [each.flight for each in (yield from updates) or ()]
-
-
-def _mapped(journal: Journal, site: Path, before: int, known: Sequence[str]) -> Done:
-    """How a flight's map, or its comparison, ended: as the reports state of the versions since, else of known flights.
-
-    Writes each person that the new versions show.
-    """
-    from sorvolo.missions.flight.map_objects import is_good
+def _mapped(journal: Journal, site: Path, outcomes: "Sequence[FlightOutcome]") -> Done:
+    """How a flight's map, or its comparison, ended. Writes each person that the new versions show."""
     from sorvolo.store.exports.change_files import objects_geojson
     from sorvolo.store.site.archive import Archive
     from sorvolo.survey.objects import PERSON
 
     with Archive.open(site, write=False) as archive:
-        since = [each.flight_id for each in archive.versions() if each.id > before]
-        flights = since or known
-        reports = [archive.report(each) for each in flights]
         people = [
             each
-            for flight in since
-            for each in archive.objects(flight)
+            for outcome in outcomes
+            if not outcome.done_utc
+            for each in archive.objects(outcome.flight)
             if each.thing.label == PERSON
         ]
         place = archive.site()
     for feature in objects_geojson(people, place, crops_from_site=True)["features"]:
         journal.add(PERSON_FOUND, {"feature": feature, "is_local": place.is_local})
-    headlines = [(each.get("comparison") or each).get("headline") or {} for each in reports]
-    texts = [str(each.get("text") or "") for each in headlines]
-    headline, are_good = "; ".join(filter(None, texts)), all(map(is_good, headlines))
-    return Done(headline or "finished", "".join(flights[-1:]), are_good)
+    texts = "; ".join(filter(None, (each.headline for each in outcomes)))
+    flight = outcomes[-1].flight if outcomes else ""
+    return Done(texts or "finished", flight, all(each.trusted for each in outcomes))
 
 
 # ---- what happens on the way ------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sorvolo.capture.decoding import PHOTO_SUFFIXES
+from sorvolo.capture.decoding import PHOTO_SUFFIXES, is_same_shape, other_size
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.segments import FlightSoFar
 from sorvolo.capture.live.telemetry_log import TelemetryLog
@@ -22,7 +22,6 @@ from sorvolo.capture.photo_metadata import (
     read_photo_metadata,
 )
 from sorvolo.capture.photos import read_picture
-from sorvolo.capture.picture_sizes import is_same_shape, other_size
 from sorvolo.capture.sync import FIX_DELAY_S, PHOTO_TIE
 from sorvolo.capture.telemetry.cleaning import notice
 from sorvolo.errors import InputError

@@ -16,6 +16,7 @@ from typing import Any
 import av
 import numpy as np
 
+from sorvolo.capture.decoding import is_same_shape, other_size
 from sorvolo.capture.live.addresses import StreamAddress
 from sorvolo.capture.live.growing import GrowingFile
 from sorvolo.capture.live.klv import LocalSet
@@ -31,7 +32,6 @@ from sorvolo.capture.live.reader import StreamFacts, StreamReader
 from sorvolo.capture.live.reconnect import LiveSettings, Outages
 from sorvolo.capture.live.segments import FlightSoFar, segment_notices
 from sorvolo.capture.live.telemetry_log import TelemetryLog
-from sorvolo.capture.picture_sizes import is_same_shape, other_size
 from sorvolo.capture.sync import DATED_NS
 from sorvolo.capture.telemetry.cleaning import notice
 from sorvolo.capture.telemetry.nmea import Epoch

@@ -24,7 +24,7 @@ from sorvolo.missions.flight.headline import contradicts_itself
 from sorvolo.missions.flight.known_camera import known_camera
 from sorvolo.missions.flight.map_objects import check_classes, open_detector
 from sorvolo.missions.flight.opened import OpenedFlight, opened_flights
-from sorvolo.missions.flight.request import AlreadyDone
+from sorvolo.missions.flight.request import outcome_of
 from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import (
@@ -36,6 +36,7 @@ from sorvolo.missions.flight.setup import (
 )
 from sorvolo.missions.flight.threads import read_ahead
 from sorvolo.missions.heights.measure import damaged_heights, heights_stamp, own_heights_stamp
+from sorvolo.missions.mission import FlightOutcome, mission
 from sorvolo.mosaic.selection import StretchSelection, every
 from sorvolo.paths import AnyPath, Inputs, as_path, as_text, listed
 from sorvolo.registration.lens import single_threaded_opencv
@@ -49,6 +50,7 @@ _AHEAD = 2  # frames that are compared while the evidence of one is gathered: a 
 _DECODED = 1  # frames of a video that wait to be compared
 
 
+@mission
 def compare_flights(
     inputs: Inputs,
     site: AnyPath,
@@ -62,7 +64,7 @@ def compare_flights(
     live: LiveSettings = LiveSettings(keeps_all=True),
     until: threading.Event | None = None,
     again: bool = False,
-) -> Generator[CompareUpdate, None, tuple[AlreadyDone, ...]]:
+) -> Generator[CompareUpdate, None, tuple[FlightOutcome, ...]]:
     """Compare one or more later flights with the map in the site folder, yielding an update for each frame compared.
 
     `inputs`, `telemetry`, `camera`, `area`, `detector`, `live` and `until` are those of `map_flights`. An update
@@ -70,9 +72,9 @@ def compare_flights(
     folder for the intermediate pictures of another method than the robust one. The flights' findings and the new version
     of the map are part of the site when a flight's last update was yielded.
     A run that was killed continues when the same is asked for again.
-    A flight that was compared already, as it is asked for, is left out and returned, unless `again` is given.
-    Raises InputError, SettingsError or StoreError with what to do; the site then stays as it was. Close the generator
-    to stop early: the flight that is being compared is left out, those before it are in.
+    A flight that was compared already, as it is asked for, is not compared again, unless `again` is given.
+    Raises InputError, SettingsError or StoreError with what to do; the site then stays as it was. `cancel()` stops early:
+    the flight that is being compared is left out, those before it are in.
     """
     inputs = listed(inputs)
     site = Path(site)
@@ -102,7 +104,7 @@ def compare_flights(
         better_camera=lambda guess: known_camera(guess, archive),
     )
     with Archive.open(site, write=True) as archive, opened as sources, single_threaded_opencv():
-        known = []
+        outcomes: list[FlightOutcome] = []
 
         def asked(source: Source) -> tuple[Any, ...]:
             base, _ = _base_version(archive, source)
@@ -125,14 +127,15 @@ def compare_flights(
         for flight in opened_flights(
             sources, archive, asked, prepared, most_gap_s=live.same_flight_s, again=again
         ):
-            if isinstance(flight, AlreadyDone):
-                known.append(flight)
+            if isinstance(flight, FlightOutcome):
+                outcomes.append(flight)
                 continue
             base, is_newest = _base_version(archive, flight.setup.source)
             # what later flights painted stays
             own = settings if is_newest else replace(settings, updates_map=False)
             yield from _compare_one(flight, archive, own, wanted, steps, looks, base)
-        return tuple(known)
+            outcomes.append(outcome_of(archive, flight.setup.source.name))
+        return tuple(outcomes)
 
 
 def _reviews(archive: Archive) -> list[tuple[str, str]]:

@@ -292,11 +292,6 @@ def with_objects(report: Mapping[str, Any], headline: Mapping[str, Any]) -> dict
     return {**headline, "text": text, "complete": found["complete"]}
 
 
-def is_good(headline: Mapping[str, Any]) -> bool:
-    """Whether a map or a comparison needs no check, by its headline: exit code 0, else 3."""
-    return headline.get("quality") in ("map", "compared") and bool(headline.get("complete", True))
-
-
 def why_not_searched(model: str) -> str:
     """Why nothing was searched for objects, in words."""
     if model == NO_MODEL:

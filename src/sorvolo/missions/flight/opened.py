@@ -5,9 +5,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from sorvolo.capture.source import Source
-from sorvolo.missions.flight.request import AlreadyDone, already_done, request_of
+from sorvolo.missions.flight.request import already_done, request_of
 from sorvolo.missions.flight.result_cache import ResultCache, cache_of_run, go_on_live
 from sorvolo.missions.flight.setup import FlightSetup
+from sorvolo.missions.mission import FlightOutcome
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.flight import Notice
 
@@ -38,7 +39,7 @@ def opened_flights(
     *,
     most_gap_s: float,
     again: bool,
-) -> Iterator[OpenedFlight | AlreadyDone]:
+) -> Iterator[OpenedFlight | FlightOutcome]:
     """Lay one flight after the other into the site; without `again`, those that the site has as asked for are named.
 
     `asked` is what a flight's result depends on besides itself: the settings, the area, the detector, and more (see

@@ -1,7 +1,6 @@
 """What is asked for of a flight, as one number: by it a site knows what it has, and a run what it goes on with."""
 
 import platform
-from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from sorvolo.capture.video import VideoSource
 from sorvolo.missions.flight.control import FlightControl
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.setup import FlightSetup
+from sorvolo.missions.mission import FlightOutcome
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.journal import content_sha256
 from sorvolo.survey.area import Area
@@ -30,14 +30,6 @@ def software(*libraries: str) -> dict[str, str]:
 
 REQUEST = "request"
 """Of a run's settings in the catalogue: what was asked for."""
-
-
-@dataclass(frozen=True)
-class AlreadyDone:
-    """A flight that the site has, as it was asked for, and when it was made part of it: ISO 8601 UTC."""
-
-    flight: str
-    done_utc: str
 
 
 def request_of(
@@ -90,13 +82,19 @@ def live_request(
     )
 
 
-def already_done(archive: Archive, setup: FlightSetup, request: str) -> AlreadyDone | None:
+def outcome_of(archive: Archive, flight: str, done_utc: str = "") -> FlightOutcome:
+    """What a site has of a flight."""
+    folder, more = archive.flight_folder(flight), archive.folder.glob("mosaic.*")
+    return FlightOutcome.of(folder, archive.report(flight), more, done_utc)
+
+
+def already_done(archive: Archive, setup: FlightSetup, request: str) -> FlightOutcome | None:
     """The flight as the site has it, if that is what is asked for; a live flight is another each time."""
     if isinstance(setup.source, LiveSource):
         return None
     return next(
         (
-            AlreadyDone(each.id, each.finished_utc)
+            outcome_of(archive, each.id, each.finished_utc)
             for each in archive.complete_flights
             if each.id == setup.source.name and each.settings.get(REQUEST) == request
         ),

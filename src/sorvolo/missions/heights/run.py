@@ -28,6 +28,7 @@ from sorvolo.heights.terrain import terrain
 from sorvolo.heights.views import View, fix_from_residual, ground_outlines_m, pixels_wide
 from sorvolo.missions.flight.headline import contradicts_itself
 from sorvolo.missions.flight.report import peak_memory_mb
+from sorvolo.missions.mission import FlightOutcome, mission
 from sorvolo.mosaic.exposure import corrected
 from sorvolo.paths import AnyPath
 from sorvolo.registration.features import gray_from_rgb
@@ -193,13 +194,14 @@ class GroundModel:
     seconds: Mapping[str, float]
 
 
+@mission
 def make_heights(
     site: AnyPath,
     cell_m: float | None = None,
     *,
     flight: str | None = None,
     catalogues: Catalogues | None = None,
-) -> Generator[HeightsUpdate]:
+) -> Generator[HeightsUpdate, None, FlightOutcome]:
     """Make the heights of one mapped flight (None: the newest) as files in its folder, yielding progress.
 
     `cell_m` is the side of the height model's cells (None: by the photos' pixels), `catalogues` has the site's (None:
@@ -228,7 +230,7 @@ def make_heights(
                     tiles.save(index, rgba)
                     yield HeightsUpdate(flight_id, "orthophoto", share)
                 write_cog(tiles, archive.site_grid(), folder / HeightFile.ORTHOPHOTO)
-            write_heights(
+            report = write_heights(
                 archive,
                 model,
                 folder,
@@ -238,6 +240,17 @@ def make_heights(
                 seconds=time.monotonic() - started_s,
             )
         yield HeightsUpdate(flight_id, "done", 1.0)
+        cameras = report["cameras"]
+        return FlightOutcome(
+            flight_id,
+            folder,
+            "",
+            not report["contradicts_itself"],
+            {"views": cameras["views"]},
+            cameras["residual_rms_px"],
+            tuple(report["warnings"]),
+            {file.value: folder / file for file in HeightFile},
+        )
 
 
 def model_ground(
@@ -346,8 +359,8 @@ def write_heights(
     run: str,
     mapped: Mapping[str, Any],
     seconds: float,
-) -> None:
-    """Write heights.tif, terrain.tif, heights.png and heights.json of a ground into a folder.
+) -> dict[str, Any]:
+    """Write heights.tif, terrain.tif, heights.png and heights.json, which is returned, of a ground into a folder.
 
     `run` is the mapping run that it is of, `mapped` that one's report.json, `seconds` what all of it took.
     """
@@ -387,6 +400,7 @@ def write_heights(
         "peak_memory_mb": peak_memory_mb(),
     }
     atomic_write_bytes(folder / HeightFile.REPORT, json_bytes(report))
+    return report
 
 
 def ground_tiles(

@@ -23,7 +23,7 @@ from sorvolo.missions.flight.disk import LiveRoom, check_room
 from sorvolo.missions.flight.headline import OBLIQUE_DEG
 from sorvolo.missions.flight.map_objects import ObjectFinder, open_detector
 from sorvolo.missions.flight.opened import OpenedFlight, opened_flights
-from sorvolo.missions.flight.request import AlreadyDone
+from sorvolo.missions.flight.request import outcome_of
 from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.flight.sample_frames import refuse_without_texture
 from sorvolo.missions.flight.settings import MapSettings
@@ -39,6 +39,7 @@ from sorvolo.missions.flight.setup import (
 from sorvolo.missions.flight.threads import read_ahead
 from sorvolo.missions.map.coverage import FlightCoverage
 from sorvolo.missions.map.planar_run import FlightRun, PlanarRun
+from sorvolo.missions.mission import FlightOutcome, mission
 from sorvolo.mosaic.control import ControlSettings
 from sorvolo.mosaic.selection import (
     Selected,
@@ -63,6 +64,7 @@ _AHEAD = 2  # decoded frames that wait to be placed
 _FEW = 8  # selected frames after which a recorded flight is given up that cannot become a map; by choice
 
 
+@mission
 def map_flights(
     inputs: Inputs,
     site: AnyPath,
@@ -80,7 +82,7 @@ def map_flights(
     refly: Inputs = (),
     catalogues: Catalogues | None = None,
     search: "SearchWhileFlying | None" = None,
-) -> Generator[MosaicUpdate, None, tuple[AlreadyDone, ...]]:
+) -> Generator[MosaicUpdate, None, tuple[FlightOutcome, ...]]:
     """Map one or more flights into the site folder, yielding an update for each selected frame.
 
     `inputs` are videos, folders of photos, photos, or live sources (see `open_sources`); `telemetry` a file of the
@@ -91,12 +93,12 @@ def map_flights(
     flight is read, by the settings `live`, until it ends or `until` is set; then its map is finished like any other's.
     Nothing of a flight is part of the site until its last update was yielded.
     A run that was killed continues when the same is asked for again. A flight that the site has already, by
-    the same files, settings and version of the program, is left out and returned, unless `again` is given.
+    the same files, settings and version of the program, is not mapped again, unless `again` is given.
     `catalogues` is where a new site's catalogue goes; None: where the environment has it.
     `refly` are files for waypoints over ground that the pictures leave out, kept up to date while the flight goes on.
     `search` measures a live flight's probability of detection meanwhile.
-    Raises InputError, SettingsError or StoreError with what to do; the site then stays as it was. Close the generator
-    to stop early: the flight that is being mapped is left out, those before it are in.
+    Raises InputError, SettingsError or StoreError with what to do; the site then stays as it was. `cancel()` stops
+    early: the flight that is being mapped is left out, those before it are in.
     """
     inputs = listed(inputs)
     site = Path(site)
@@ -118,7 +120,7 @@ def map_flights(
     opened = opened_sources(
         inputs, telemetry, camera, known_flights(site, catalogues), live=live, until=until
     )
-    known = []
+    outcomes: list[FlightOutcome] = []
     with opened as sources, Archive.open(site, write=True, catalogues=catalogues) as archive:
         ground = _known_ground(control, base, sources, settings)
 
@@ -141,15 +143,16 @@ def map_flights(
             most_gap_s=live.same_flight_s,
             again=again,
         ):
-            if isinstance(flight, AlreadyDone):
-                known.append(flight)
+            if isinstance(flight, FlightOutcome):
+                outcomes.append(flight)
                 continue
             coverage = FlightCoverage(
                 flight.setup, archive, wanted, waypoint_files, settings.live_s
             )
             measuring = search if isinstance(flight.setup.source, LiveSource) else None
             yield from _map_one(flight, archive, settings, wanted, looks, coverage, measuring)
-    return tuple(known)
+            outcomes.append(outcome_of(archive, flight.setup.source.name))
+    return tuple(outcomes)
 
 
 def _known_ground(

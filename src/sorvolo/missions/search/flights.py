@@ -6,6 +6,7 @@ from typing import Any
 
 from sorvolo.errors import InputError
 from sorvolo.missions.flight.detector_protocol import FindsObjects
+from sorvolo.missions.mission import mission
 from sorvolo.missions.search.earlier import Basis, read_plants, write_plants
 from sorvolo.missions.search.measure import (
     MeasuredFlight,
@@ -31,13 +32,14 @@ from sorvolo.store.atomic import make_folder
 from sorvolo.store.site.archive import Archive
 
 
+@mission
 def search_site(
     site_folder: AnyPath,
     settings: SearchSettings,
     outputs: SearchOutputs,
     detector: FindsObjects | None = None,
-) -> Generator[SearchProgress | dict[str, Any]]:
-    """Measure the flights of a site, yielding progress and, at last, the report; files appear in `outputs.folder`.
+) -> Generator[SearchProgress, None, dict[str, Any]]:
+    """Measure the flights of a site, yielding progress. The result is search.json; files appear in `outputs.folder`.
 
     The probability that a person, or a car, who lay anywhere in the area would have been reported is learnt from ones
     drawn into the flights' own frames. Raises InputError for a site without metres or flights, and for a model that is
@@ -65,7 +67,7 @@ def search_site(
             {name: tuple(own) for name, own in frames.items()},
             prepared.segments,
         )
-        yield write_search(
+        return write_search(
             searched, archive.tiles(), archive.site_grid(), settings, outputs, prepared.detector
         )
 

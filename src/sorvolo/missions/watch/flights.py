@@ -1,5 +1,6 @@
 """Mode 2: people, cars and small objects found while the drone flies, or in what it brought home; no map is needed."""
 
+import json
 import threading
 import time
 import warnings
@@ -28,6 +29,7 @@ from sorvolo.missions.flight.result_cache import ResultCache, go_on
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup, prepare
 from sorvolo.missions.flight.threads import read_ahead
+from sorvolo.missions.mission import FlightOutcome, mission
 from sorvolo.missions.watch.cot_sender import check_host, cot_place
 from sorvolo.missions.watch.places import Places, over_heights, places_of
 from sorvolo.missions.watch.run import EarlyFound, WatchRun, WatchUpdate, utc_ns
@@ -45,6 +47,7 @@ _AHEAD = 4  # decoded frames that wait for the detector
 _STOPPED = "stopped on demand"
 
 
+@mission
 def watch(
     source: Inputs,
     settings: WatchSettings = WatchSettings(),
@@ -57,7 +60,7 @@ def watch(
     until: threading.Event | None = None,
     moved: Callable[[PictureStep], None] | None = None,
     early: Callable[[EarlyFound], None] | None = None,
-) -> Generator[WatchUpdate]:
+) -> Generator[WatchUpdate, None, tuple[FlightOutcome, ...]]:
     """Search a flight, yielding an update for each frame searched.
 
     `source`, `telemetry` and `camera` are those of `map_flights`; a folder of several videos is watched one after
@@ -74,8 +77,8 @@ def watch(
     A watch that was killed goes on where it was when the same is asked for again, with a live stream within
     `live.same_flight_s`: what was found is not searched for again, and alerts that were sent are not sent again.
 
-    Set `until` to end a live flight, whose rest is then searched, or a recorded one at once; close the generator, or
-    press Ctrl-C, to end at once: all that was found until then is written. Raises
+    Set `until` to end a live flight, whose rest is then searched, or a recorded one at once; `cancel()`, or
+    Ctrl-C, ends at once: all that was found until then is written. Raises
     InputError, SettingsError or StoreError with what to do.
     """
     telemetry = as_text(telemetry)
@@ -87,13 +90,14 @@ def watch(
         for each in sources:
             if isinstance(each, LiveSource):
                 stack.callback(each.close)
+        outcomes: list[FlightOutcome] = []
         for each in sources:
             if until.is_set():
-                return
+                break
             is_live = isinstance(each, LiveSource)
             stopped = _stopped_watch(each, settings, outputs, finder, live.same_flight_s)
             folder = stopped or _folder_of(each, outputs, is_only=len(sources) == 1)
-            yield from _watch_one(
+            outcome = yield from _watch_one(
                 each,
                 settings,
                 replace(outputs, folder=folder),
@@ -104,6 +108,8 @@ def watch(
                 goes_on=stopped is not None,
                 telemetry_named=telemetry is not None,
             )
+            outcomes.append(outcome)
+        return tuple(outcomes)
 
 
 def _stopped_watch(
@@ -181,7 +187,7 @@ def _watch_one(
     *,
     goes_on: bool,
     telemetry_named: bool,
-) -> Generator[WatchUpdate]:
+) -> Generator[WatchUpdate, None, FlightOutcome]:
     folder, is_live = outputs.folder, isinstance(source, LiveSource)
     assert folder is not None
     setup, ground = _prepared(source, settings, telemetry_named=telemetry_named)
@@ -234,6 +240,7 @@ def _watch_one(
             raise InputError(
                 f"no frame of {source.name} could be searched: {reason}; see `sorvolo inspect`"
             )
+    return FlightOutcome.of(folder, json.loads((folder / "report.json").read_bytes()))
 
 
 class _Passed:
