@@ -2,6 +2,7 @@
 
 from sorvolo.capture.areas import read_area as read_area
 from sorvolo.capture.live.reconnect import LiveSettings as LiveSettings
+from sorvolo.capture.source import frames as frames
 from sorvolo.change.compare import Comparison as Comparison
 from sorvolo.change.compare import compare_images as compare_images
 from sorvolo.change.robust import RobustSettings as RobustSettings

@@ -1,8 +1,10 @@
-"""Which program made a result: its version, and a hash of its code, which an update always changes."""
+"""Which program made a result: its version, a hash of its code, which an update always changes, and what is added."""
 
 import hashlib
 from functools import cache
+from importlib.metadata import entry_points
 from pathlib import Path
+from typing import Any
 
 VERSION = "0.1.0"
 """The one place of the version: a release raises it here."""
@@ -21,3 +23,23 @@ def build() -> str:
     for path in sorted(each for each in package.rglob("*") if each.suffix in _CODE):
         digest.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes())
     return f"{VERSION}+{digest.hexdigest()[:8]}"
+
+
+@cache
+def added(group: str, name: str = "") -> dict[str, Any]:
+    """What installed packages add in the group of entry points `sorvolo.<group>`, by name: all, or that of a `name`.
+
+    Raises ImportError for what cannot be loaded.
+    """
+    found = {}
+    for each in entry_points(group=f"sorvolo.{group}"):
+        if name not in ("", each.name):
+            continue
+        try:
+            found[each.name] = each.load()
+        except Exception as error:
+            raise ImportError(
+                f"{each.value}, which an installed package adds to sorvolo.{group}, cannot be loaded: {error}; mend or "
+                "remove that package"
+            ) from error
+    return found

@@ -3,18 +3,27 @@
 import os
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TypeAlias, overload
+from typing import Any, Protocol, TypeAlias, overload
 
 AnyPath: TypeAlias = str | os.PathLike[str]
-Inputs: TypeAlias = AnyPath | Iterable[AnyPath]
+
+
+class GivenFlight(Protocol):
+    """A flight that is an object already, such as `sorvolo.frames` makes."""
+
+    @property
+    def fingerprint(self) -> str:
+        """The same for the same flight."""
+
+
+Inputs: TypeAlias = AnyPath | GivenFlight | Iterable[AnyPath | GivenFlight]
 """One input or several; a text is one input, never a row of letters."""
 
 
-def listed(given: Inputs) -> list[str]:
-    """The inputs as texts: files, folders, or addresses of live sources."""
-    if isinstance(given, str | os.PathLike):
-        return [os.fspath(given)]
-    return [os.fspath(each) for each in given]
+def listed(given: Inputs) -> list[Any]:
+    """The inputs: files, folders, or addresses of live sources as texts, and flights as they are."""
+    several = [given] if isinstance(given, str) or not isinstance(given, Iterable) else given
+    return [os.fspath(each) if isinstance(each, str | os.PathLike) else each for each in several]
 
 
 @overload

@@ -9,7 +9,7 @@ import sorvolo
 from small_flights import simulate_into, small_flight
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import ImageRGB
-from sorvolo.missions.flight.detector_protocol import as_detector, load_detector
+from sorvolo.missions.flight.detector_protocol import as_detector
 from sorvolo.survey.objects import Detections
 
 
@@ -53,24 +53,6 @@ def test_what_a_detector_must_give() -> None:
         as_detector(Wrong())
     with pytest.raises(SettingsError, match="found 'fox', but names deer"):
         as_detector(Surprising()).detect(picture)
-
-
-def test_another_package_brings_a_detector_by_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    package = tmp_path / "herd-1.0.dist-info"
-    package.mkdir()
-    (package / "METADATA").write_text("Metadata-Version: 2.1\nName: herd\nVersion: 1.0\n")
-    (package / "entry_points.txt").write_text("[sorvolo.detectors]\nherd = herd_plugin:Herd\n")
-    (tmp_path / "herd_plugin.py").write_text(
-        "import numpy as np\nfrom sorvolo import Detections\n\n\nclass Herd:\n    version = '1'\n\n"
-        "    def detect(self, image):\n"
-        "        return Detections(np.zeros((0, 4)), np.zeros(0), np.zeros(0, int), ('cow',))\n"
-    )
-    monkeypatch.syspath_prepend(tmp_path)
-    detector = load_detector("herd")
-    assert (detector.classes, detector.info.name, detector.info.version) == (("cow",), "Herd", "1")
-    assert load_detector("default").info.name == "default"
 
 
 def test_supervision_gives_back_what_it_was_given() -> None:

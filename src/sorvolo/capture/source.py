@@ -1,17 +1,20 @@
 """Inputs as flights: what a mission receives for each video, folder of photos or set of photos."""
 
 import hashlib
+import os
 import re
 import threading
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
+from sorvolo.build import added
 from sorvolo.capture.calibration import camera_from_option, guess_camera, stated_camera
 from sorvolo.capture.decoding import PHOTO_SUFFIXES
 from sorvolo.capture.live.addresses import (
@@ -43,7 +46,9 @@ from sorvolo.capture.telemetry.gpmf import read_gpmf_file
 from sorvolo.capture.video import VIDEO_SUFFIXES, VideoInfo, VideoSource, read_video_info
 from sorvolo.capture.video_stream import ONE_FILE
 from sorvolo.errors import InputError
+from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.camera import Camera
+from sorvolo.paths import AnyPath
 from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry, no_telemetry
 
 _HEAD_BYTES = 262_144  # of a file, by which a flight is recognised again; by choice
@@ -132,7 +137,10 @@ def open_sources(
     or of `camera`.
     Raises InputError for what cannot be read, naming the file and what to do.
     """
-    if not inputs:
+    flights_of = {each: _given(each) for each in inputs}
+    given = [flight for flight in flights_of.values() if flight is not None]
+    inputs = [each for each, flight in flights_of.items() if flight is None]
+    if not inputs and not given:
         raise InputError(
             "no input; give a video file, a folder of photos, photos, or a live stream's address"
         )
@@ -142,14 +150,15 @@ def open_sources(
         [*(each.chapters[0].resolve() for each in videos), *(album.place for album in albums)]
     )
     # Raises InputError where telemetry was given for more than one flight.
-    flights = len(names) + len(addresses)
+    flights = len(names) + len(addresses) + len(given)
     if telemetry is not None and flights > 1:
         raise InputError(
             f"one telemetry file for {flights} flights; map the flights one by one, or put each telemetry file beside "
             "its video under the same name"
         )
     log = _telemetry_file(telemetry, is_live=bool(addresses))
-    sources: list[VideoSource | PhotoSource | LiveSource] = [
+    sources: list[VideoSource | PhotoSource | LiveSource | GivenFrames] = [
+        *given,
         *(_open_recording(each, name, log, camera) for each, name in zip(videos, names)),
         *(
             _open_photos(album, name, log, camera)
@@ -165,6 +174,91 @@ def open_sources(
         for each in sources:
             each.camera = better_camera(each.camera)
     return list(sources)
+
+
+def _given(one: Any) -> "GivenFrames | None":
+    """The flight that an input is, or that a package reads from its address "NAME:REST"."""
+    if isinstance(one, GivenFrames):
+        return one
+    name, colon, rest = str(one).partition(":")
+    if not colon or Path(str(one)).exists():
+        return None
+    readers = added("sources", name)
+    return readers[name](rest) if readers else None
+
+
+class GivenFrames:
+    """A flight of pictures that a program gives; fulfils `Source`. Made by `frames`."""
+
+    kind = "video"
+    inputs = ()
+    start_origin = "the given frames' times"
+    ground_elevation_m = float("nan")
+
+    def __init__(
+        self,
+        name: str,
+        pictures: Sequence[tuple[int, ImageRGB]],
+        camera: CameraModel,
+        telemetry: Telemetry,
+    ) -> None:
+        self.name, self._pictures = name, pictures
+        self.camera, self.telemetry = camera, telemetry
+        self.frame_count, self.start_ns = len(pictures), pictures[0][0]
+        last_ns = pictures[-1][0]
+        self.frame_rate_hz = 1e9 * (len(pictures) - 1) / max(1, last_ns - self.start_ns)
+        digest = hashlib.sha256()
+        for time_ns, image in pictures:
+            digest.update(time_ns.to_bytes(8, "little", signed=True) + image.tobytes())
+        self.fingerprint = digest.hexdigest()
+
+    def notices(self) -> tuple[Notice, ...]:
+        """None: whatever was lost, was lost before."""
+        return ()
+
+    def frames(self, wanted: Callable[[int, int], bool]) -> Iterator[Frame | LostFrame]:
+        """See `Source.frames`."""
+        for index, (time_ns, image) in enumerate(self._pictures):
+            if wanted(index, time_ns):
+                yield Frame(index, str(index), time_ns, image)
+
+
+def frames(
+    pictures: Iterable[tuple[int, ImageRGB]],
+    *,
+    camera: AnyPath | CameraModel | None = None,
+    telemetry: AnyPath | Telemetry | None = None,
+    name: str = "frames",
+) -> GivenFrames:
+    """A flight of pictures in memory, to be given in place of a file: each with its time, UTC in nanoseconds.
+
+    Pictures are RGB uint8 (H, W, 3) of one size, in order of time; all are kept until the flight is done with. `camera`
+    is what `map_flights` takes, or a CameraModel; `telemetry` a file, or a Telemetry. Raises InputError.
+
+    Example: `map_flights(frames([(time_ns, image), ...], camera="aov=78.8", telemetry="log.csv"), "site")`
+    """
+    kept = [(int(time_ns), np.ascontiguousarray(image)) for time_ns, image in pictures]
+    sizes = {image.shape for _, image in kept}
+    if any(each.dtype != np.uint8 for _, each in kept) or {(*s[:2], 3) for s in sizes} != sizes:
+        raise InputError(f"{name}: the frames are no RGB pictures: give uint8 (height, width, 3)")
+    if len(kept) < 2 or len(sizes) > 1:
+        raise InputError(
+            f"{name}: {len(kept)} frames of {len(sizes)} sizes; give two or more, of one size"
+        )
+    if any(after[0] <= before[0] for before, after in pairwise(kept)):
+        raise InputError(f"{name}: the frames' times do not increase; give each its own, in order")
+    height, width = kept[0][1].shape[:2]
+    if not isinstance(camera, CameraModel):
+        camera = (
+            _unknown_camera(width, height)
+            if camera is None
+            else camera_from_option(os.fspath(camera), width, height)
+        )
+    if telemetry is None:
+        telemetry = no_telemetry()
+    elif not isinstance(telemetry, Telemetry):
+        telemetry = read_telemetry(Path(telemetry))
+    return GivenFrames(name, kept, camera, telemetry)
 
 
 def _recorded(inputs: Sequence[Path | str]) -> list[Path]:
@@ -294,7 +388,8 @@ def _distinct_names(places: Sequence[Path]) -> list[str]:
 
 
 def _give_names(
-    sources: Sequence["VideoSource | PhotoSource | LiveSource"], known: Mapping[str, str]
+    sources: Sequence["VideoSource | PhotoSource | LiveSource | GivenFrames"],
+    known: Mapping[str, str],
 ) -> None:
     """Names that are safe as folders and no other flight has, by their fingerprints."""
     taken = dict(known)

@@ -187,6 +187,8 @@ def _words_of(error: Exception) -> str:
     """What happened and what to do, in one line."""
     if isinstance(error, SorvoloError):
         return str(error)
+    if isinstance(error, ImportError):
+        return f"{error}; a package is missing or broken"
     if isinstance(error, OSError) and error.errno in FULL:
         where = f" while writing {error.filename}" if error.filename else ""
         return f"the disk is full{where}; free some space and run the same command again"

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
 
+from sorvolo.build import added
 from sorvolo.capture.telemetry import dji_srt, flight_table, gpx, nmea
 from sorvolo.capture.telemetry.autopilot_logs import AUTOPILOT_READERS
 from sorvolo.capture.telemetry.mcap_log import McapReader
@@ -66,7 +67,7 @@ TELEMETRY_READERS: dict[str, Reader] = {
     "table": flight_table,
     "nmea": nmea,
 }
-"""Every format that is read, by the name that `Telemetry.format` carries."""
+"""Every format that is read, by the name that `Telemetry.format` carries; packages add to `sorvolo.telemetry`."""
 
 
 def read_telemetry(path: Path) -> Telemetry:
@@ -88,7 +89,7 @@ def read_telemetry(path: Path) -> Telemetry:
             "Longitude columns (DatCon, Airdata, DJI logs as .csv), NMEA 0183 with GGA or RMC sentences, logs of PX4 "
             "(.ulg) and ArduPilot (.bin, .tlog), and fixes in MCAP recordings"
         )
-    return TELEMETRY_READERS[reader].read(data, str(path))
+    return reader.read(data, str(path))
 
 
 def is_telemetry(path: Path) -> bool:
@@ -194,10 +195,9 @@ def _bytes_of(path: Path) -> bytes:
     return data
 
 
-def _reader_for(head: bytes) -> str | None:
-    return next(
-        (name for name, reader in TELEMETRY_READERS.items() if reader.recognises(head)), None
-    )
+def _reader_for(head: bytes) -> Reader | None:
+    readers = (*added("telemetry").values(), *TELEMETRY_READERS.values())
+    return next((each for each in readers if each.recognises(head)), None)
 
 
 def _unknown(data: bytes) -> str:

@@ -23,8 +23,7 @@ from sorvolo.missions.flight.disk import check_room
 from sorvolo.missions.flight.headline import contradicts_itself
 from sorvolo.missions.flight.known_camera import known_camera
 from sorvolo.missions.flight.map_objects import check_classes, open_detector
-from sorvolo.missions.flight.opened import OpenedFlight, opened_flights
-from sorvolo.missions.flight.request import outcome_of
+from sorvolo.missions.flight.opened import OpenedFlight, opened_flights, outcome_of
 from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import (

@@ -1,21 +1,18 @@
 """What missions ask of a detector, and how a stranger's own becomes one: by a single method, `detect`."""
 
 from collections.abc import Mapping, Sequence
-from importlib.metadata import entry_points
 from typing import Literal, Protocol, cast
 from uuid import uuid4
 
 import numpy as np
 
+from sorvolo.build import added
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.detector import Detector
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.survey.flight import Notice
 from sorvolo.survey.objects import Detections, Early
-
-PLUGINS = "sorvolo.detectors"
-"""The group of entry points that name installed detectors: each is called without arguments and gives one."""
 
 _BEST_PX = (8.0, 1e4)  # longer sides that a stranger's detector may find: nothing is known of it
 
@@ -159,10 +156,9 @@ def as_detector(given: FindsObjects) -> ObjectDetector:
 
 
 def load_detector(name: str) -> ObjectDetector:
-    """An installed model, a model file, or a detector that another package brings (`PLUGINS`).
+    """An installed model, a model file, or a detector that another package adds to `sorvolo.detectors`.
 
     Raises InputError for what is not there or cannot be used.
     """
-    for plugin in entry_points(group=PLUGINS, name=name):
-        return as_detector(plugin.load()())
-    return Detector.load(name)
+    brought = added("detectors", name)
+    return as_detector(brought[name]()) if brought else Detector.load(name)

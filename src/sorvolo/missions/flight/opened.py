@@ -1,10 +1,13 @@
 """The beginning that all missions over a site share: a flight is laid into the site, unless that was done already."""
 
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
+from sorvolo.build import added
 from sorvolo.capture.source import Source
+from sorvolo.errors import SorvoloWarning
 from sorvolo.missions.flight.request import already_done, request_of
 from sorvolo.missions.flight.result_cache import ResultCache, cache_of_run, go_on_live
 from sorvolo.missions.flight.setup import FlightSetup
@@ -52,7 +55,20 @@ def opened_flights(
         setup = prepared(source)
         request = request_of(setup, *wanted)
         done = already_done(archive, setup, request)
-        if done is not None and not again:
-            yield done
+        if done and not again:
+            yield outcome_of(archive, source.name, done)
         else:
-            yield OpenedFlight(setup, request, anew=again and done is None)
+            yield OpenedFlight(setup, request, anew=again and not done)
+
+
+def outcome_of(archive: Archive, flight: str, done_utc: str = "") -> FlightOutcome:
+    """What a site has of a flight. One that is new to it is given to the exports that packages add."""
+    folder = archive.flight_folder(flight)
+    for name, export in ({} if done_utc else added("exports")).items():
+        try:
+            export(archive.folder, flight)
+        except Exception as error:  # the flight is in the site, whatever others make of it
+            text = f"the export {name!r} of {flight} failed: {type(error).__name__}: {error}"
+            warnings.warn(text, SorvoloWarning, stacklevel=2)
+    more = archive.folder.glob("mosaic.*")
+    return FlightOutcome.of(folder, archive.report(flight), more, done_utc)

@@ -12,7 +12,6 @@ from sorvolo.capture.video import VideoSource
 from sorvolo.missions.flight.control import FlightControl
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.setup import FlightSetup
-from sorvolo.missions.mission import FlightOutcome
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.journal import content_sha256
 from sorvolo.survey.area import Area
@@ -82,23 +81,17 @@ def live_request(
     )
 
 
-def outcome_of(archive: Archive, flight: str, done_utc: str = "") -> FlightOutcome:
-    """What a site has of a flight."""
-    folder, more = archive.flight_folder(flight), archive.folder.glob("mosaic.*")
-    return FlightOutcome.of(folder, archive.report(flight), more, done_utc)
-
-
-def already_done(archive: Archive, setup: FlightSetup, request: str) -> FlightOutcome | None:
-    """The flight as the site has it, if that is what is asked for; a live flight is another each time."""
+def already_done(archive: Archive, setup: FlightSetup, request: str) -> str:
+    """When the site got the flight as it is asked for, ISO 8601 UTC, else ""; a live flight is another each time."""
     if isinstance(setup.source, LiveSource):
-        return None
+        return ""
     return next(
         (
-            outcome_of(archive, each.id, each.finished_utc)
+            each.finished_utc
             for each in archive.complete_flights
             if each.id == setup.source.name and each.settings.get(REQUEST) == request
         ),
-        None,
+        "",
     )
 
 

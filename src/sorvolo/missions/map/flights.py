@@ -22,8 +22,7 @@ from sorvolo.missions.flight.detector_protocol import FindsObjects, ObjectDetect
 from sorvolo.missions.flight.disk import LiveRoom, check_room
 from sorvolo.missions.flight.headline import OBLIQUE_DEG
 from sorvolo.missions.flight.map_objects import ObjectFinder, open_detector
-from sorvolo.missions.flight.opened import OpenedFlight, opened_flights
-from sorvolo.missions.flight.request import outcome_of
+from sorvolo.missions.flight.opened import OpenedFlight, opened_flights, outcome_of
 from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.flight.sample_frames import refuse_without_texture
 from sorvolo.missions.flight.settings import MapSettings
