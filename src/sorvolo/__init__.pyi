@@ -67,6 +67,7 @@ from sorvolo.missions.watch.flights import watch as watch
 from sorvolo.missions.watch.run import WatchUpdate as WatchUpdate
 from sorvolo.missions.watch.settings import WatchOutputs as WatchOutputs
 from sorvolo.missions.watch.settings import WatchSettings as WatchSettings
+from sorvolo.store.exports.plain import Features as Features
 from sorvolo.store.site.archive import Archive as Archive
 from sorvolo.store.site.change_records import StoredChange as StoredChange
 from sorvolo.survey.area import Area as Area

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, is_dataclass
 from datetime import UTC, datetime
 from enum import Enum
@@ -88,6 +88,27 @@ def feature_collection(
 def feature(geometry: Any, properties: Any, **own: Any) -> dict[str, Any]:
     """One feature of GeoJSON; `own` are further members, such as its id."""
     return {"type": "Feature", **own, "geometry": geometry, "properties": properties}
+
+
+class Features(list[dict[str, Any]]):
+    """Features of GeoJSON, which libraries that know `__geo_interface__` take as they are."""
+
+    def __init__(self, features: Iterable[dict[str, Any]] = (), *, is_local: bool = False) -> None:
+        super().__init__(features)
+        self._crs = None if is_local else "EPSG:4326"
+
+    @property
+    def __geo_interface__(self) -> dict[str, Any]:
+        """All of them as a FeatureCollection; pixels of its own map where the site is local."""
+        return {"type": "FeatureCollection", "features": list(self)}
+
+    def to_geodataframe(self) -> Any:
+        """The same as `geopandas.GeoDataFrame` (pip install "sorvolo[notebooks]")."""
+        import geopandas
+
+        if not self:
+            return geopandas.GeoDataFrame(geometry=[], crs=self._crs)
+        return geopandas.GeoDataFrame.from_features(self, crs=self._crs)
 
 
 def features_name(name: str, *, is_local: bool) -> str:

@@ -15,12 +15,21 @@ from typing import Any, Self, TypeVar
 from sqlalchemy import Connection
 
 from sorvolo.errors import InputError, NotFoundError, SettingsError, SorvoloWarning, StoreError
+from sorvolo.findings.importance import ordered
 from sorvolo.findings.register import MissionSighting, Register, SearchedDate
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.paths import AnyPath
 from sorvolo.store.exports.change_files import object_crops
-from sorvolo.store.exports.plain import features_name, plain_json
+from sorvolo.store.exports.places import place_deg
+from sorvolo.store.exports.plain import (
+    Features,
+    feature,
+    features_name,
+    plain_json,
+    rounded,
+    utc_text,
+)
 from sorvolo.store.images import image_from_jpeg
 from sorvolo.store.nofollow import MOST_BYTES, open_below, read_below, sha256_of
 from sorvolo.store.site import catalogue as records
@@ -210,7 +219,7 @@ class Archive:
 
     def changes(self, flight_id: str | None = None) -> list[StoredChange]:
         """The changes that complete runs found, by flight rank and number, with their verdicts; of one flight."""
-        return self.catalogue_rows(change_records.load_changes, flight_id)
+        return self.catalogue_rows(change_records.load_changes, self._known(flight_id))
 
     def reviews(self) -> list[StoredReview]:
         """All reviews of changes, oldest first, also of changes that were replaced since."""
@@ -223,7 +232,7 @@ class Archive:
 
     def objects(self, flight_id: str | None = None) -> list[StoredObject]:
         """The objects that complete runs found, by flight rank and number; of one flight."""
-        return self.catalogue_rows(change_records.load_objects, flight_id)
+        return self.catalogue_rows(change_records.load_objects, self._known(flight_id))
 
     def keep_under_trees(self, flight_id: str, found: Sequence[MapObject]) -> None:
         """Keep what a look below the crowns of a mapped flight found, in place of an earlier look's; the lists follow."""
@@ -245,6 +254,48 @@ class Archive:
         """What all missions of these flights found, each thing one finding; with what others saw and looked at, which
         the site does not keep."""
         return self.catalogue_rows(site_register, flights, others, their_looks)
+
+    def findings(self, flight_id: str | None = None) -> Features:
+        """Each thing on the ground that any mission found, once, as a point; of one flight, what that saw.
+
+        `gone` names the flight that looked there and did not find it, null where it still stands.
+        """
+        site, flight_id = self.site(), self._known(flight_id)
+        found = [
+            each
+            for each in ordered(self.register().findings)
+            if flight_id is None or flight_id in each.dates
+        ]
+        features = []
+        for each in found:
+            place = each.position_m.tolist() if site.is_local else place_deg(each.position_m, site)
+            features.append(
+                feature(
+                    {"type": "Point", "coordinates": [round(x, 8) for x in place]},
+                    {
+                        "id": each.id,
+                        "class": each.label,
+                        "score": rounded(each.newest.score, 4),
+                        "sigma_m": rounded(each.sigma_m, 3),
+                        "length_m": rounded(each.newest.length_m, 2),
+                        "flights": list(each.dates),
+                        "gone": each.gone or None,
+                        "first_seen": utc_text(each.first_ns),
+                        "last_seen": utc_text(each.last_ns),
+                    },
+                    id=each.id,
+                )
+            )
+        return Features(features, is_local=site.is_local)
+
+    def _known(self, flight_id: str | None) -> str | None:
+        """The flight, None for all. Raises NotFoundError for one that the site has not."""
+        names = [] if flight_id is None else [each.id for each in self.flights()]
+        if flight_id is not None and flight_id not in names:
+            raise NotFoundError(
+                f"{self.folder} has no flight {flight_id!r}, only {', '.join(names) or 'none'}"
+            )
+        return flight_id
 
     def flown(self) -> list[tuple[str, int, int, int]]:
         """Each flight's name, rank, and the times of its first and last frame, by rank; none of flights without."""
@@ -286,7 +337,7 @@ class Archive:
 
     def keyframes(self, flight_id: str | None = None) -> list[StoredKeyframe]:
         """Keyframes of complete runs, by flight rank and index; of one flight when its id is given."""
-        return self.catalogue_rows(records.load_keyframes, flight_id)
+        return self.catalogue_rows(records.load_keyframes, self._known(flight_id))
 
     def sound_keyframes(self, flight_id: str | None = None) -> list[StoredKeyframe]:
         """`keyframes` less those whose images are damaged or gone: `notices` and a warning count them.
@@ -560,16 +611,13 @@ class Archive:
         """A flight's report.json; empty when somebody took it away or broke it, of which a warning tells."""
         return self._document(f"flights/{checked_name(flight_id, 'flight')}/report.json")
 
-    def features(
-        self, folder: str, name: str, *, is_local: bool | None = None
-    ) -> list[dict[str, Any]]:
+    def features(self, folder: str, name: str, *, is_local: bool | None = None) -> Features:
         """The features of a GeoJSON file in a folder of the site; none when somebody took it away or broke it."""
         is_local = self.site().is_local if is_local is None else is_local
         file = "/".join(filter(None, (folder, features_name(name, is_local=is_local))))
         features = self._document(file).get("features")
-        if not isinstance(features, list):
-            return []
-        return [each for each in features if isinstance(each, dict)]
+        found = features if isinstance(features, list) else []
+        return Features((each for each in found if isinstance(each, dict)), is_local=is_local)
 
     def _document(self, name: str) -> Mapping[str, Any]:
         """A JSON object in a file; empty when it is missing, damaged or broken."""
