@@ -1,10 +1,31 @@
 """The errors a person must act on; every message states what was found, what was needed and what to do."""
 
 import errno
+import re
+
+_ARGUMENT_OF = {  # options whose argument in Python is not called the same
+    "at": "places", "cell": "cell_m", "check": "checks", "fps": "frames_per_second", "gcp": "control",
+    "gcp-accuracy": "control_sigma_m", "ground-elevation": "ground_elevation_m", "gsd": "m_per_px",
+    "height": "height_m", "interval": "interval_m", "masks": "writes_masks", "max-height": "max_height_m", "out": "folder",
+    "offset": "offset_s", "trust-map": "trusts_map", "no-update": "updates_map=False",
+}  # fmt: skip
+_OPTION = re.compile(r"(?:sorvolo [a-z]|ray start|pip install)[^,;`]*|--([a-z][a-z-]*)")
 
 
 class SorvoloError(Exception):
-    """Root of all errors that Sorvolo raises on purpose."""
+    """Root of all errors that Sorvolo raises on purpose. As `str` it names arguments of functions, formatted (as
+    commands print it, and within another's words) options of commands."""
+
+    def __str__(self) -> str:
+        return _OPTION.sub(
+            lambda found: (
+                _ARGUMENT_OF.get(found[1], found[1].replace("-", "_")) if found[1] else found[0]
+            ),
+            super().__str__(),
+        )
+
+    def __format__(self, spec: str) -> str:
+        return format(super().__str__(), spec)
 
 
 class InputError(SorvoloError):

@@ -185,7 +185,7 @@ def test_a_later_chapter_alone_is_tied_to_no_log_by_its_clock(tmp_path: Path) ->
     log = write_gpx(tmp_path / "GX020106.gpx", BEGIN - timedelta(seconds=5), 60)
     (source,) = open_sources([video], log)
     assert len(of_notices(source, "later_chapter")) == 1
-    with pytest.raises(InputError, match=r"is chapter 2 of a recording.*--offset SECONDS"):
+    with pytest.raises(InputError, match=r"is chapter 2 of a recording.*offset_s SECONDS"):
         tied_clock(source, source.telemetry)
     assert tied_clock(source, source.telemetry, 17.8).sample_s[0] == pytest.approx(-5 - 17.8)
     write_video(tmp_path / "GX010106.MP4", 1)

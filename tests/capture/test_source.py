@@ -189,7 +189,7 @@ def test_a_site_folder_is_no_flight(tmp_path: Path) -> None:
     site = write_photos(tmp_path / "site", 1)
     (site / "site.db").touch()
     with pytest.raises(
-        InputError, match=r"a site folder \(it has site\.db\), no flight; give .*--site"
+        InputError, match=r"a site folder \(it has site\.db\), no flight; give .*site"
     ):
         open_sources([site])
 
@@ -199,7 +199,7 @@ def test_telemetry_given_as_input_is_refused_with_where_it_belongs(
     tmp_path: Path, name: str
 ) -> None:
     (tmp_path / name).write_text(SRT)
-    with pytest.raises(InputError, match=r"a telemetry file, no video or photo; .* --telemetry"):
+    with pytest.raises(InputError, match=r"a telemetry file, no video or photo; .* telemetry"):
         open_sources([tmp_path / name])
 
 

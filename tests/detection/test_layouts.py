@@ -159,11 +159,11 @@ def test_a_network_that_suppresses_itself(tmp_path: Path) -> None:
 
 def test_what_cannot_be_told_is_refused_with_what_to_give(tmp_path: Path) -> None:
     two = network(tmp_path / "two.onnx", output0=np.zeros((1, 300, 6)))
-    with pytest.raises(InputError, match="--layout"):
+    with pytest.raises(InputError, match="layout"):
         adopted(two)
     assert read_layout(two, "yolov10") == "yolov10"
     three = network(tmp_path / "three.onnx", output0=np.zeros((1, 7, CELLS)))
-    with pytest.raises(InputError, match=r"tells 3 classes apart and it names none; .*--classes"):
+    with pytest.raises(InputError, match=r"tells 3 classes apart and it names none; .*classes"):
         adopted(three)
     with pytest.raises(InputError, match=r"tells 3 classes apart and 2 are named"):
         adopted(three, "yolov8", ("person", "car"))

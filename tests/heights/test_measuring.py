@@ -132,7 +132,7 @@ def test_a_long_corridor_has_cells_that_its_raster_can_hold() -> None:
         corridor, SiteGrid.at(Geodetic(46.0, -91.0, 100.0), cell_m, "EPSG:32615")
     )
     assert 25_000 < max(lattice.shape) <= MOST_SIDE
-    with pytest.raises(GeometryError, match=r"cells larger than 0\.06 m \(--cell\)"):
+    with pytest.raises(GeometryError, match=r"cells larger than 0\.06 m \(cell_m\)"):
         Lattice.over(corridor, SiteGrid.at(Geodetic(46.0, -91.0, 100.0), 0.06, "EPSG:32615"))
 
 

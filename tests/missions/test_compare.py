@@ -455,7 +455,7 @@ def test_the_thesis_method_compares_too_and_shows_its_steps(flown, site, tmp_pat
 
 
 def test_steps_of_another_method_are_refused(flown, site):
-    with pytest.raises(SettingsError, match="choose another --method"):
+    with pytest.raises(SettingsError, match="choose another method"):
         list(
             compare_flights(
                 [flown / "flight2"],

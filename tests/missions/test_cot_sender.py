@@ -205,11 +205,11 @@ def test_a_client_that_the_server_refuses_has_sent_nothing(
         thread.start()
         place = CotPlace("tls", "127.0.0.1", server.getsockname()[1])
         with pytest.raises(
-            InputError, match=r"nothing could be sent.*certificate required.*give --cot-cert"
+            InputError, match=r"nothing could be sent.*certificate required.*give cot_cert"
         ):
             send_all(events, place, CotTls(certificates["server"]))
         with pytest.raises(
-            InputError, match=r"nothing could be sent.*check that it knows .*--cot-cert"
+            InputError, match=r"nothing could be sent.*check that it knows .*cot_cert"
         ):
             send_all(events, place, CotTls(certificates["server"], certificates["server"]))
         assert not received
@@ -265,7 +265,7 @@ def test_a_server_that_is_not_trusted_is_asked_once_and_the_remedy_named(
         thread = _tls_server(certificates, server, received)  # takes one connection
         place = CotPlace("tls", "127.0.0.1", server.getsockname()[1])
         with pytest.raises(
-            InputError, match=r"certificate is not trusted \(self.signed certificate\).*--cot-ca"
+            InputError, match=r"certificate is not trusted \(self.signed certificate\).*cot_ca"
         ):
             send_all([b"<event/>"] * 3, place)
         thread.join(5)

@@ -162,7 +162,7 @@ def test_heights_name_what_is_missing(mapped: Path, tmp_path: Path) -> None:
         list(make_heights(mapped, flight="nowhere"))
     with pytest.raises(StoreError, match="no site"):
         list(make_heights(tmp_path / "none"))
-    with pytest.raises(SettingsError, match="--cell"):
+    with pytest.raises(SettingsError, match="cell_m"):
         next(make_heights(mapped, 0.0))
 
 
@@ -258,7 +258,7 @@ def test_measuring_names_what_is_missing(with_heights: Path, tmp_path: Path) -> 
         measure_profile(with_heights, ["46.8,-91.9"])
     with pytest.raises(GeometryError, match="LAT,LON"):
         measure_profile(with_heights, ["here", "there"])
-    with pytest.raises(SettingsError, match="--interval"):
+    with pytest.raises(SettingsError, match="interval_m"):
         write_contours(with_heights, tmp_path / "lines.geojson", 0.0)
 
 

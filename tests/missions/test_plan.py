@@ -71,7 +71,7 @@ def test_no_flight_is_planned_above_the_laws_limit():
     assert higher["height_m"] == 200.0
     assert "get a permit" in " ".join(run(*mavic, "--max-height", 200).output.split())
     refused = run(*mavic, "--height", 150)
-    assert isinstance(refused.exception, SettingsError) and "--max-height" in str(refused.exception)
+    assert isinstance(refused.exception, SettingsError) and "max_height_m" in str(refused.exception)
 
 
 def test_the_packaged_detector_bounds_the_height_by_its_own_word():

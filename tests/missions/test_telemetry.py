@@ -688,7 +688,7 @@ def test_a_flight_is_recognised_under_any_name_and_another_one_refused(
 
     log, text = tmp_path / "earlier.gpx", next((filmed / "flight1").rglob("*.gpx")).read_text()
     log.write_text(re.sub(r"T\d\d:", "T07:", text))
-    with pytest.raises(InputError, match=r"no time in common.*--offset -18000 .*5 h ahead"):
+    with pytest.raises(InputError, match=r"no time in common.*offset_s -18000 .*5 h ahead"):
         correct_telemetry(site, out, source=faulty / "flight1" / "flight1.mp4", telemetry=str(log))
 
 

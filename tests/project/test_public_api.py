@@ -65,3 +65,27 @@ def test_records_of_outputs_take_text() -> None:
 def test_types_that_functions_give_are_public() -> None:
     for name in ("MosaicUpdate", "CompareUpdate", "Track", "Telemetry", "ModelInfo", "CotPlace"):
         assert dataclasses.is_dataclass(getattr(sorvolo, name)) and name in sorvolo.__all__
+
+
+@pytest.mark.parametrize(
+    ("words", "in_python"),
+    [
+        ("give --offset 2, or --telemetry FILE", "give offset_s 2, or telemetry FILE"),
+        ("use --height-model (--gsd)", "use height_model (m_per_px)"),
+        (
+            "first run sorvolo map --site s, then --gcp",
+            "first run sorvolo map --site s, then control",
+        ),
+    ],
+)
+def test_errors_name_arguments_in_python_and_options_in_commands(
+    words: str, in_python: str
+) -> None:
+    error = sorvolo.InputError(words)
+    assert str(error) == in_python and f"{error}" == words
+    assert str(sorvolo.StoreError(f"x: {error}")) == f"x: {in_python}"
+
+
+def test_no_error_of_python_asks_for_an_option() -> None:
+    with pytest.raises(sorvolo.SettingsError, match=r"\(every\) or .*\(frames_per_second\)"):
+        sorvolo.WatchSettings(every=2, frames_per_second=3)

@@ -223,7 +223,7 @@ def test_tls_with_an_authority_of_one_s_own(flight: Path, tmp_path: Path) -> Non
     tls.load_cert_chain(certificate, key)
     with StreamServer(tmp_path / "streams", tls=tls) as server:
         with pytest.raises(
-            InputError, match=r"certificate is not trusted .* give its authority as --ca"
+            InputError, match=r"certificate is not trusted .* give its authority as ca"
         ):
             client(flight, server, tmp_path / "spool1").run()
         trusting = StreamSettings(speed=0, authority=certificate)

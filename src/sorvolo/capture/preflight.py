@@ -201,7 +201,7 @@ def _tie(source: Source, frames: FrameFacts) -> tuple[str, float, str]:
     try:
         clock = tied_clock(source, telemetry)
     except InputError as error:
-        return "none", 0.0, str(error).removeprefix(f"{source.name}: ")
+        return "none", 0.0, f"{error}".removeprefix(f"{source.name}: ")
     if clock.tie == STARTS_TIED:
         lack = (
             "the telemetry has no date"

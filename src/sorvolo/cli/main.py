@@ -186,7 +186,7 @@ def options(
 def _words_of(error: Exception) -> str:
     """What happened and what to do, in one line."""
     if isinstance(error, SorvoloError):
-        return str(error)
+        return f"{error}"
     if isinstance(error, ImportError):
         return f"{error}; a package is missing or broken"
     if isinstance(error, OSError) and error.errno in FULL:

@@ -276,7 +276,7 @@ def _row(model: "InstalledModel") -> dict[str, Any]:
             | {"name": model.name, "bytes": model.path.stat().st_size}
         )
     except InputError as error:
-        return row | {"error": str(error)}
+        return row | {"error": f"{error}"}
 
 
 def _classes(facts: Mapping[str, Any]) -> list[str]:

@@ -179,7 +179,7 @@ def serve(source: IO[bytes], sink: IO[bytes]) -> None:
             shapes = {name: list(each.shape) for name, each in zip(OUTPUTS, arrays)}
             write_message(sink, {"shapes": shapes}, b"".join(each.tobytes() for each in arrays))
     except (InputError, SettingsError) as error:
-        write_message(sink, {"error": type(error).__name__, "text": str(error)})
+        write_message(sink, {"error": type(error).__name__, "text": f"{error}"})
     except EOFError:
         return  # nobody asks any more
     except Exception as error:

@@ -92,23 +92,23 @@ class FlightOutcome:
     paths: Mapping[str, Path]
     done_utc: str = ""
 
-    @classmethod
-    def of(
-        cls, folder: Path, report: Mapping[str, Any], more: Iterable[Path] = (), done_utc: str = ""
-    ) -> "FlightOutcome":
-        """The outcome that a flight's report.json states, with `more` files than its folder's."""
-        own = report.get("comparison") or report
-        headline = own.get("headline") or {}
-        counts = own.get("views") or report.get("frames") or {}
-        median = (own.get("residual_px") or {}).get("median")
-        return cls(
-            str(report.get("flight") or folder.name),
-            folder,
-            str(headline.get("text") or ""),
-            bool(headline.get("complete", headline.get("quality") in _TRUSTED)),
-            {name: count for name, count in counts.items() if isinstance(count, int)},
-            float("nan") if median is None else median,
-            tuple(report.get("warnings") or ()),
-            {path.name: path for path in (*more, *folder.iterdir()) if path.is_file()},
-            done_utc,
-        )
+
+def flight_outcome(
+    folder: Path, report: Mapping[str, Any], more: Iterable[Path] = (), done_utc: str = ""
+) -> FlightOutcome:
+    """The outcome that a flight's report.json states, with `more` files than its folder's."""
+    own = report.get("comparison") or report
+    headline = own.get("headline") or {}
+    counts = own.get("views") or report.get("frames") or {}
+    median = (own.get("residual_px") or {}).get("median")
+    return FlightOutcome(
+        str(report.get("flight") or folder.name),
+        folder,
+        str(headline.get("text") or ""),
+        bool(headline.get("complete", headline.get("quality") in _TRUSTED)),
+        {name: count for name, count in counts.items() if isinstance(count, int)},
+        float("nan") if median is None else median,
+        tuple(report.get("warnings") or ()),
+        {path.name: path for path in (*more, *folder.iterdir()) if path.is_file()},
+        done_utc,
+    )

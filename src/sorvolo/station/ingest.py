@@ -116,7 +116,7 @@ class Ingest:
         except Refusal as refusal:
             await _close(link, refusal.code, str(refusal))
         except (InputError, StoreError) as error:
-            await _close(link, REFUSED_CODE, str(error))
+            await _close(link, REFUSED_CODE, f"{error}")
         except LinkClosed:
             pass
 

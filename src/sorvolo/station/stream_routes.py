@@ -69,7 +69,7 @@ def stream_routes(ingest: Ingest, runs: Runs) -> APIRouter:
         try:
             hub = ingest.hub(stream)
         except InputError as error:
-            await websocket.close(REFUSED_CODE, str(error)[:120])
+            await websocket.close(REFUSED_CODE, f"{error}"[:120])
             return
         viewer = hub.join(mode)
         sending = asyncio.create_task(_send(websocket, viewer))

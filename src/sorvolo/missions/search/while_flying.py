@@ -154,7 +154,7 @@ class SearchWhileFlying:
         except Exception as error:
             if not self._has_warned and not self._landed.is_set():
                 words = (
-                    str(error)
+                    f"{error}"
                     if isinstance(error, SorvoloError)
                     else f"{type(error).__name__}: {error}"
                 )

@@ -29,7 +29,7 @@ from sorvolo.missions.flight.result_cache import ResultCache, go_on
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup, prepare
 from sorvolo.missions.flight.threads import read_ahead
-from sorvolo.missions.mission import FlightOutcome, mission
+from sorvolo.missions.mission import FlightOutcome, flight_outcome, mission
 from sorvolo.missions.watch.cot_sender import check_host, cot_place
 from sorvolo.missions.watch.places import Places, over_heights, places_of
 from sorvolo.missions.watch.run import EarlyFound, WatchRun, WatchUpdate, utc_ns
@@ -240,7 +240,7 @@ def _watch_one(
             raise InputError(
                 f"no frame of {source.name} could be searched: {reason}; see `sorvolo inspect`"
             )
-    return FlightOutcome.of(folder, json.loads((folder / "report.json").read_bytes()))
+    return flight_outcome(folder, json.loads((folder / "report.json").read_bytes()))
 
 
 class _Passed:
