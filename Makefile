@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 TRAINS := $(VENV)/.trains
 
-.PHONY: demo test test-long check bench page-vendor wheel docs
+.PHONY: demo test test-long check bench page-vendor wheel models-wheel docs
 
 demo: $(READY)
 	$(BIN)/sorvolo demo demo-site
@@ -34,6 +34,17 @@ wheel: requirements-build.lock
 	$(PYTHON) -m venv $(PACKING)
 	$(PACKING)/bin/python -m pip install --quiet --disable-pip-version-check -r requirements-build.lock
 	$(PACKING)/bin/python -m build --no-isolation --outdir dist .
+
+# dist/: the models as a wheel of their own, for all platforms. build/models has all that it is made from.
+models-wheel: build/models
+	$(PYTHON) -m venv $(PACKING)
+	$(PACKING)/bin/python -m pip install --quiet --disable-pip-version-check -r requirements-build.lock
+	$(PACKING)/bin/python -m build --no-isolation --wheel --outdir dist build/models
+
+build/models: $(wildcard src/sorvolo/detection/data/*) models/pyproject.toml NOTICE
+	rm -rf $@ && mkdir -p $@/sorvolo/detection
+	cp -r src/sorvolo/detection/data $@/sorvolo/detection/
+	cp -r models/pyproject.toml NOTICE LICENSES $@
 
 # build/site/: this documentation as web pages; a broken link ends it with an error.
 WRITING := build/docs-env

@@ -24,8 +24,22 @@ __all__ = ["__version__", *sorted(_HOMES)]  # noqa: PLE0604
 
 def __getattr__(name: str) -> Any:
     if name in _HOMES:
-        return getattr(import_module(_HOMES[name]), name)
+        try:
+            return getattr(import_module(_HOMES[name]), name)
+        except ModuleNotFoundError as error:
+            return _refuse(name, error)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def _refuse(name: str, lacking: ModuleNotFoundError) -> Any:
+    """A function in place of one whose extra is not installed, so that all other names and their help are there."""
+
+    def refuse(*_: object, **__: object) -> Any:
+        raise ImportError(
+            f"sorvolo.{name} needs {lacking.name}: pip install 'sorvolo[training]'"
+        ) from lacking
+
+    return refuse
 
 
 def __dir__() -> list[str]:

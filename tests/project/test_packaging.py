@@ -2,8 +2,11 @@
 
 import json
 import re
+import shutil
 import subprocess
+import sys
 import tomllib
+import zipfile
 from fnmatch import fnmatch
 from importlib import metadata
 from pathlib import Path
@@ -11,9 +14,15 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+from typer.main import get_command
+
+from sorvolo.cli.main import app
+from sorvolo.store.site.catalogue_place import VARIABLE
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+MODELS = tomllib.loads((ROOT / "models/pyproject.toml").read_text(encoding="utf-8"))
+MODELS_FOLDER = Path("detection/data")  # a wheel of its own
 CARDS = sorted((ROOT / "src/sorvolo/detection/data").glob("*.json"))
 SOURCES_OF_KERNELS = {".cpp", ".hpp"}
 
@@ -33,6 +42,7 @@ def test_the_wheel_takes_every_file_of_the_package_that_is_not_python() -> None:
         path
         for path in files_of_package()
         if path.suffix not in {".py", *SOURCES_OF_KERNELS}
+        and path.parent != MODELS_FOLDER
         and not any(path.match(each) for each in patterns)
     ]
     assert left_out == []
@@ -46,18 +56,21 @@ def test_the_sdist_takes_every_file_of_the_package() -> None:
     left_out = [
         path
         for path in files_of_package()
-        if path.suffix != ".py" and not any(fnmatch(path.name, each) for each in patterns)
+        if path.suffix != ".py"
+        and path.parent != MODELS_FOLDER
+        and not any(fnmatch(path.name, each) for each in patterns)
     ]
     assert left_out == []
 
 
 def test_licence_expression_names_a_full_text_each() -> None:
-    expression = PROJECT["project"]["license"]
+    expression = f"{PROJECT['project']['license']} AND {MODELS['project']['license']}"
     texts = {path.stem for path in (ROOT / "LICENSES").glob("*.txt")}
     assert set(re.split(r" (?:AND|OR) ", expression)) == texts
     for path in (ROOT / "LICENSES").glob("*.txt"):
         assert len(path.read_text(encoding="utf-8")) > 10_000
-    assert {"LICENSE", "NOTICE", "LICENSES/*.txt"} <= set(PROJECT["project"]["license-files"])
+    assert {"LICENSE", "NOTICE"} <= set(PROJECT["project"]["license-files"])
+    assert {"NOTICE", "LICENSES/*.txt"} == set(MODELS["project"]["license-files"])
 
 
 @pytest.mark.parametrize("card", CARDS, ids=lambda path: path.stem)
@@ -65,7 +78,7 @@ def test_every_shipped_model_is_under_a_licence_of_the_package_and_its_sources_a
     card: Path,
 ) -> None:
     written = json.loads(card.read_text(encoding="utf-8"))
-    assert written["licence"] in PROJECT["project"]["license"]
+    assert written["licence"] in MODELS["project"]["license"]
     credited = section_of(written["name"])
     for other in re.findall(r"^All sources of the model `([^`]+)`", credited, re.M):
         credited += section_of(other)
@@ -85,6 +98,79 @@ def section_of(model: str) -> str:
     )
     assert found, f"NOTICE has no section for the model {model}"
     return found[1]
+
+
+def test_the_models_are_a_wheel_of_their_own_and_not_in_the_programs(tmp_path: Path) -> None:
+    """The program's own build leaves them out; one target puts together all that theirs is made from."""
+    shutil.copytree(ROOT / "models", tmp_path / "models")
+    for name in ("Makefile", "NOTICE"):
+        shutil.copy(ROOT / name, tmp_path)
+    (tmp_path / "LICENSES").symlink_to(ROOT / "LICENSES")
+    data = tmp_path / "src/sorvolo" / MODELS_FOLDER
+    data.mkdir(parents=True)
+    for name in ("default.onnx", "default.json"):
+        (data / name).write_bytes(b"{}")
+    subprocess.run(["make", "-s", "build/models"], cwd=tmp_path, check=True)
+    build = "from setuptools import build_meta; build_meta.build_wheel('.')"
+    command = [sys.executable, "-c", build]
+    subprocess.run(command, cwd=tmp_path / "build/models", check=True, capture_output=True)
+    (wheel,) = (tmp_path / "build/models").glob("sorvolo_models-*.whl")
+    with zipfile.ZipFile(wheel) as opened:
+        names = opened.namelist()
+    assert {f"sorvolo/{MODELS_FOLDER}/default.{each}" for each in ("onnx", "json")} <= set(names)
+    assert not any(name.endswith(".py") for name in names)
+    assert any(name.endswith("CC-BY-SA-4.0.txt") for name in names)
+    left_out = PROJECT["tool"]["setuptools"]["exclude-package-data"]["sorvolo"]
+    assert left_out == [f"{MODELS_FOLDER}/*"]
+
+
+def test_the_images_steps_can_be_taken() -> None:
+    """What the Dockerfile copies is there and not ignored; extras, ports and variables are those of the program."""
+    steps = re.sub(r"\\\n\s*", " ", (ROOT / "Dockerfile").read_text(encoding="utf-8"))
+    shown = {line[1:] for line in (ROOT / ".dockerignore").read_text().split() if line[0] == "!"}
+    copied = [
+        name
+        for line in re.findall(r"^COPY (?!--from)(.*)$", steps, re.M)
+        for name in line.split()[:-1]
+    ]
+    assert copied and all((ROOT / name).exists() and name in shown for name in copied)
+    (extras,) = re.findall(r'"\.\[(.*?)\]"', steps)
+    assert set(extras.split(",")) <= set(PROJECT["project"]["optional-dependencies"])
+    (python,) = set(re.findall(r"^FROM python:([\d.]+)-slim", steps, re.M))
+    assert f"Programming Language :: Python :: {python}" in PROJECT["project"]["classifiers"]
+    compose = (ROOT / "compose.yaml").read_text(encoding="utf-8")
+    assert f"{VARIABLE}: postgresql://" in compose and "127.0.0.1:8750:8750" in compose
+    (arguments,) = re.findall(r"command: (\[.*\])", compose)
+    assert get_command(app).commands["serve"].make_context("serve", json.loads(arguments)[1:])
+
+
+def test_the_base_needs_no_extra() -> None:
+    """All public names but those of training, and the command line, in a process without what extras bring."""
+    extras = {
+        canonicalize_name(Requirement(each).name)
+        for group in PROJECT["project"]["optional-dependencies"].values()
+        for each in group
+    }
+    program = f"""
+import sys
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0].replace("_", "-") in {sorted(extras)!r}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+sys.meta_path.insert(0, Missing())
+from sorvolo import *
+import pydoc, sorvolo, sorvolo.cli.main
+try:
+    train_detector()
+except ImportError as error:
+    assert "sorvolo[training]" in str(error)
+assert sorvolo.map_flights and "map_flights" in pydoc.render_doc(sorvolo)
+sys.exit(sorvolo.cli.main.main(["models", "list"]))
+"""
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", program], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0 and "default" in done.stdout, done.stderr
 
 
 def test_locks_that_are_installed_together_agree() -> None:
