@@ -328,3 +328,27 @@ def test_public_names_are_the_missions() -> None:
     assert set(sorvolo.__all__) <= set(dir(sorvolo))
     with pytest.raises(AttributeError, match="no_such"):
         _ = sorvolo.no_such
+
+
+def test_a_file_gives_options_and_a_name_that_is_none_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "sorvolo.toml"
+    config.write_text('[plan]\njson = true\nspeed = 4.0\n[measure.volume]\nflight = "one"\n')
+    command = ["--quiet", "--config", str(config), "plan", "--camera", "Mavic 2 Pro"]
+    assert cli.main(command) == 0
+    assert json.loads(capsys.readouterr().out)["minimum_frame_rate_hz"] == pytest.approx(
+        0.155, abs=1e-3
+    )
+    assert cli.main([*command, "--speed", "6"]) == 0
+    assert json.loads(capsys.readouterr().out)["minimum_frame_rate_hz"] == pytest.approx(
+        0.233, abs=1e-3
+    )
+    for text, words in (
+        ("[plan]\nsped = 4\n", "[plan] there is no 'sped'; there are"),
+        ("[plant]\n", "there is no 'plant'; there are archive, batch,"),
+        ("[plan\n", "no TOML file that can be read"),
+    ):
+        config.write_text(text)
+        assert cli.main(command) == 1
+        assert words in capsys.readouterr().err

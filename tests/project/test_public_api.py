@@ -1,8 +1,8 @@
 """What strangers import: every function takes files as text or as any path, one input or several."""
 
-import dataclasses
 import inspect
 import os
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -62,9 +62,21 @@ def test_records_of_outputs_take_text() -> None:
     assert (outputs.folder, outputs.refly) == (Path("results"), (Path("holes.kmz"),))
 
 
-def test_types_that_functions_give_are_public() -> None:
-    for name in ("MosaicUpdate", "CompareUpdate", "Track", "Telemetry", "ModelInfo", "CotPlace"):
-        assert dataclasses.is_dataclass(getattr(sorvolo, name)) and name in sorvolo.__all__
+def test_every_type_that_a_public_function_takes_or_gives_is_public() -> None:
+    hidden = {
+        f"{name}: {kind}"
+        for name, function in public_functions()
+        for given in _annotations(function)
+        for kind in re.findall(r"sorvolo\.[\w.]*?\.([A-Z]\w+)(?![\w.])", str(given))
+        if kind not in sorvolo.__all__
+    }
+    assert hidden == set()
+
+
+def _annotations(function: Callable[..., Any]) -> list[Any]:
+    signature = inspect.signature(function)
+    parameters = (parameter.annotation for parameter in signature.parameters.values())
+    return [*parameters, signature.return_annotation]
 
 
 @pytest.mark.parametrize(

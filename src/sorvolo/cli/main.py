@@ -4,12 +4,14 @@ import os
 import signal
 import sys
 import threading
+import tomllib
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, TextIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TextIO
 
 import typer
 
@@ -34,7 +36,7 @@ from sorvolo.cli.stream import stream
 from sorvolo.cli.telemetry import telemetry_command
 from sorvolo.cli.train import train
 from sorvolo.cli.watch import watch_command
-from sorvolo.errors import FULL, SorvoloError, SorvoloWarning
+from sorvolo.errors import FULL, InputError, SettingsError, SorvoloError, SorvoloWarning
 from sorvolo.store.freed_memory import share_arenas
 
 if TYPE_CHECKING:
@@ -78,6 +80,7 @@ class GlobalOptions:
     """The options before the command, and the last line of a command that was stopped."""
 
     debug: bool
+    quiet: bool = False
     stop_words: str = "stopped; unfinished work was discarded, everything before it is unchanged"
 
 
@@ -174,13 +177,49 @@ def options(
     debug: Annotated[
         bool, typer.Option("--debug", help="Show where in the program an error occurred.")
     ] = False,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", help="Show no progress; results, warnings and errors stay.")
+    ] = False,
+    config: Annotated[
+        Path | None,
+        typer.Option(help="A TOML file with a table of options for each command, such as [map]."),
+    ] = None,
 ) -> None:
     """Maps from small drones: geo-referenced, compared with earlier flights, searched for people and cars.
 
     New here? Run `sorvolo demo`. With a flight of your own: `sorvolo inspect`, then `map`, `compare` or `watch`.
     """
-    if debug:
-        context.obj.debug = True
+    context.obj.debug |= debug
+    context.obj.quiet = quiet
+    if config is not None:
+        try:
+            tables = tomllib.loads(config.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise InputError(f"{config}: no TOML file that can be read ({error})") from error
+        context.default_map = _defaults(context.command, tables, f"{config}: ")
+
+
+def _defaults(command: Any, table: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """What a table of a settings file gives for a command's options, or for those of a group's commands.
+
+    Raises SettingsError for a name that is none of them.
+    """
+    below = getattr(command, "commands", {})
+    names = {
+        option.lstrip("-"): each.name
+        for each in command.params
+        for option in each.opts
+        if not below
+    }
+    if unknown := sorted(set(table) - {*names, *below}):
+        known = ", ".join(sorted({*names, *below} - {"help"}))
+        raise SettingsError(f"{where}there is no {unknown[0]!r}; there are {known}")
+    return {
+        names.get(name, name): _defaults(below[name], value, f"{where}[{name}] ")
+        if name in below
+        else value
+        for name, value in table.items()
+    }
 
 
 def _words_of(error: Exception) -> str:

@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Generator, Iterable
 from typing import TYPE_CHECKING, Self, TypeVar
 
+import click
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
@@ -29,7 +30,9 @@ class ProgressReport:
         self, console: Console, *, stays: bool = False, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self.console, self._clock = console, clock
-        self._is_live = console.is_interactive
+        running = click.get_current_context(silent=True)
+        self._is_quiet = bool(running and getattr(running.find_root().obj, "quiet", False))
+        self._is_live = console.is_interactive and not self._is_quiet
         self._last_s = clock()
         self._task = ""
         self._bar = Progress(
@@ -59,7 +62,7 @@ class ProgressReport:
                 self._bar.add_task(task, words="")
             # a total of None would stop the bar from ever filling; rich pulses until there is one
             self._bar.update(self._bar.task_ids[-1], completed=done, total=total, words=words)
-        elif self._clock() - self._last_s >= _LINE_EVERY_S:
+        elif not self._is_quiet and self._clock() - self._last_s >= _LINE_EVERY_S:
             self._last_s = self._clock()
             so_far = f" {done:,} of {total:,}" if total else f" {done:,}" if done else ""
             line = f"{task}{so_far}{', ' + words if words else ''}"
