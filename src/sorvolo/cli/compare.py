@@ -126,8 +126,8 @@ def compare(
     """
     from sorvolo.capture.live.reconnect import LiveSettings
     from sorvolo.missions.compare.flights import compare_flights
-    from sorvolo.missions.mission import is_good
     from sorvolo.missions.flight.settings import CompareSettings
+    from sorvolo.missions.mission import is_good
 
     settings = CompareSettings(
         None if method == "robust" else _thesis(),

@@ -125,9 +125,9 @@ def map_command(
     Example: sorvolo map rtsp://192.168.1.10/live --telemetry serial:/dev/ttyUSB0 --site field
     """
     from sorvolo.capture.live.reconnect import LiveSettings
-    from sorvolo.missions.mission import is_good
     from sorvolo.missions.flight.settings import MapSettings
     from sorvolo.missions.map.flights import map_flights
+    from sorvolo.missions.mission import is_good
     from sorvolo.missions.site.copy import folder_of
     from sorvolo.store.site.catalogue_place import chosen_catalogues
 

@@ -13,8 +13,6 @@ P = ParamSpec("P")
 U = TypeVar("U")
 R = TypeVar("R")
 
-_TRUSTED = ("map", "compared")  # of a headline's qualities; a watch's is complete or not
-
 
 class Mission(Iterator[U], Generic[U, R]):
     """A mission at work: each step gives an update, and work goes on when the next is asked for.
@@ -105,10 +103,17 @@ def flight_outcome(
         str(report.get("flight") or folder.name),
         folder,
         str(headline.get("text") or ""),
-        bool(headline.get("complete", headline.get("quality") in _TRUSTED)),
+        is_good(headline),
         {name: count for name, count in counts.items() if isinstance(count, int)},
         float("nan") if median is None else median,
         tuple(report.get("warnings") or ()),
         {path.name: path for path in (*more, *folder.iterdir()) if path.is_file()},
         done_utc,
+    )
+
+
+def is_good(headline: Mapping[str, Any]) -> bool:
+    """Whether a result needs no check, by its headline: exit code 0, else 3."""
+    return headline.get("quality", "map") in ("map", "compared") and bool(
+        headline.get("complete", "quality" in headline)
     )
