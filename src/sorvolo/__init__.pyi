@@ -90,7 +90,7 @@ from sorvolo.missions.watch.run import WatchUpdate as WatchUpdate
 from sorvolo.missions.watch.settings import WatchOutputs as WatchOutputs
 from sorvolo.missions.watch.settings import WatchSettings as WatchSettings
 from sorvolo.paths import GivenFlight as GivenFlight
-from sorvolo.store.exports.plain import Features as Features
+from sorvolo.store.exports.plain import FeatureList as FeatureList
 from sorvolo.store.site.archive import Archive as Archive
 from sorvolo.store.site.catalogue_place import Catalogues as Catalogues
 from sorvolo.store.site.change_records import StoredChange as StoredChange

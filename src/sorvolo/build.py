@@ -6,7 +6,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-VERSION = "0.1.0"
+VERSION = "1.0.0"
 """The one place of the version: a release raises it here."""
 
 _CODE = frozenset({".py", ".cpp"})  # not what is compiled: it differs between machines

@@ -75,7 +75,7 @@ def _line(value: Any) -> str:
 def feature_collection(
     name: str, features: Sequence[Mapping[str, Any]], *, is_local: bool, note: str = _OF_OWN_MAP
 ) -> dict[str, Any]:
-    """Features with a geometry as a GeoJSON FeatureCollection; of a local site as plain JSON, which no map would open.
+    """FeatureList with a geometry as a GeoJSON FeatureCollection; of a local site as plain JSON, which no map would open.
 
     A local site has no place on Earth: its coordinates are pixels, of its own map where `note` states nothing else.
     """
@@ -90,8 +90,8 @@ def feature(geometry: Any, properties: Any, **own: Any) -> dict[str, Any]:
     return {"type": "Feature", **own, "geometry": geometry, "properties": properties}
 
 
-class Features(list[dict[str, Any]]):
-    """Features of GeoJSON, which libraries that know `__geo_interface__` take as they are."""
+class FeatureList(list[dict[str, Any]]):
+    """FeatureList of GeoJSON, which libraries that know `__geo_interface__` take as they are."""
 
     def __init__(self, features: Iterable[dict[str, Any]] = (), *, is_local: bool = False) -> None:
         super().__init__(features)

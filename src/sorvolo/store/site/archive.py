@@ -23,7 +23,7 @@ from sorvolo.paths import AnyPath
 from sorvolo.store.exports.change_files import object_crops
 from sorvolo.store.exports.places import place_deg
 from sorvolo.store.exports.plain import (
-    Features,
+    FeatureList,
     feature,
     features_name,
     plain_json,
@@ -255,7 +255,7 @@ class Archive:
         the site does not keep."""
         return self.catalogue_rows(site_register, flights, others, their_looks)
 
-    def findings(self, flight_id: str | None = None) -> Features:
+    def findings(self, flight_id: str | None = None) -> FeatureList:
         """Each thing on the ground that any mission found, once, as a point; of one flight, what that saw.
 
         `gone` names the flight that looked there and did not find it, null where it still stands.
@@ -286,7 +286,7 @@ class Archive:
                     id=each.id,
                 )
             )
-        return Features(features, is_local=site.is_local)
+        return FeatureList(features, is_local=site.is_local)
 
     def _known(self, flight_id: str | None) -> str | None:
         """The flight, None for all. Raises NotFoundError for one that the site has not."""
@@ -611,13 +611,13 @@ class Archive:
         """A flight's report.json; empty when somebody took it away or broke it, of which a warning tells."""
         return self._document(f"flights/{checked_name(flight_id, 'flight')}/report.json")
 
-    def features(self, folder: str, name: str, *, is_local: bool | None = None) -> Features:
+    def features(self, folder: str, name: str, *, is_local: bool | None = None) -> FeatureList:
         """The features of a GeoJSON file in a folder of the site; none when somebody took it away or broke it."""
         is_local = self.site().is_local if is_local is None else is_local
         file = "/".join(filter(None, (folder, features_name(name, is_local=is_local))))
         features = self._document(file).get("features")
         found = features if isinstance(features, list) else []
-        return Features((each for each in found if isinstance(each, dict)), is_local=is_local)
+        return FeatureList((each for each in found if isinstance(each, dict)), is_local=is_local)
 
     def _document(self, name: str) -> Mapping[str, Any]:
         """A JSON object in a file; empty when it is missing, damaged or broken."""
