@@ -23,9 +23,10 @@ from sorvolo.heights.obstacles import Obstacles
 from sorvolo.heights.orthophoto import choose_photos, paint_orthophoto, visible
 from sorvolo.heights.smooth_sigma import SmoothSigma
 from sorvolo.heights.surface import Surface, SurfaceSettings, sweep_surface
-from sorvolo.heights.sweep import SmoothingSettings, SweepSettings, choose_views, smoothed
+from sorvolo.heights.sweep import SweepSettings, choose_views
 from sorvolo.heights.terrain import TerrainSettings, filled, terrain
 from sorvolo.heights.views import inside
+from sorvolo.kernels import path_costs
 from sorvolo.registration.features import gray_from_rgb
 
 ORIGIN, CRS = Geodetic(46.0, -91.0, 100.0), "EPSG:32615"
@@ -342,7 +343,7 @@ def test_smoothing_keeps_a_step_and_drops_a_lone_cell() -> None:
         for column in range(12):
             cost[row, 1 if column < 6 else 4, column] = 0.2
     cost[4, 1, 3], cost[4, 5, 3] = 0.5, 0.3
-    best = smoothed(cost, SmoothingSettings(0.1, 0.5)).argmin(axis=1)
+    best = path_costs(cost, 0.1, 0.5).argmin(axis=1)
     assert (best[:, :6] == 1).all() and (best[:, 6:] == 4).all()
 
 
@@ -465,7 +466,7 @@ def test_what_one_cell_knows_reaches_its_neighbours_in_all_eight_directions(step
     """Semi-global matching: among cells that know nothing one is sure; straight paths from it carry its level."""
     cost = np.full((9, 6, 9), 0.5, np.float32)
     cost[4, :, 4], cost[4, 2, 4] = 1.0, 0.0
-    best = smoothed(cost, SmoothingSettings(0.1, 0.5))
+    best = path_costs(cost, 0.1, 0.5)
     row, column = 4 + 3 * step[0], 4 + 3 * step[1]
     assert best[row, :, column].argmin() == 2
     assert np.ptp(best[row, :, column]) > 0.2

@@ -55,3 +55,25 @@ def agreements(
                 wanted = int(np.ceil(len(known) * share))
                 result[y, level, x] = np.mean(known[-wanted:])
     return result
+
+
+def path_costs(cost: np.ndarray, one_level: float, more_levels: float) -> np.ndarray:
+    """As `sorvolo.kernels.path_costs`: each of the eight paths on its own, cell by cell."""
+    rows, _, columns = cost.shape
+    total = np.zeros(cost.shape)
+    for down, right in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)):
+        path = np.zeros(cost.shape)
+        for y in range(rows)[:: -1 if down < 0 else 1]:
+            for x in range(columns)[:: -1 if right < 0 else 1]:
+                from_y, from_x = y - down, x - right
+                path[y, :, x] = cost[y, :, x]
+                if not 0 <= from_y < rows or (down == 0 and not 0 <= from_x < columns):
+                    continue
+                # a slanted path that came in from a side began in the same column
+                before = path[from_y, :, min(max(from_x, 0), columns - 1)]
+                beside = np.pad(before, 1, constant_values=np.inf)
+                beside = np.minimum(beside[:-2], beside[2:]) + one_level
+                least = before.min()
+                path[y, :, x] += np.minimum(np.minimum(before, beside), least + more_levels) - least
+        total += path
+    return total

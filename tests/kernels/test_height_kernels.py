@@ -1,4 +1,4 @@
-"""How well photos agree on level planes: the compiled kernel against its NumPy twin."""
+"""What the heights' compiled kernels compute, against their NumPy twins."""
 
 import numpy as np
 import numpy_heights
@@ -47,6 +47,24 @@ def test_something_is_seen_and_something_is_not() -> None:
     assert 0.1 < np.isfinite(found).mean() < 0.95 and np.nanmax(found) > 0.2
 
 
+@settings(max_examples=40, deadline=None)
+@given(
+    st.integers(1, 7),
+    st.integers(1, 6),
+    st.integers(1, 7),
+    st.floats(0, 0.5),
+    st.floats(0.1, 1),
+    st.integers(0, 2**32 - 1),
+)
+def test_paths_cost_as_specified(
+    rows: int, levels: int, columns: int, one: float, more: float, seed: int
+) -> None:
+    cost = np.random.default_rng(seed).random((rows, levels, columns)).astype(np.float32)
+    np.testing.assert_allclose(
+        kernels.path_costs(cost, one, more), numpy_heights.path_costs(cost, one, more), rtol=1e-4
+    )
+
+
 def test_what_does_not_fit_is_refused() -> None:
     asked = _asked(3, (8, 8), 1)
     for wrong, words in (
@@ -57,3 +75,5 @@ def test_what_does_not_fit_is_refused() -> None:
     ):
         with pytest.raises(ValueError, match=words):
             kernels.agreements(**asked | wrong)
+    with pytest.raises(ValueError, match="do not fit"):
+        kernels.path_costs(np.zeros((2, 2), np.float32), 0.1, 0.5)

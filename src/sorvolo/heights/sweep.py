@@ -30,52 +30,6 @@ class SmoothingSettings:
     temperature: float = 0.04  # of a path's total cost, by which a height is e times less likely: fits sigma to errors
 
 
-def smoothed(cost: Floats32, settings: SmoothingSettings) -> Floats32:
-    """(H, D, W) sums over eight paths of a matching cost, (H, D, W) float32: rows, levels, columns."""
-    total = np.zeros_like(cost)
-    _sweep(cost, total, settings)
-    _sweep(cost[::-1], total[::-1], settings)
-    turned: Floats32 = np.ascontiguousarray(cost.transpose(2, 1, 0))
-    across = np.zeros_like(turned)
-    _straight(turned, across, settings)
-    _straight(turned[::-1], across[::-1], settings)
-    total += across.transpose(2, 1, 0)
-    return total
-
-
-def _sweep(cost: Floats32, total: Floats32, settings: SmoothingSettings) -> None:
-    """Add the paths that come from the row above: straight, from the left and from the right."""
-    before = [cost[0]] * 3
-    total[0] += 3 * cost[0]
-    for row in range(1, len(cost)):
-        left, right = np.empty_like(before[1]), np.empty_like(before[2])
-        left[:, 1:], left[:, :1] = before[1][:, :-1], before[1][:, :1]
-        right[:, :-1], right[:, -1:] = before[2][:, 1:], before[2][:, -1:]
-        before = [_next(cost[row], each, settings) for each in (before[0], left, right)]
-        for each in before:
-            total[row] += each
-
-
-def _straight(cost: Floats32, total: Floats32, settings: SmoothingSettings) -> None:
-    before = cost[0]
-    total[0] += before
-    for row in range(1, len(cost)):
-        before = _next(cost[row], before, settings)
-        total[row] += before
-
-
-def _next(cost: Floats32, before: Floats32, settings: SmoothingSettings) -> Floats32:
-    """(D, W) the cost of paths that go on from `before`, (D, W), the least of it taken off so that sums stay small."""
-    least = before.min(axis=0)
-    reached = np.minimum(before, least + np.float32(settings.more_levels))
-    step = np.float32(settings.one_level)
-    np.minimum(reached[1:], before[:-1] + step, out=reached[1:])
-    np.minimum(reached[:-1], before[1:] + step, out=reached[:-1])
-    reached += cost
-    reached -= least
-    return reached
-
-
 _MORE = 3  # views beyond the wanted ones ...
 _LEFT_OUT = 0.04  # ... while two of those that are chosen leave out so much of the ground that two could show
 _ANGLES = 16  # directions in a picture that are distinguished, over half a turn
@@ -159,7 +113,10 @@ def sweep(
             each.hidden_below_m = obstacles.hidden_below_m(lattice, eye_m)
     agreement = _agreements(laid, levels, settings)
     seen_by = np.sum(seen, axis=0).astype(np.float32)
-    total = smoothed(_cost(agreement, settings.smoothing), settings.smoothing)
+    smoothing = settings.smoothing
+    total = kernels.path_costs(
+        _cost(agreement, smoothing), smoothing.one_level, smoothing.more_levels
+    )
     up_m, score = _best(total, agreement, levels)
     # (H, W) the root mean square distance of the other levels from a height, each by its
     # probability.

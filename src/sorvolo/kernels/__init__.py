@@ -326,6 +326,17 @@ def agreements(
     )
 
 
+def path_costs(
+    cost: NDArray[np.float32], one_level: float, more_levels: float
+) -> NDArray[np.float32]:
+    """(h, L, w) sums over eight paths of costs (h, L, w): rows, levels, columns (semi-global, Hirschmueller 2008).
+
+    A path pays `one_level` to go to the next level, and `more_levels` to go to any other.
+    """
+    _check(cost.ndim == 3 and cost.size > 0, "path_costs", cost=cost)
+    return _native.path_costs(np.ascontiguousarray(cost, np.float32), one_level, more_levels)
+
+
 def _target(out: Bytes | None, shape: tuple[int, ...]) -> Bytes:
     if out is None:
         return np.empty(shape, np.uint8)

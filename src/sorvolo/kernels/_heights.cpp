@@ -1,4 +1,4 @@
-// How well photos agree, laid on level planes: see `agreements` in kernels/__init__.py.
+// How well photos agree, laid on level planes, and what heights cost along paths: see kernels/__init__.py.
 #include "_native.hpp"
 
 #include <pybind11/stl.h>
@@ -261,6 +261,84 @@ Floats32 agreements(const std::vector<Floats32> &pictures, const Integers64 &cha
     return result;
 }
 
+// A row of paths, `levels` x `columns`, that go on from `before`; the least of each is taken off so that sums stay small.
+SORVOLO_CLONES
+void go_on(const float *cost, const float *before, int levels, int columns, float one, float more, float *lowest,
+           float *out) {
+    std::memcpy(lowest, before, columns * sizeof(float));
+    for (int d = 1; d < levels; ++d) {
+        const float *each = before + static_cast<std::ptrdiff_t>(d) * columns;
+        SORVOLO_INDEPENDENT
+        for (int c = 0; c < columns; ++c) lowest[c] = least(lowest[c], each[c]);
+    }
+    for (int d = 0; d < levels; ++d, cost += columns, before += columns, out += columns) {
+        const float *below = d > 0 ? before - columns : before, *above = d + 1 < levels ? before + columns : before;
+        SORVOLO_INDEPENDENT
+        for (int c = 0; c < columns; ++c) {
+            const float step = least(below[c], above[c]) + one;
+            out[c] = (least(least(before[c], lowest[c] + more), step) + cost[c]) - lowest[c];
+        }
+    }
+}
+
+SORVOLO_CLONES
+void sum_up(const float *each, std::ptrdiff_t count, float *total) {
+    add(total, each, static_cast<int>(count), total);
+}
+
+void shift(const float *before, int levels, int columns, int by, float *out) {
+    for (int d = 0; d < levels; ++d, before += columns, out += columns)
+        for (int c = 0; c < columns; ++c) out[c] = before[std::clamp(c - by, 0, columns - 1)];
+}
+
+// Adds the paths from row to row of a volume (rows, levels, columns), straight and, if asked for, from both sides too.
+void add_paths(const float *cost, int rows, int levels, int columns, bool is_down, bool is_straight, float one,
+               float more, float *total) {
+    const std::ptrdiff_t row = static_cast<std::ptrdiff_t>(levels) * columns;
+    const int ways = is_straight ? 1 : 3;
+    std::vector<float> before(ways * row), shifted(row), after(row), lowest(columns);
+    for (int k = 0; k < rows; ++k) {
+        const std::ptrdiff_t at = (is_down ? k : rows - 1 - k) * row;
+        for (int way = 0; way < ways; ++way) {
+            float *own = before.data() + way * row;
+            if (k == 0) {
+                std::memcpy(own, cost + at, row * sizeof(float));
+            } else {
+                const float *from = own;
+                if (way > 0) shift(own, levels, columns, way == 1 ? 1 : -1, shifted.data()), from = shifted.data();
+                go_on(cost + at, from, levels, columns, one, more, lowest.data(), after.data());
+                std::memcpy(own, after.data(), row * sizeof(float));
+            }
+            sum_up(own, row, total + at);
+        }
+    }
+}
+
+Floats32 path_costs(const Floats32 &cost, float one, float more) {
+    const int rows = static_cast<int>(cost.shape(0)), levels = static_cast<int>(cost.shape(1)),
+              columns = static_cast<int>(cost.shape(2));
+    Floats32 result({rows, levels, columns});
+    const float *from = cost.data();
+    float *total = result.mutable_data();
+    pybind11::gil_scoped_release released;
+    const std::size_t count = static_cast<std::size_t>(rows) * levels * columns;
+    std::fill(total, total + count, 0.0f);
+    for (bool is_down : {true, false}) add_paths(from, rows, levels, columns, is_down, false, one, more, total);
+    std::vector<float> turned(count), across(count, 0.0f);
+    const auto each = [&](auto work) {
+        for (int y = 0; y < rows; ++y)
+            for (int d = 0; d < levels; ++d)
+                for (int x = 0; x < columns; ++x)
+                    work((static_cast<std::size_t>(y) * levels + d) * columns + x,
+                         (static_cast<std::size_t>(x) * levels + d) * rows + y);
+    };
+    each([&](std::size_t own, std::size_t other) { turned[other] = from[own]; });
+    for (bool is_down : {true, false})
+        add_paths(turned.data(), columns, levels, rows, is_down, true, one, more, across.data());
+    each([&](std::size_t own, std::size_t other) { total[own] += across[other]; });
+    return result;
+}
+
 }  // namespace
 
 void bind_heights(pybind11::module_ &module) {
@@ -269,6 +347,7 @@ void bind_heights(pybind11::module_ &module) {
                py::arg("planes").noconvert(), py::arg("frames").noconvert(), py::arg("insets").noconvert(),
                py::arg("hidden"), py::arg("heights").noconvert(), py::arg("sides"), py::arg("rows"),
                py::arg("columns"), py::arg("share"), py::arg("threads"));
+    module.def("path_costs", &path_costs, py::arg("cost").noconvert(), py::arg("one_level"), py::arg("more_levels"));
 }
 
 }  // namespace sorvolo

@@ -93,3 +93,6 @@ def agreements(
     share: float,
     threads: int,
 ) -> NDArray[np.float32]: ...
+def path_costs(
+    cost: NDArray[np.float32], one_level: float, more_levels: float
+) -> NDArray[np.float32]: ...
