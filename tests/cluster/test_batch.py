@@ -130,6 +130,7 @@ def test_again_nothing_is_done_twice(batched: tuple[Path, BatchReport], flown: P
     assert again.counts() == {"known": 2, "duplicate": 1, "skipped": 1, "failed": 1, "set aside": 1}
 
 
+@pytest.mark.long
 def test_a_killed_watch_goes_on_and_leaves_what_an_undisturbed_one_leaves(
     flown: Path, tmp_path: Path
 ) -> None:

@@ -396,6 +396,7 @@ def test_a_flight_without_telemetry_finds_itself(flown, site, tmp_path):
     assert features(site, "silent")
 
 
+@pytest.mark.long
 def test_a_guessed_camera_becomes_the_one_that_mapping_found(surveyed, tmp_path):
     site, bare = tmp_path / "site", tmp_path / "no-camera-file"
     shutil.copytree(surveyed, bare, ignore=shutil.ignore_patterns("camera.xml"))

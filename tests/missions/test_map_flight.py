@@ -181,6 +181,7 @@ def test_holes_are_shown_and_planned_while_the_flight_goes_on(
     ).all()
 
 
+@pytest.mark.long
 def test_a_video_that_looks_ahead_by_half_a_right_angle(oblique: Path, tmp_path: Path) -> None:
     site, flight = tmp_path / "site", oblique / "flight1"
     run_map(site, flight / "flight1.mp4", "--camera", oblique / "camera.xml")

@@ -292,6 +292,7 @@ def test_a_flight_that_an_earlier_search_measured_counts_once_it_was_looked_at(
 
 @pytest.mark.usefixtures("threads")
 @pytest.mark.long
+@pytest.mark.long
 def test_a_flight_that_is_stopped_leaves_no_waypoints(
     photographed: Path, site: Path, tmp_path: Path
 ) -> None:

@@ -168,7 +168,7 @@ def test_without_telemetry_objects_are_counted_in_the_picture(
     assert tracks["crs"] is None and "x_px" in tracks["features"][0]["properties"]
 
 
-@pytest.mark.parametrize("has_telemetry", [True, False])
+@pytest.mark.parametrize("has_telemetry", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_views_never_exceed_the_frames_searched(
     flown: Path, tmp_path: Path, has_telemetry: bool
 ) -> None:

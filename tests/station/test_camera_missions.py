@@ -153,6 +153,7 @@ def test_a_camera_is_opened_once_and_seen_by_the_mission_and_by_browsers(
     )
 
 
+@pytest.mark.long
 def test_a_camera_outlives_a_restarted_station(tmp_path: Path) -> None:
     """What comes meanwhile waits and is sent; the flight is one, of the mission that goes on."""
     port = free_port()
@@ -187,6 +188,7 @@ def test_a_killed_mission_takes_its_camera_with_it(camera: RtspServer, tmp_path:
         assert not stream["is_connected"] and stream["flights"][0]["is_over"]
 
 
+@pytest.mark.long
 def test_a_mission_whose_folder_is_taken_away_ends_with_its_camera(
     camera: RtspServer, tmp_path: Path
 ) -> None:

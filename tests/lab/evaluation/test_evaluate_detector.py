@@ -359,6 +359,7 @@ def test_pictures_are_shown_as_to_watch(toy, coco, monkeypatch):
     assert main(command) == 0 and set(shown) == {"auto"}
 
 
+@pytest.mark.long
 def test_a_damaged_picture_is_left_out_for_all_models_and_named(toy, coco, tmp_path, capsys):
     folder = tmp_path / "coco"
     folder.mkdir()

@@ -47,6 +47,7 @@ def test_boxes_lie_in_the_picture_and_cars_have_a_car_s_size():
     )  # 4.0 to 5.2 m long, seen at any heading, some from the side
 
 
+@pytest.mark.long
 def test_heights_and_ground_sampling_distances_keep_their_bounds():
     for index in range(6):
         picture = simulate_picture(SETTINGS, index)
@@ -54,6 +55,7 @@ def test_heights_and_ground_sampling_distances_keep_their_bounds():
         assert 15 <= picture.site_from_camera.translation_m[2] <= 60
 
 
+@pytest.mark.long
 @pytest.mark.long
 def test_people_stand_out_in_thermal_pictures_which_are_grey():
     settings = replace(SETTINGS, thermal_share=1.0)

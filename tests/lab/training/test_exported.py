@@ -178,6 +178,7 @@ def _load_layers_of(model: FasterRCNN) -> None:
     load_exported(model, file.SerializeToString(), _batch())
 
 
+@pytest.mark.long
 def test_a_model_in_eight_bits_is_reported() -> None:
     small = find_model("default-int8").read_bytes()
     with pytest.raises(InputError, match="float32 model of the same preset"):

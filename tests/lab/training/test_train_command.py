@@ -226,6 +226,7 @@ def test_whole_videos_are_held_out(data: Path) -> None:
     assert len(learnt) == 3 and len(held) == 1 and not learnt & held
 
 
+@pytest.mark.long
 def test_what_was_remarked_is_reported_on_the_terminal_too(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

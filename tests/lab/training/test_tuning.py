@@ -249,6 +249,7 @@ def test_the_four_steps_begin_from_a_model_too(learnt: Path, data: Path, tmp_pat
     assert json.loads((tmp_path / "out" / "training.json").read_text())["export"]["good"]
 
 
+@pytest.mark.long
 def test_models_that_do_not_fit_are_reported(
     learnt: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
