@@ -78,11 +78,6 @@ class GroupTables:
     tables: tuple[_ClassTable, ...]
     groups: int
 
-    @property
-    def label_counts(self) -> dict[str, int]:
-        """How many labels each class has."""
-        return {table.label: int(table.labels.sum()) for table in self.tables}
-
     def measure(self, weights: Floats) -> dict[str, Floats]:
         """Each measure (draws,) for weights (draws, groups): how often each group was drawn.
 
@@ -171,18 +166,18 @@ def differences(
     group and one seed an arm there is nothing to draw: the bounds are NaN.
     """
     groups = a[0].groups
-    exact = [_means(arm) for arm in (a, b)]
-    values = {
-        name: float(exact[1][name][0] - exact[0][name][0]) for name in exact[0] if name in exact[1]
-    }
+    of_a, of_b = (_arm_scores("", arm).mean for arm in (a, b))
+    values = {name: of_b[name] - of_a[name] for name in of_a if name in of_b}
     if groups < 2 and len(a) < 2 and len(b) < 2:
         return {
             name: ScoreDifference(value, np.nan, np.nan, np.nan) for name, value in values.items()
         }
     weights = draw_groups(groups, draws, seed)
     rng = np.random.default_rng([seed, 4302])
-    of_a, of_b = (_drawn_means(arm, weights, values, rng) for arm in (a, b))
-    return {name: _difference(value, of_b[name] - of_a[name]) for name, value in values.items()}
+    drawn_a, drawn_b = (_drawn_means(arm, weights, values, rng) for arm in (a, b))
+    return {
+        name: _difference(value, drawn_b[name] - drawn_a[name]) for name, value in values.items()
+    }
 
 
 def _difference(value: float, drawn: Floats) -> ScoreDifference:
@@ -223,12 +218,6 @@ def _average_precision(labels: Floats, groups: Rows, before: Floats, weights: Fl
 
 def _counted(groups: Rows, count: int) -> Floats:
     return np.bincount(groups, minlength=count).astype(np.float64)
-
-
-def _means(arm: Sequence[GroupTables]) -> dict[str, Floats]:
-    """Each measure (1,) of an arm on all groups: the mean over its seeds."""
-    measured = [each.measure(np.ones((1, each.groups))) for each in arm]
-    return {name: np.mean([each[name] for each in measured], axis=0) for name in measured[0]}
 
 
 def _bounds(values: Floats) -> tuple[float, float]:
@@ -391,7 +380,7 @@ def compare_arms(
         labelled.name,
         len(labelled),
         first.groups,
-        first.label_counts,
+        {table.label: int(table.labels.sum()) for table in first.tables},
         tuple(_arm_scores(arm.name, each) for arm, each in zip(arms, tables)),
         tuple(differences(tables[0], each, draws=draws, seed=seed) for each in tables[1:]),
     )

@@ -33,26 +33,8 @@ def write_reproduction(
 
     `size` is that of a simulated dataset. Raises StoreError on a full disk.
     """
-    document = reproduction_document(rows, place, settings, size)
-    sheets = reproduction_sheets(document["tables"])
-    store = RowStore(out)
-    page = reproduction_page(document, sheets, lambda file: store.picture_path(file).read_bytes())
-    make_folder(out / "tables")
-    for each in sheets:
-        atomic_write_bytes(out / "tables" / f"{each.name}.csv", each.csv)
-    text = "\n".join([document["size"], "", *(each.markdown for each in sheets)])
-    atomic_write_bytes(out / MARKDOWN, text.encode())
-    atomic_write_bytes(out / NUMBERS, json_bytes(document))
-    atomic_write_bytes(out / PAGE, page.encode())
-    return document
-
-
-def reproduction_document(
-    rows: Sequence[Row], place: Path, settings: ReproductionSettings, size: SimulatedSize | None
-) -> dict[str, Any]:
-    """The content of reproduction.json: tables, rows, and what is missing."""
     made = [each for each in rows if not each.missing]
-    return plain_json(
+    document = plain_json(
         {
             "made_by": "sorvolo reproduce",
             "format": 1,
@@ -73,6 +55,17 @@ def reproduction_document(
             "missing": [{"id": each.id, "reason": each.missing} for each in rows if each.missing],
         }
     )
+    sheets = reproduction_sheets(document["tables"])
+    store = RowStore(out)
+    page = reproduction_page(document, sheets, lambda file: store.picture_path(file).read_bytes())
+    make_folder(out / "tables")
+    for each in sheets:
+        atomic_write_bytes(out / "tables" / f"{each.name}.csv", each.csv)
+    text = "\n".join([document["size"], "", *(each.markdown for each in sheets)])
+    atomic_write_bytes(out / MARKDOWN, text.encode())
+    atomic_write_bytes(out / NUMBERS, json_bytes(document))
+    atomic_write_bytes(out / PAGE, page.encode())
+    return document
 
 
 def _size_words(rows: Sequence[Row], size: SimulatedSize | None) -> str:
