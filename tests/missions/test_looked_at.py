@@ -10,8 +10,9 @@ from sorvolo.detection.contract import ModelInfo
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.missions.flight.looked_at import LookedAt, ground_for, looked_at, searched_document
-from sorvolo.missions.flight.map_objects import is_good, with_objects
+from sorvolo.missions.flight.map_objects import with_objects
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
+from sorvolo.missions.mission import is_good
 from sorvolo.missions.watch.run import headline_of_watch
 from sorvolo.missions.watch.settings import WatchSettings
 from sorvolo.search.looked_ground import ClassGround, LookedGround, near_ground
