@@ -136,6 +136,17 @@ def test_a_mission_that_is_off_as_a_whole_shows_who_parked_in_the_next_bay() -> 
         assert len(register.findings) == 6
 
 
+def test_what_a_date_did_not_see_is_known_again_though_each_date_is_off() -> None:
+    """Three dates, metres off to opposite sides; the second passed one of six cars by."""
+    cars, wide = np.arange(6) * 9.0, {"sigma_m": 1.9}
+    seen = [sighting(0, "map", east_m, **wide) for east_m in cars]
+    seen += [sighting(1, "map", east_m + 3.0, **wide) for east_m in cars[1:]]
+    seen += [sighting(2, "map", east_m - 3.0, **wide) for east_m in cars]
+    found = associate(seen, [look(0), look(2)]).findings
+    assert [len(each.sightings) for each in found] == [2, 3, 3, 3, 3, 3]
+    assert found[1].position_m[0] == 6.0, "where the newest date puts it"
+
+
 def test_moving_things_are_one_within_a_date_and_never_between_dates() -> None:
     """A walker where his speed takes him; the same place a day later is another's."""
     walks = {"moving": True, "velocity_m_s": (1.0, 0.0), "label": "person"}

@@ -24,6 +24,7 @@ _WALKS_M_S = (
     2.0  # by so much what moves may be off for each second between two missions' last sight of it
 )
 _SURELY_OFF = 3  # things seen again that show how far a mission as a whole is off
+_AGREE_M = 1.0  # so far apart at most, they show the same
 _SIGMA_OF_MEDIAN = 0.85  # per axis, by the median distance of a normal scatter in the plane
 _LIKE_SIZE = 2.5  # lengths further apart than this ratio are two things, where their classes differ
 _LIKE_CLASS = 0.1  # classes' shares that agree less are two classes
@@ -199,29 +200,34 @@ def _order(each: MissionSighting | SearchedDate) -> tuple[float, str, str, int, 
 
 
 class _Thing:
-    """A finding while missions are added."""
+    """A finding while missions are added. `known_m` is its place with its missions' common errors taken off."""
 
     def __init__(self, id_: str) -> None:
         self.id, self.gone = id_, ""
         self.sightings: list[MissionSighting] = []
         self.of_date: list[MissionSighting] = []
         self.sums: dict[str, float] = {}
+        self._off_m: list[Floats] = []
 
-    def add(self, sighting: MissionSighting) -> None:
-        """Take a sighting; of a date's places, the mean by their errors counts."""
+    def add(self, sighting: MissionSighting, off_m: Floats) -> None:
+        """Take a sighting of a mission that is off by (2,) as a whole; of a date's places, the mean by their errors
+        counts."""
         if self.of_date and self.of_date[0].date != sighting.date:
-            self.of_date = []
+            self.of_date, self._off_m = [], []
         self.of_date.append(sighting)
+        self._off_m.append(off_m)
         self.sightings.append(sighting)
         for name, share in _odds(sighting).items():
             self.sums[name] = self.sums.get(name, 0.0) + share * sighting.score
         weights = [max(_known(each.sigma_m, 10.0), 0.01) ** -2 for each in self.of_date]
         self.sigma_m = max(weights) ** -0.5  # missions of one flight err in common
-        places_m = [each.position_m for each in self.of_date]
-        if len(places_m) == 1 or sighting.moving:
-            self.place_m = sighting.position_m
-        else:
-            self.place_m = np.array(weights) @ np.array(places_m) / sum(weights)
+        places_m = np.array([each.position_m for each in self.of_date])
+        if sighting.moving:
+            weights = [0.0] * (len(weights) - 1) + [1.0]
+        self.place_m, off_m = (
+            np.array(weights) @ np.array(each) / sum(weights) for each in (places_m, self._off_m)
+        )
+        self.known_m = self.place_m - off_m
 
     @property
     def left(self) -> str:
@@ -252,23 +258,18 @@ class _Working:
     def take(self, mission: Sequence[MissionSighting]) -> None:
         """Add all sightings of one mission, each to a finding of its own."""
         pairs = self._near(mission)
-        joined = _one_to_one(pairs, np.zeros(2), math.inf)
-        off_m = [
-            each.off_m for each in pairs if joined.get(each.row) == each.number and each.stands
-        ]
-        if len(off_m) >= _SURELY_OFF:
-            # a mission errs in common; what is left between its things and those known is how far they scatter
-            shift_m = np.median(off_m, axis=0)
-            scatter_m = _SIGMA_OF_MEDIAN * float(np.median(np.hypot(*(off_m - shift_m).T)))
-            joined = _one_to_one(pairs, shift_m, scatter_m)
+        off_m = np.zeros(2)
+        joined = _one_to_one(pairs, off_m, math.inf)
+        if (common := _common_error(pairs, least=max(_SURELY_OFF, len(joined) / 2))) is not None:
+            off_m, joined = common[0], _one_to_one(pairs, *common)
         for row, sighting in enumerate(mission):
             if (number := joined.get(row)) is None:
                 number = len(self.things)
                 self.things.append(_Thing(self._id(sighting)))
                 self._stands[number] = True
             self._seen.add(number)
-            self.things[number].add(sighting)
-            self._places_m[number] = self.things[number].place_m
+            self.things[number].add(sighting, off_m)
+            self._places_m[number] = self.things[number].known_m
 
     def _near(self, mission: Sequence[MissionSighting]) -> list["_Pair"]:
         """Each sighting of a mission, by row, with each thing near it that it may be, by number."""
@@ -374,12 +375,30 @@ def _pair(row: int, sighting: MissionSighting, number: int, thing: _Thing) -> _P
     return _Pair(
         row,
         number,
-        sighting.position_m - thing.place_m - np.multiply(last.velocity_m_s, between_s),
+        sighting.position_m - thing.known_m - np.multiply(last.velocity_m_s, between_s),
         _REACH_OF_LENGTH * length_m + _REACH_M + _WALKS_M_S * abs(between_s),
         math.hypot(_known(sighting.sigma_m), _known(thing.sigma_m)),
         1 - shared,
         not moves,
     )
+
+
+def _common_error(pairs: Sequence[_Pair], least: float) -> tuple[Floats, float] | None:
+    """By how much, (2,), a mission is off as a whole, and how far its things scatter around that, 1 sigma per axis: as
+    most sightings agree, of a row of like things too. None where fewer than `least` do."""
+    standing = [each for each in pairs if each.stands]
+    if len(standing) < least:
+        return None
+    off_m = np.array([each.off_m for each in standing])
+    rows = np.array([each.row for each in standing])
+    agreeing = [np.array(each) for each in cKDTree(off_m).query_ball_point(off_m, _AGREE_M)]
+    votes = [len(np.unique(rows[each])) for each in agreeing]
+    best = agreeing[max(range(len(votes)), key=lambda k: (votes[k], -np.hypot(*off_m[k])))]
+    if len(np.unique(rows[best])) < least:
+        return None
+    shift_m = np.median(off_m[best], axis=0)
+    scatter_m = float(np.median(np.hypot(*(off_m[best] - shift_m).T)))
+    return shift_m, _SIGMA_OF_MEDIAN * scatter_m
 
 
 def _one_to_one(pairs: Sequence[_Pair], shift_m: Floats, most_sigma_m: float) -> dict[int, int]:
