@@ -173,25 +173,37 @@ sys.exit(sorvolo.cli.main.main(["models", "list"]))
     assert done.returncode == 0 and "default" in done.stdout, done.stderr
 
 
+def pinned(lock: str) -> list[tuple[str, str]]:
+    """The packages of a lock, by their canonical names, and their versions."""
+    text = (ROOT / lock).read_text(encoding="utf-8")
+    found = re.findall(r"^([\w.-]+)==([^\s\\]+)", text, re.M)
+    return [(canonicalize_name(name), version) for name, version in found]
+
+
+TOGETHER = ("requirements.lock", "requirements-training.lock", "requirements-notebooks.lock")
+
+
 def test_locks_that_are_installed_together_agree() -> None:
     """Two versions of one package cannot be installed, and a fresh clone would end there."""
     versions: dict[str, set[str]] = {}
-    for lock in ("requirements.lock", "requirements-training.lock", "requirements-notebooks.lock"):
-        for line in (ROOT / lock).read_text(encoding="utf-8").splitlines():
-            name, _, version = line.partition("==")
-            if version:
-                versions.setdefault(name.lower().replace("_", "-"), set()).add(version)
+    for name, version in (each for lock in TOGETHER for each in pinned(lock)):
+        versions.setdefault(name, set()).add(version)
     assert not {name: each for name, each in versions.items() if len(each) > 1}
+
+
+@pytest.mark.parametrize(
+    "lock", ["requirements.lock", "requirements-build.lock", "requirements-docs.lock"]
+)
+def test_every_package_of_a_lock_has_hashes_and_no_address(lock: str) -> None:
+    text = (ROOT / lock).read_text(encoding="utf-8")
+    blocks = re.split(r"^(?=[\w.-]+==)", text, flags=re.M)[1:]
+    assert len(blocks) == len(pinned(lock)) and "://" not in text
+    assert not [each.split()[0] for each in blocks if "--hash=sha256:" not in each]
 
 
 def test_the_locks_hold_all_that_their_packages_require() -> None:
     """The environment is installed from them without their dependencies."""
-    locked = {}
-    for lock in ("requirements.lock", "requirements-training.lock", "requirements-notebooks.lock"):
-        for line in (ROOT / lock).read_text(encoding="utf-8").splitlines():
-            if "==" in line and not line.startswith("#"):
-                name, _, version = line.partition("==")
-                locked[canonicalize_name(name)] = version
+    locked = dict(each for lock in TOGETHER for each in pinned(lock))
     missing = []
     for name in locked:
         try:
@@ -207,11 +219,7 @@ def test_the_locks_hold_all_that_their_packages_require() -> None:
 
 
 def test_build_lock_holds_what_the_build_requires() -> None:
-    locked = dict(
-        line.split("==")
-        for line in (ROOT / "requirements-build.lock").read_text(encoding="utf-8").splitlines()
-        if "==" in line
-    )
+    locked = dict(pinned("requirements-build.lock"))
     for required in PROJECT["build-system"]["requires"]:
         name, _, least = required.partition(">=")
         assert [int(each) for each in locked[name].split(".")] >= [
