@@ -28,7 +28,7 @@ class Forest:
 def make_forest(
     seed: int, side_m: float, leaves_per_m2: float, people_m: PointsM, floor_m: float = 0.0
 ) -> Forest:
-    """A forest around (0, 0); 60 % of the floor is hidden by 3 leaves a square metre, 80 % by 6."""
+    """A forest around (0, 0); 3 leaves a square metre hide about half of the floor, 6 two thirds."""
     draw = np.random.default_rng(seed)
     px = int(side_m / _GROUND_M_PER_PX)
     ground = np.full((px, px), 90.0, np.float32)
