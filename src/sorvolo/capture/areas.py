@@ -331,7 +331,13 @@ def _from_text(path: Path, text: str) -> list[Rings]:
     first = next((index for index, line in enumerate(lines) if line), 0)
     names = [name.strip('"').lower() for name in _SEPARATOR.split(lines[first])]
     if any(name in _LATITUDE_NAMES for name in names):
-        columns = _named_columns(path, names)
+        latitude = [names.index(name) for name in _LATITUDE_NAMES if name in names]
+        longitude = [names.index(name) for name in _LONGITUDE_NAMES if name in names]
+        if not latitude or not longitude:
+            raise InputError(
+                f"{path}: the header {' '.join(names)[:60]!r} names no latitude and longitude"
+            )
+        columns = latitude[0], longitude[0]
         lines = lines[first + 1 :]
     lists: list[list[tuple[float, float]]] = [[]]
     for number, line in enumerate(lines, start=1):
@@ -353,16 +359,6 @@ def _from_text(path: Path, text: str) -> list[Rings]:
     if not polygons:
         raise InputError(f"{path}: no coordinates in it")
     return polygons
-
-
-def _named_columns(path: Path, names: list[str]) -> tuple[int, int]:
-    latitude = [names.index(name) for name in _LATITUDE_NAMES if name in names]
-    longitude = [names.index(name) for name in _LONGITUDE_NAMES if name in names]
-    if not latitude or not longitude:
-        raise InputError(
-            f"{path}: the header {' '.join(names)[:60]!r} names no latitude and longitude"
-        )
-    return latitude[0], longitude[0]
 
 
 def _area_of_list(path: Path, lonlat: Floats) -> list[Rings]:

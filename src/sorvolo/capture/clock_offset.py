@@ -212,11 +212,6 @@ def _hypotheses(
     return begin_s, tuple(rivals_s)
 
 
-def _outlying_m(miss_m: Floats) -> float:
-    """From which distance on a fix counts as wrong."""
-    return 3 * float(np.median(miss_m)) + 1e-9
-
-
 def _smooth_path(
     fix_s: Floats,
     fixes_m: PointsM,
@@ -260,7 +255,8 @@ def _offset_sigma_s(times_s: Floats, fixes_m: PointsM, places_m: PointsM) -> flo
     some frames, evenly spread, make it too large rather than too small.
     """
     miss_m = np.linalg.norm(fixes_m - places_m, axis=1)
-    rows = np.flatnonzero(miss_m <= _outlying_m(miss_m))
+    # From which distance on a fix counts as wrong.
+    rows = np.flatnonzero(miss_m <= 3 * float(np.median(miss_m)) + 1e-9)
     velocity_m_s = np.gradient(places_m, times_s, axis=0)[rows]
     some = np.unique(np.linspace(0, len(rows) - 1, _MOST_FRAMES).round().astype(int))
     rows, velocity_m_s = rows[some], velocity_m_s[some]

@@ -101,7 +101,16 @@ class FlightTelemetry:
     @property
     def speed_m_s(self) -> float:
         """The speed that three quarters of the flight stay below, over steps of a second or more."""
-        return _speed_m_s(self.track.sample_s[self._known], self.track.east_north_m[self._known])
+        path_s = self.track.sample_s[self._known]
+        path_m = self.track.east_north_m[self._known]
+        if len(path_s) < 2:
+            return 1.0
+        times = np.arange(path_s[0], path_s[-1], max(1.0, float(np.median(np.diff(path_s)))))
+        if len(times) < 2:
+            return 1.0
+        steps = np.column_stack([np.interp(times, path_s, path_m[:, k]) for k in range(2)])
+        speeds = np.linalg.norm(np.diff(steps, axis=0), axis=1) / np.diff(times)
+        return max(_SLOWEST_M_S, float(np.percentile(speeds, 75)))
 
     def offset_seen(
         self, seconds: Sequence[float], seen_m: PointsM, applied_s: float
@@ -235,17 +244,6 @@ def local_prior(camera: Camera, *, first: bool) -> CameraPrior:
     sigma = np.full(3, 1e-3 * camera.fx_px) if first else np.full(3, np.inf)
     attitude = np.array([4.0, 4.0, 0.1]) if first else np.array([12.0, 12.0, np.inf])
     return CameraPrior(position_m, sigma, rotation, attitude, source="no telemetry")
-
-
-def _speed_m_s(path_s: Floats, path_m: PointsM) -> float:
-    if len(path_s) < 2:
-        return 1.0
-    times = np.arange(path_s[0], path_s[-1], max(1.0, float(np.median(np.diff(path_s)))))
-    if len(times) < 2:
-        return 1.0
-    steps = np.column_stack([np.interp(times, path_s, path_m[:, k]) for k in range(2)])
-    speeds = np.linalg.norm(np.diff(steps, axis=0), axis=1) / np.diff(times)
-    return max(_SLOWEST_M_S, float(np.percentile(speeds, 75)))
 
 
 def _continued(before: CameraTrack, now: CameraTrack) -> CameraTrack:

@@ -141,17 +141,24 @@ def read_photo_metadata(path: Path) -> PhotoMetadata:
     )
     full_height_px = round(full_width_px * header.height_px / header.width_px)
     place, place_doubt = _place(gps, properties)
+    orientation = _whole(main.get(ExifTags.Base.Orientation))
+    unit = _whole(detail.get(ExifTags.Base.FocalPlaneResolutionUnit)) or 2
+    # UTC of the exposure: the drone's stamp, else the GPS receiver's, else a clock with its zone;
+    # else 0.
+    written = properties.get("dji:UTCAtExposure", properties.get("sensefly:UTCTime", ""))
+    written = written.replace("-", ":").replace("T", " ").rstrip("Z")
+    stamp_ns = _parse_ns(written if "." in written else f"{written}.0", "%Y:%m:%d %H:%M:%S.%f")
     return PhotoMetadata(
         header.width_px,
         header.height_px,
-        _orientation(main),
+        orientation if 1 <= orientation <= 8 else 1,
         _text(main.get(ExifTags.Base.Make)),
         _text(main.get(ExifTags.Base.Model)),
         _positive(detail.get(ExifTags.Base.FocalLength)),
         _positive(detail.get(ExifTags.Base.FocalLengthIn35mmFilm)),
-        _focal_plane_px_per_mm(detail),
+        _positive(detail.get(ExifTags.Base.FocalPlaneXResolution)) / _MM_PER_UNIT.get(unit, nan),
         full_width_px,
-        _utc_ns(main, detail, gps, properties),
+        stamp_ns or _receiver_utc_ns(gps) or _zoned_clock_ns(main, detail),
         _camera_clock_ns(main, detail),
         _telemetry_columns(gps, properties) | place,
         unreadable,
@@ -268,16 +275,6 @@ def _text(value: Any) -> str:
     return value.split("\0")[0].strip() if isinstance(value, str) else ""
 
 
-def _orientation(main: _Tags) -> int:
-    orientation = _whole(main.get(ExifTags.Base.Orientation))
-    return orientation if 1 <= orientation <= 8 else 1
-
-
-def _focal_plane_px_per_mm(detail: _Tags) -> float:
-    unit = _whole(detail.get(ExifTags.Base.FocalPlaneResolutionUnit)) or 2
-    return _positive(detail.get(ExifTags.Base.FocalPlaneXResolution)) / _MM_PER_UNIT.get(unit, nan)
-
-
 def _parse_ns(text: str, pattern: str) -> int:
     """Nanoseconds since 1970 of a date as written, read as UTC; 0 for none and outside 1990-2200."""
     try:
@@ -301,14 +298,6 @@ def _camera_clock_ns(main: _Tags, detail: _Tags) -> int:
             fraction = re.match(r"\d{1,9}", _text(detail.get(fraction_tag)))
             return time_ns + (int(fraction[0].ljust(9, "0")) if fraction else 0)
     return 0
-
-
-def _utc_ns(main: _Tags, detail: _Tags, gps: _Tags, properties: Mapping[str, str]) -> int:
-    """UTC of the exposure: the drone's stamp, else the GPS receiver's, else a clock with its zone; else 0."""
-    written = properties.get("dji:UTCAtExposure", properties.get("sensefly:UTCTime", ""))
-    written = written.replace("-", ":").replace("T", " ").rstrip("Z")
-    stamp_ns = _parse_ns(written if "." in written else f"{written}.0", "%Y:%m:%d %H:%M:%S.%f")
-    return stamp_ns or _receiver_utc_ns(gps) or _zoned_clock_ns(main, detail)
 
 
 def _receiver_utc_ns(gps: _Tags) -> int:
@@ -339,8 +328,12 @@ def _zoned_clock_ns(main: _Tags, detail: _Tags) -> int:
 
 def _telemetry_columns(gps: _Tags, properties: Mapping[str, str]) -> dict[str, float]:
     altitude_m, is_ellipsoidal = _altitude(gps)
+    # The receiver's own estimate, else one from its dilution of precision.
+    stated_m = _positive(gps.get(ExifTags.GPS.GPSHPositioningError))
     columns = {
-        "horizontal_sigma_m": _horizontal_sigma_m(gps),
+        "horizontal_sigma_m": stated_m
+        if isfinite(stated_m)
+        else sigma_from_hdop_m(_positive(gps.get(ExifTags.GPS.GPSDOP))),
         "course_deg": _number(gps.get(ExifTags.GPS.GPSTrack)),
         "speed_m_s": _number(gps.get(ExifTags.GPS.GPSSpeed))
         * _M_S_PER_SPEED_UNIT.get(_text(gps.get(ExifTags.GPS.GPSSpeedRef)) or "K", nan),
@@ -399,16 +392,6 @@ def apart_m(one: Mapping[str, float], other: Mapping[str, float]) -> float:
 
 def _finite(columns: Mapping[str, float]) -> dict[str, float]:
     return {name: value for name, value in columns.items() if isfinite(value)}
-
-
-def _horizontal_sigma_m(gps: _Tags) -> float:
-    """The receiver's own estimate, else one from its dilution of precision."""
-    stated_m = _positive(gps.get(ExifTags.GPS.GPSHPositioningError))
-    return (
-        stated_m
-        if isfinite(stated_m)
-        else sigma_from_hdop_m(_positive(gps.get(ExifTags.GPS.GPSDOP)))
-    )
 
 
 def _size_deg(parts: Any) -> tuple[float, bool]:

@@ -126,7 +126,12 @@ def read_properties(packet: bytes) -> dict[str, str]:
     Parts of a structure are "maker:Structure.Name". Raises ValueError or ParseError for damaged XML, and for entities,
     which no camera writes.
     """
-    makers = _makers_by_address(packet)
+    makers: dict[str, str] = {}
+    for prefix, address in _DECLARATION.findall(packet):
+        text = address.decode("utf-8", "replace")
+        known = next((maker for part, maker in _MAKER_OF_ADDRESS if part in text.lower()), None)
+        if maker := known or _MAKER_OF_PREFIX.get(prefix.decode("ascii", "replace").lower()):
+            makers[text] = maker
     properties: dict[str, str] = {}
     _collect(ElementTree.fromstring(packet.strip(b"\0 \r\n\t")), "", makers, properties)
     return properties
@@ -134,6 +139,9 @@ def read_properties(packet: bytes) -> dict[str, str]:
 
 def telemetry_columns(properties: Mapping[str, str]) -> dict[str, float]:
     """The telemetry columns (survey.flight.TELEMETRY_COLUMNS) that the properties state, NaN for the others."""
+    north_m_s = _first(properties, "dji:FlightXSpeed", "autel:FlightXSpeed")
+    east_m_s = _first(properties, "dji:FlightYSpeed", "autel:FlightYSpeed")
+    speed_m_s = hypot(north_m_s, east_m_s)
     columns = {
         "height_above_takeoff_m": _first(properties, *_ABOVE_TAKEOFF),
         **{
@@ -141,7 +149,14 @@ def telemetry_columns(properties: Mapping[str, str]) -> dict[str, float]:
             for axis, names in _GIMBAL.items()
         },
         **{f"body_{axis.lower()}_deg": _first(properties, *names) for axis, names in _BODY.items()},
-        **_velocity_columns(properties),
+        **{
+            "speed_m_s": speed_m_s
+            if isfinite(speed_m_s)
+            else _first(properties, "sensefly:GroundSpeed"),
+            "course_deg": degrees(atan2(east_m_s, north_m_s)) % 360
+            if north_m_s or east_m_s
+            else nan,
+        },
         **_sigma_columns(properties),
     }
     if not isfinite(columns["camera_pitch_deg"]):
@@ -204,16 +219,6 @@ def number(properties: Mapping[str, str], name: str) -> float:
     return value / divisor if divisor else nan
 
 
-def _makers_by_address(packet: bytes) -> dict[str, str]:
-    makers: dict[str, str] = {}
-    for prefix, address in _DECLARATION.findall(packet):
-        text = address.decode("utf-8", "replace")
-        known = next((maker for part, maker in _MAKER_OF_ADDRESS if part in text.lower()), None)
-        if maker := known or _MAKER_OF_PREFIX.get(prefix.decode("ascii", "replace").lower()):
-            makers[text] = maker
-    return makers
-
-
 def _collect(
     element: Element, owner: str, makers: Mapping[str, str], properties: dict[str, str]
 ) -> None:
@@ -245,18 +250,6 @@ def _states_ellipsoid(properties: Mapping[str, str]) -> bool:
         return True
     flag = number(properties, "autel:RtkFlag")
     return isfinite(flag) and int(flag) in _RTK_FLAGS
-
-
-def _velocity_columns(properties: Mapping[str, str]) -> dict[str, float]:
-    north_m_s = _first(properties, "dji:FlightXSpeed", "autel:FlightXSpeed")
-    east_m_s = _first(properties, "dji:FlightYSpeed", "autel:FlightYSpeed")
-    speed_m_s = hypot(north_m_s, east_m_s)
-    return {
-        "speed_m_s": speed_m_s
-        if isfinite(speed_m_s)
-        else _first(properties, "sensefly:GroundSpeed"),
-        "course_deg": degrees(atan2(east_m_s, north_m_s)) % 360 if north_m_s or east_m_s else nan,
-    }
 
 
 def _sigma_columns(properties: Mapping[str, str]) -> dict[str, float]:

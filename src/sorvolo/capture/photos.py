@@ -198,7 +198,9 @@ def read_album(
     found, place_notices = _placed(found, positions, strict=strict)
     timed, start_origin, time_notices = _put_in_time(found)
     distinct = _mark_duplicates(timed)
-    width_px, height_px = _usual_size(distinct)
+    # Width and height that most usable photos have as shown; of equally many the larger.
+    sizes = Counter(photo.metadata.used_size_px for photo in distinct if not photo.problem)
+    width_px, height_px = max(sizes, key=lambda size: (sizes[size], size[0] * size[1], size))
     photos = [_check_size(photo, width_px, height_px) for photo in distinct]
     typical = next(
         photo.metadata
@@ -473,12 +475,6 @@ def _digest_of_ends(path: Path, size: int) -> bytes:
         head = file.read(_EDGE_BYTES)
         file.seek(max(0, size - _EDGE_BYTES))
         return hashlib.sha256(head + file.read(_EDGE_BYTES)).digest()
-
-
-def _usual_size(photos: Sequence[Photo]) -> tuple[int, int]:
-    """Width and height that most usable photos have as shown; of equally many the larger."""
-    sizes = Counter(photo.metadata.used_size_px for photo in photos if not photo.problem)
-    return max(sizes, key=lambda size: (sizes[size], size[0] * size[1], size))
 
 
 def _check_size(photo: Photo, width_px: int, height_px: int) -> Photo:

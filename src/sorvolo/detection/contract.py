@@ -166,7 +166,9 @@ def info_from_metadata(metadata: Mapping[str, str], where: str) -> ModelInfo:
 def _info(fields: Mapping[str, Any]) -> ModelInfo:
     if missing := [name for name in _NEEDED if name not in fields]:
         raise ValueError(f"it lacks {', '.join(missing)}")
-    classes = _classes(fields)
+    classes = tuple(str(each) for each in fields["classes"])
+    if not classes or len(set(classes)) != len(classes):
+        raise ValueError(f"its classes must be one or more different names, not {list(classes)}")
     thresholds, best_px = _thresholds(fields, "thresholds", classes), _best_px(fields, classes)
     turned = _thresholds(fields, "turned", classes) if fields.get("turned") else {}
     stride = int(fields.get("stride", _FALLBACK_STRIDE))
@@ -221,13 +223,6 @@ def _info(fields: Mapping[str, Any]) -> ModelInfo:
         columns=columns,
         **texts,
     )
-
-
-def _classes(fields: Mapping[str, Any]) -> tuple[str, ...]:
-    classes = tuple(str(each) for each in fields["classes"])
-    if not classes or len(set(classes)) != len(classes):
-        raise ValueError(f"its classes must be one or more different names, not {list(classes)}")
-    return classes
 
 
 def _thresholds(fields: Mapping[str, Any], key: str, classes: Sequence[str]) -> dict[str, float]:

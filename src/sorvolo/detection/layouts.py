@@ -65,10 +65,6 @@ def _centred(rows: Numbers) -> Floats:
     return np.asarray(np.concatenate([middle - half, middle + half], axis=1), np.float64)
 
 
-def _sigmoid(values: Numbers) -> Floats:
-    return np.asarray(1 / (1 + np.exp(-np.asarray(values, np.float64))), np.float64)
-
-
 def _grid(size: Size, strides: Sequence[int]) -> tuple[Floats, Floats]:
     """Column and row (N, 2) of each cell of all levels, level by level, and the level's stride (N, 1)."""
     cells, steps = [], []
@@ -124,7 +120,9 @@ def _detr(outputs: Mapping[str, Numbers], size: Size) -> Decoded:
     boxes = next(each for each in arrays if each.ndim == 2 and each.shape[1] == 4)
     if len(outputs) == 2:
         logits = next(each for each in arrays if each is not boxes)
-        return _centred(boxes) * scale, _sigmoid(logits)
+        return _centred(boxes) * scale, np.asarray(
+            1 / (1 + np.exp(-np.asarray(logits, np.float64))), np.float64
+        )
     labels = next(each for each in arrays if each.ndim == 1 and each.dtype.kind in "iu")
     sure = next(each for each in arrays if each.ndim == 1 and each.dtype.kind == "f")
     scores = np.zeros((len(labels), int(labels.max(initial=0)) + 1))

@@ -88,7 +88,13 @@ def _features(gray: ImageGray, view: View) -> _Found:
     rays = view.camera.resized(gray.shape[1], gray.shape[0]).rays_from_pixels(found.points_px)[
         :, :2
     ]
-    return _Found(view, found, gray.shape[1], rays, _on_ground(rays, view))
+    # (N, 3) where rays of a view meet level ground at height 0; NaN for those that never do.
+    away = np.column_stack([rays, np.ones(len(rays))]) @ view.site_from_camera.rotation.T
+    eye = view.site_from_camera.translation_m
+    down = np.where(away[:, 2] < -0.05 * np.linalg.norm(away, axis=1), away[:, 2], np.nan)
+    return _Found(
+        view, found, gray.shape[1], rays, np.asarray(eye + away * (-eye[2] / down)[:, None])
+    )
 
 
 def _pairs(views: Sequence[View]) -> Iterator[tuple[int, int]]:
@@ -122,14 +128,6 @@ def _shared(left: _Found, right: _Found) -> Rows:
         if good.sum() >= _LEAST_INLIERS:
             return matched[good]
     return matched[:0]
-
-
-def _on_ground(rays: Floats, view: View) -> PointsM:
-    """(N, 3) where rays of a view meet level ground at height 0; NaN for those that never do."""
-    away = np.column_stack([rays, np.ones(len(rays))]) @ view.site_from_camera.rotation.T
-    eye = view.site_from_camera.translation_m
-    down = np.where(away[:, 2] < -0.05 * np.linalg.norm(away, axis=1), away[:, 2], np.nan)
-    return np.asarray(eye + away * (-eye[2] / down)[:, None])
 
 
 def _near(ground_m: PointsM, view: View, margin: float) -> Rows:
@@ -273,11 +271,7 @@ def _first(views: Sequence[View], tracks: Tracks) -> Scene:
     scene = replace(scene, points_m=triangulate(scene))
     known = np.asarray(np.isfinite(scene.points_m).all(axis=1))
     scene = scene.keeping(known[scene.point])
-    return scene.keeping(_in_front(scene))
-
-
-def _in_front(scene: Scene) -> Mask:
-    return np.asarray(np.isfinite(scene.residuals_px()).all(axis=1))
+    return scene.keeping(np.asarray(np.isfinite(scene.residuals_px()).all(axis=1)))
 
 
 def _fitting(scene: Scene, limit_px: float) -> Mask:

@@ -115,7 +115,15 @@ def seen_through(
             up_m[here],
             rest,
         ):  # a plate beside a wall is apart from it once its own cells are gone
-            found[here] |= known[here] & _mostly(model, through[here], shown[here], lattice.cell_m)
+            # (H, W) the cells of pieces that are seen through often, of the times that they are
+            # seen.
+            piece = pieces(model, _SEEN_STEP_CELLS * lattice.cell_m)
+            often, seen = (
+                np.bincount(piece.ravel(), each.ravel()) for each in (through[here], shown[here])
+            )
+            found[here] |= known[here] & np.asarray(
+                ((often > 0) & (often >= _SEEN_SHARE * seen))[piece]
+            )
     return found
 
 
@@ -187,10 +195,3 @@ def _seen_at(lattice: Lattice, ground: Floats32, view: View, places: _Places) ->
     agrees, above_m = alike[at] > _SEEN_AGREES, up_m - shows_m[at]
     margin_m = _SEEN_MARGIN_CELLS * lattice.cell_m
     return agrees & (above_m > margin_m), agrees & (np.abs(above_m) <= margin_m)
-
-
-def _mostly(up_m: Floats32, through: ImageGray, shown: ImageGray, cell_m: float) -> Mask:
-    """(H, W) the cells of pieces that are seen through often, of the times that they are seen."""
-    piece = pieces(up_m, _SEEN_STEP_CELLS * cell_m)
-    often, seen = (np.bincount(piece.ravel(), each.ravel()) for each in (through, shown))
-    return np.asarray(((often > 0) & (often >= _SEEN_SHARE * seen))[piece])

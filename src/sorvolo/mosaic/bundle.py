@@ -314,7 +314,18 @@ def _moved_as_one(problem: _Problem, nodes: Nodes, shared: Floats) -> tuple[Node
     equations = _normal_equations(problem, nodes, shared)
     for _ in range(_STEPS_AS_ONE):
         middle_m = nodes.centres_m[nodes.own].mean(axis=0) * [1, 1, 0]
-        basis = _common_motions(nodes.centres_m[nodes.own] - middle_m)
+        # (6 n + 8, 12) how n cameras' six unknowns, and the shared ones, follow a shift east and
+        # north, a turn, a scale. `offsets_m` (n, 3): the cameras from the point on the ground
+        # about which they turn and grow.
+        offsets_m = nodes.centres_m[nodes.own] - middle_m
+        count = len(offsets_m)
+        motions = np.zeros((count, 6, 4))
+        motions[:, 3, 0] = motions[:, 4, 1] = motions[:, 2, 2] = 1.0
+        motions[:, 3, 2], motions[:, 4, 2] = -offsets_m[:, 1], offsets_m[:, 0]
+        motions[:, 3:, 3] = offsets_m
+        basis = np.zeros((6 * count + len(SHARED), 4 + len(SHARED)))
+        basis[: 6 * count, :4] = motions.reshape(-1, 4)
+        basis[6 * count :, 4:] = np.eye(len(SHARED))
         among, pull = basis.T @ equations.times(basis), basis.T @ equations.gradient()
         step = np.asarray(np.linalg.lstsq(among, pull, rcond=None)[0], np.float64)
         trial_nodes, trial_shared = _move_as_one(nodes, middle_m, step[:4]), shared + step[4:]
@@ -323,22 +334,6 @@ def _moved_as_one(problem: _Problem, nodes: Nodes, shared: Floats) -> tuple[Node
             break
         nodes, shared, equations = trial_nodes, trial_shared, trial
     return nodes, shared
-
-
-def _common_motions(offsets_m: Floats) -> Floats:
-    """(6 n + 8, 12) how n cameras' six unknowns, and the shared ones, follow a shift east and north, a turn, a scale.
-
-    `offsets_m` (n, 3): the cameras from the point on the ground about which they turn and grow.
-    """
-    count = len(offsets_m)
-    motions = np.zeros((count, 6, 4))
-    motions[:, 3, 0] = motions[:, 4, 1] = motions[:, 2, 2] = 1.0
-    motions[:, 3, 2], motions[:, 4, 2] = -offsets_m[:, 1], offsets_m[:, 0]
-    motions[:, 3:, 3] = offsets_m
-    basis = np.zeros((6 * count + len(SHARED), 4 + len(SHARED)))
-    basis[: 6 * count, :4] = motions.reshape(-1, 4)
-    basis[6 * count :, 4:] = np.eye(len(SHARED))
-    return basis
 
 
 def _move_as_one(nodes: Nodes, middle_m: Floats, step: Floats) -> Nodes:
@@ -357,7 +352,17 @@ def _normal_equations(problem: _Problem, nodes: Nodes, shared: Floats) -> Normal
     if len(problem.pairs.old):
         _add_links(into, nodes, problem.pairs, shared, problem.position, problem.robust_sigmas)
     if len(problem.ground.node):
-        _add_ground(into, nodes, problem.ground, shared, problem.position, problem.robust_sigmas)
+        rows = linearise_ground(nodes, problem.ground, shared)
+        residual = rows.residual_px / rows.sigma_px[:, None]
+        squared = (residual**2).sum(-1) / problem.robust_sigmas**2
+        into.cost += float((rows.seen * np.log1p(squared)).sum()) * problem.robust_sigmas**2
+        root = np.sqrt(rows.seen / (1 + squared))[:, None]
+        jacobian = (
+            np.concatenate([rows.by_camera, rows.by_shared], axis=-1) / rows.sigma_px[:, None, None]
+        )
+        into.add(
+            jacobian * root[..., None], residual * root, (problem.position[problem.ground.node],)
+        )
     _add_telemetry(into, nodes, shared, problem.position, problem.robust_sigmas)
     held = problem.shared_sigma <= 0
     prior = np.where(held, 1e12, 1 / np.maximum(problem.shared_sigma, 1e-12) ** 2)
@@ -389,25 +394,6 @@ def _add_links(
             len(some.old), residual.shape[1], -1
         )
         into.add(jacobian, residual, (position[some.old], position[some.new]))
-
-
-def _add_ground(
-    into: NormalEquations,
-    nodes: Nodes,
-    ground: Ground,
-    shared: Floats,
-    position: Rows,
-    robust: float,
-) -> None:
-    rows = linearise_ground(nodes, ground, shared)
-    residual = rows.residual_px / rows.sigma_px[:, None]
-    squared = (residual**2).sum(-1) / robust**2
-    into.cost += float((rows.seen * np.log1p(squared)).sum()) * robust**2
-    root = np.sqrt(rows.seen / (1 + squared))[:, None]
-    jacobian = (
-        np.concatenate([rows.by_camera, rows.by_shared], axis=-1) / rows.sigma_px[:, None, None]
-    )
-    into.add(jacobian * root[..., None], residual * root, (position[ground.node],))
 
 
 def _add_telemetry(

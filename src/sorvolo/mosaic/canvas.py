@@ -302,7 +302,15 @@ class Canvas:
         picture = blend(labels, self._one_ahead(self._layers(ids, labels, x, y)))
         if self._known is not None and apron > WINDOW_APRON_PX:
             lasting = self._known.lasting(x, y, x + width, y + height) & (labels >= 0)
-            picture = settled(picture, self._stored(x, y, width, height), lasting)
+            # The picture that the tiles hold in a window, black where they hold none.
+            side = self._grid.tile_px
+            result = np.zeros((height, width, 3), np.uint8)
+            for row in range(y // side, (y + height - 1) // side + 1):
+                for column in range(x // side, (x + width - 1) // side + 1):
+                    tile = self._tiles.get((column, row))
+                    if tile is not None:
+                        _paste(result, tile[..., :3], column * side - x, row * side - y)
+            picture = settled(picture, result, lasting)
         inner = slice(apron, -apron)
         alpha = (labels[inner, inner] >= 0).view(np.uint8) * np.uint8(255)
         rgba = cv2.merge([*cv2.split(picture[inner, inner]), alpha])
@@ -356,17 +364,6 @@ class Canvas:
                     continue
                 x, y = chunk_column * _CHUNK_CELLS - column, chunk_row * _CHUNK_CELLS - row
                 _paste(result, chunk.winner, x, y)
-        return result
-
-    def _stored(self, x: int, y: int, width: int, height: int) -> ImageRGB:
-        """The picture that the tiles hold in a window, black where they hold none."""
-        side = self._grid.tile_px
-        result = np.zeros((height, width, 3), np.uint8)
-        for row in range(y // side, (y + height - 1) // side + 1):
-            for column in range(x // side, (x + width - 1) // side + 1):
-                tile = self._tiles.get((column, row))
-                if tile is not None:
-                    _paste(result, tile[..., :3], column * side - x, row * side - y)
         return result
 
     def _store(self, x: int, y: int, rgba: ImageRGBA) -> set[TileIndex]:

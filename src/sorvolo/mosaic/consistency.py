@@ -99,7 +99,11 @@ def _steps(groups: Sequence[Sequence[PlacedFrame]], figures: FlightFigures) -> l
     beside = [
         k
         for k in range(1, len(groups))
-        if any(_apart_m(centres[k], other) < 0.6 * figures.diagonal_m for other in centres[:k])
+        if any(
+            float(np.linalg.norm(centres[k][:, None] - other[None], axis=-1).min())
+            < 0.6 * figures.diagonal_m
+            for other in centres[:k]
+        )
     ]
     if not beside:
         return []
@@ -125,10 +129,6 @@ def _relief_doubts(figures: FlightFigures, graph: GraphReport | None) -> list[st
         f"{otherwise_m:.1f} m if it were level; give control points (--gcp), or use `sorvolo heights`, which measures "
         "the ground and makes a true orthophoto"
     ]
-
-
-def _apart_m(first_m: PointsM, second_m: PointsM) -> float:
-    return float(np.linalg.norm(first_m[:, None] - second_m[None], axis=-1).min())
 
 
 def _piece(frames: Sequence[PlacedFrame], stated: Stated) -> Piece | None:

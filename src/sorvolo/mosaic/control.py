@@ -119,7 +119,17 @@ def tie_control(
         expected_m = float(
             np.hypot(settings.sigma_m, _MARK_PX * np.median(heights_m) / problem.camera.fx_px)
         )
-        wrong = _wrong_point(seen, misses, used, expected_m, settings)
+        # The used point that misses most, where it misses more than surveying, marking and the
+        # others allow.
+        miss_m = {
+            label: float(np.linalg.norm(misses[k]))
+            for k, label in enumerate(seen.labels)
+            if label in used
+        }
+        worst = max(miss_m, key=lambda label: miss_m[label])
+        usual_m = float(np.median([value for label, value in miss_m.items() if label != worst]))
+        limit_m = max(_EXCLUDED_SIGMAS * expected_m, _EXCLUDED_TIMES * usual_m)
+        wrong = worst if miss_m[worst] > limit_m else None
         if wrong is None or len(used) == LEAST_CONTROL:
             break
         used.remove(wrong)
@@ -132,9 +142,13 @@ def tie_control(
         _residual(problem.control, number, rows, used, excluded)
         for number in range(len(problem.control.points))
     )
+    cameras_m = np.array([mapper.pose(each).translation_m for each in mapper.placed()])
+    picture_m = float(np.median(cameras_m[:, 2])) * problem.camera.width_px / problem.camera.fx_px
     remarks = (
         *_misfit_remarks(mapper, problem, seen, used, expected_m, settings),
-        *_layout_remarks(mapper, problem, seen.of(used), settings),
+        *layout_remarks(
+            np.unique(seen.of(used).place_m[:, :2], axis=0), cameras_m[:, :2], picture_m, settings
+        ),
     )
     missed_m = _rms_m(misses[np.array([label not in excluded for label in seen.labels], bool)])
     mapper.note_ground_miss(float(np.sqrt(max(0.0, missed_m**2 - expected_m**2) / 2)))
@@ -177,16 +191,6 @@ def _unlike_m(mapper: PlanarMapper, seen: _Seen, is_used: Rows) -> float:
 
 def _rms_m(off_m: PointsM) -> float:
     return float(np.sqrt((off_m**2).sum(axis=1).mean()))
-
-
-def _layout_remarks(
-    mapper: PlanarMapper, problem: ControlProblem, ties: GroundTies, settings: ControlSettings
-) -> tuple[str, ...]:
-    cameras_m = np.array([mapper.pose(each).translation_m for each in mapper.placed()])
-    picture_m = float(np.median(cameras_m[:, 2])) * problem.camera.width_px / problem.camera.fx_px
-    return layout_remarks(
-        np.unique(ties.place_m[:, :2], axis=0), cameras_m[:, :2], picture_m, settings
-    )
 
 
 def layout_remarks(
@@ -244,8 +248,21 @@ def _seen(
     marked = {each.label for each in marks}
     labels = tuple(each.label for each in control.points if each.label in marked)
     frame = LocalFrame(control.middle) if problem.is_datum else problem.frame
+    # (P, 3) in the site; the points' median height is taken for the ground's, points without one
+    # lie there.
+    latitude, longitude, height = (
+        np.array([getattr(each, name) for each in control.points])
+        for name in ("latitude_deg", "longitude_deg", "height_m")
+    )
+    level = np.full(len(latitude), frame.origin.height_m)
+    known = np.isfinite(height)
+    up_m = np.where(known, height - (np.median(height[known]) if known.any() else 0.0), 0.0)
     place_of = dict(
-        zip((each.label for each in control.points), _places_m(control, frame), strict=True)
+        zip(
+            (each.label for each in control.points),
+            np.column_stack([frame.site_from_wgs84(latitude, longitude, level)[:, :2], up_m]),
+            strict=True,
+        )
     )
     keyframes, pixels, point = _columns(marks, problem.keyframe_of, labels)
     count = np.bincount(point, minlength=len(labels))[point]
@@ -267,33 +284,6 @@ def _columns(
     rows = [(keyframe_of[each.frame], labels.index(each.label)) for each in marks]
     keyframes, points = np.array(rows, int).reshape(-1, 2).T
     return keyframes, np.array([(each.x_px, each.y_px) for each in marks]).reshape(-1, 2), points
-
-
-def _places_m(control: GroundControl, frame: LocalFrame) -> PointsM:
-    """(P, 3) in the site; the points' median height is taken for the ground's, points without one lie there."""
-    latitude, longitude, height = (
-        np.array([getattr(each, name) for each in control.points])
-        for name in ("latitude_deg", "longitude_deg", "height_m")
-    )
-    level = np.full(len(latitude), frame.origin.height_m)
-    known = np.isfinite(height)
-    up_m = np.where(known, height - (np.median(height[known]) if known.any() else 0.0), 0.0)
-    return np.column_stack([frame.site_from_wgs84(latitude, longitude, level)[:, :2], up_m])
-
-
-def _wrong_point(
-    seen: _Seen, misses: PointsM, used: set[str], expected_m: float, settings: ControlSettings
-) -> str | None:
-    """The used point that misses most, where it misses more than surveying, marking and the others allow."""
-    miss_m = {
-        label: float(np.linalg.norm(misses[k]))
-        for k, label in enumerate(seen.labels)
-        if label in used
-    }
-    worst = max(miss_m, key=lambda label: miss_m[label])
-    usual_m = float(np.median([value for label, value in miss_m.items() if label != worst]))
-    limit_m = max(_EXCLUDED_SIGMAS * expected_m, _EXCLUDED_TIMES * usual_m)
-    return worst if miss_m[worst] > limit_m else None
 
 
 def _check_fit(

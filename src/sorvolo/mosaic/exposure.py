@@ -6,7 +6,7 @@ undoes its exposure: what two frames a and b show of the same ground agrees when
 V(r_a) = log I_b + log g_b - log V(r_b). That is linear in log g, a2 and a4.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -144,7 +144,11 @@ def solve_exposure(
     """
     ids = sorted({each for link in pairs for each in link})
     camera_of = camera_of or dict.fromkeys(ids, 0)
-    unknowns = _unknowns(ids, camera_of)
+    cameras = sorted({camera_of[each] for each in ids})
+    lens = {camera: len(ids) + 2 * i for i, camera in enumerate(cameras)}
+    unknowns = _Unknowns(
+        {each: i for i, each in enumerate(ids)}, lens, {each: lens[camera_of[each]] for each in ids}
+    )
     if not any(len(each) for each in pairs.values()):
         return Exposure({e: np.ones(3) for e in ids}, {c: np.zeros(2) for c in unknowns.lens}, 0.0)
     solution, spread = _robust_solution(_equations(pairs, unknowns, settings), unknowns, settings)
@@ -229,14 +233,6 @@ class _Equations:
             a, b = self.radius2_a[some].astype(np.float64), self.radius2_b[some].astype(np.float64)
             one = np.ones_like(a)
             yield some, np.stack([one, -one, -a, -(a**2), b, b**2], axis=-1)
-
-
-def _unknowns(ids: Sequence[int], camera_of: Mapping[int, int]) -> _Unknowns:
-    cameras = sorted({camera_of[each] for each in ids})
-    lens = {camera: len(ids) + 2 * i for i, camera in enumerate(cameras)}
-    return _Unknowns(
-        {each: i for i, each in enumerate(ids)}, lens, {each: lens[camera_of[each]] for each in ids}
-    )
 
 
 def _equations(

@@ -360,14 +360,6 @@ def telemetry_trust(rows: NodeRows, tied: Mask, miss_m: Floats) -> Trust:
     )
     used = tied & angled
     used[contradicted] = False
-    return Trust(
-        _place_factors(stated_m, tied, miss_m),
-        _attitude_factors(stated_rad, used, error_rad),
-        contradicted,
-    )
-
-
-def _place_factors(stated_m: Floats, tied: Mask, miss_m: Floats) -> Floats:
     place = np.ones(3)
     fixed = tied & np.isfinite(stated_m[:, 0])
     if fixed.sum() >= _ENOUGH:
@@ -377,7 +369,11 @@ def _place_factors(stated_m: Floats, tied: Mask, miss_m: Floats) -> Floats:
     if high.sum() >= _ENOUGH:
         times = SIGMA_PER_MEDIAN_DEVIATION * np.median(np.abs(miss_m[high, 2]) / stated_m[high, 2])
         place[2] = np.clip(times, 0.5, 20.0)
-    return place
+    return Trust(
+        place,
+        _attitude_factors(stated_rad, used, error_rad),
+        contradicted,
+    )
 
 
 def _attitude_factors(stated_rad: Floats, used: Mask, error_rad: Floats) -> Floats:

@@ -53,7 +53,12 @@ def similarity_of_most(points_a: PointsM, points_b: PointsM) -> Matrix3 | None:
     if len(points_a) < 4:  # nothing can be left out
         return fit_similarity(points_a, points_b)
     a, b = points_a @ np.array([1, 1j]), points_b @ np.array([1, 1j])
-    first, second = _guesses(len(a))
+    # Index pairs of points: all of them while they are few, else some, the same each time.
+    count = len(a)
+    first, second = np.triu_indices(count, 1)
+    if len(first) > _MOST_GUESSES:
+        chosen = np.random.default_rng(count).choice(len(first), _MOST_GUESSES, replace=False)
+        first, second = first[chosen], second[chosen]
     apart = np.abs(b[first] - b[second]) > 0.2 * np.median(
         np.abs(b - np.median(b.real) - 1j * np.median(b.imag))
     )
@@ -72,12 +77,3 @@ def similarity_of_most(points_a: PointsM, points_b: PointsM) -> Matrix3 | None:
         best = np.linalg.norm(apply_homography(change, points_b) - points_a, axis=1)
         keep = best <= max(_MILD * float(np.partition(best, agreeing - 1)[agreeing - 1]), 1e-9)
     return change
-
-
-def _guesses(count: int) -> tuple[Rows, Rows]:
-    """Index pairs of points: all of them while they are few, else some, the same each time."""
-    first, second = np.triu_indices(count, 1)
-    if len(first) > _MOST_GUESSES:
-        chosen = np.random.default_rng(count).choice(len(first), _MOST_GUESSES, replace=False)
-        first, second = first[chosen], second[chosen]
-    return first, second

@@ -555,7 +555,12 @@ class PlanarMapper:
         tie.refusals.pop(other, None)
         tie.links.append(found)
         if len(tie.links) == 1:
-            tie.guess = self._by_link(tie.new, found) or tie.guess
+            old = self._graph.camera(found.old_id)
+            tie.guess = (
+                pose_from_link(
+                    found, self._graph.refined(tie.new.camera), old, self._graph.pose(found.old_id)
+                )
+            ) or tie.guess
 
     def _ask_under(self, tie: _Tie, previous: Sequence[int]) -> None:
         """Ask the pictures under the predicted view the cheap way; again those that refused a vague prediction."""
@@ -629,12 +634,6 @@ class PlanarMapper:
                 np.clip(2.5 * new.camera.fx_px * (tilt + place), 0.08 * side, 0.5 * side)
             )
         return LinkPrediction(new_from_old, search, is_tight=tight)
-
-    def _by_link(self, new: Keyframe, each: Link) -> Pose | None:
-        old = self._graph.camera(each.old_id)
-        return pose_from_link(
-            each, self._graph.refined(new.camera), old, self._graph.pose(each.old_id)
-        )
 
     def _under(
         self, new: Keyframe, guess: Pose, tried: set[int], previous: Sequence[int], linked: bool

@@ -168,7 +168,18 @@ class CommonShift:
         moved = fitted.crosses @ fitted.solved
         self._left_m2 = max(self.jitter_m2 - self.jitter_m2**2 * float(fitted.trusts.sum()), 0.0)
         if len(ids) > 1:
-            self._learn(fitted)
+            # How much frames jump, from how far all of one frame's objects together lie from
+            # where they were expected.
+            weights = fitted.trusts.sum(axis=0) / fitted.trusts.sum()
+            expected_m2 = 1 / float(fitted.trusts.sum())  # of the weighted mean of all gaps
+            together_m = weights @ fitted.gaps_m
+            seen_m2 = float(together_m @ together_m) / 2 - expected_m2 + self.jitter_m2
+            self._lessons += 1
+            rate = max(_LEARNS, 1 / (self._lessons + 3))
+            least_m2, most_m2 = _LEAST_JITTER**2 * self._shared_m2, self._shared_m2
+            self.jitter_m2 = float(
+                np.clip((1 - rate) * self.jitter_m2 + rate * seen_m2, least_m2, most_m2)
+            )
         self._covariance -= fitted.gains @ fitted.crosses.T
         self._covariance = (self._covariance + self._covariance.T) / 2
         self.mean_m, self.jump_m = self.mean_m + moved[0], fitted.jump_m
@@ -188,19 +199,6 @@ class CommonShift:
             for number, row in self._rows.items()
             if row < len(moved) and abs(moved[row, 0]) + abs(moved[row, 1]) > 1e-4
         }
-
-    def _learn(self, fitted: FittedShift) -> None:
-        """How much frames jump, from how far all of one frame's objects together lie from where they were expected."""
-        weights = fitted.trusts.sum(axis=0) / fitted.trusts.sum()
-        expected_m2 = 1 / float(fitted.trusts.sum())  # of the weighted mean of all gaps
-        together_m = weights @ fitted.gaps_m
-        seen_m2 = float(together_m @ together_m) / 2 - expected_m2 + self.jitter_m2
-        self._lessons += 1
-        rate = max(_LEARNS, 1 / (self._lessons + 3))
-        least_m2, most_m2 = _LEAST_JITTER**2 * self._shared_m2, self._shared_m2
-        self.jitter_m2 = float(
-            np.clip((1 - rate) * self.jitter_m2 + rate * seen_m2, least_m2, most_m2)
-        )
 
     def _known(self, ids: Sequence[int]) -> tuple[Floats, Floats]:
         """(N,) covariances with the shift and variances of places."""

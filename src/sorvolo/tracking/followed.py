@@ -89,11 +89,16 @@ class Followed:
             self.looks = (
                 looks if self.looks is None else self.looks + (looks - self.looks) / self.views
             )
-        clearness = _clearness(sighting)
+        # How well a sighting shows its object: sure, and large in the picture.
+        left, top, right, bottom = sighting.box_px.tolist()
+        clearness = float(sighting.score * max((right - left) * (bottom - top), 1.0) ** 0.25)
         if clearness > self._clearest:
             self.best, self._clearest = sighting, clearness
         self.last_ns = sighting.time_ns
-        self._extend_path(sighting.time_ns)
+        self.path_m.append(self.place_m)
+        self.path_ns.append(sighting.time_ns)
+        if len(self.path_m) > _MOST_PATH:
+            self.path_m, self.path_ns = self.path_m[::2], self.path_ns[::2]
 
     def join(self, other: "Followed") -> None:
         """Take in another track of the same object; the one seen last gives its place."""
@@ -112,7 +117,11 @@ class Followed:
         self.ended &= other.ended
         self.was_missed |= other.was_missed
         self.is_out &= other.is_out
-        self._join_counts(other)
+        for counts, others in ((self.together, other.together), (self.apart, other.apart)):
+            for neighbour, count in others.items():
+                counts[neighbour] = counts.get(neighbour, 0) + count
+            for own in (self.id, other.id):
+                counts.pop(own, None)
         self._reported = None
         if other._clearest > self._clearest:
             self.best, self._clearest = other.best, other._clearest
@@ -169,25 +178,6 @@ class Followed:
             {label: score / total for label, score in sorted(self.scores.items())},
         )
         return self._reported
-
-    def _join_counts(self, other: "Followed") -> None:
-        for counts, others in ((self.together, other.together), (self.apart, other.apart)):
-            for neighbour, count in others.items():
-                counts[neighbour] = counts.get(neighbour, 0) + count
-            for own in (self.id, other.id):
-                counts.pop(own, None)
-
-    def _extend_path(self, time_ns: int) -> None:
-        self.path_m.append(self.place_m)
-        self.path_ns.append(time_ns)
-        if len(self.path_m) > _MOST_PATH:
-            self.path_m, self.path_ns = self.path_m[::2], self.path_ns[::2]
-
-
-def _clearness(sighting: Sighting) -> float:
-    """How well a sighting shows its object: sure, and large in the picture."""
-    left, top, right, bottom = sighting.box_px.tolist()
-    return float(sighting.score * max((right - left) * (bottom - top), 1.0) ** 0.25)
 
 
 def _is_near(reported_m: PointsM, place_m: PointsM, shared_m2: float) -> bool:

@@ -103,7 +103,9 @@ class ImageMotion:
     def _follow(self, image: ImageRGB, boxes_px: Floats) -> None:
         """Find where a picture lies."""
         shrink = min(1.0, _WIDTH_PX / image.shape[1])
-        gray = _small_gray(image, shrink)
+        size = (round(image.shape[1] * shrink), round(image.shape[0] * shrink))
+        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if shrink < 1 else image
+        gray = np.asarray(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), np.uint8)
         thumbnail = cv2.resize(gray, _THUMBNAIL_PX, interpolation=cv2.INTER_AREA).astype(np.float64)
         if self._last is None or self._last.gray.shape != gray.shape:
             if self._last is not None:
@@ -113,27 +115,32 @@ class ImageMotion:
         here, places = _followed(self._last, gray)
         first_from_small, inliers = _similarity(here, places)
         if first_from_small is None:
-            here, places = _followed(self._last, gray, _whole_step(self._last.gray, gray))
+            # (2,) by how much the picture as a whole has moved (phase correlation).
+            window = cv2.createHanningWindow(gray.shape[::-1], cv2.CV_32F)
+            (x, y), _ = cv2.phaseCorrelate(
+                self._last.gray.astype(np.float32), gray.astype(np.float32), window
+            )
+            here, places = _followed(self._last, gray, np.array([x, y]))
             first_from_small, inliers = _similarity(here, places)
         if first_from_small is None:
             self._lose(gray, thumbnail, boxes_px, shrink)
             return
         first_from_image = _composed(first_from_small, _small_from_full(shrink))
-        self._note_step(first_from_image, image.shape)
-        self._first_from_image, self._failures = first_from_image, 0
-        self._look_anew(gray, thumbnail, boxes_px, shrink, here[inliers], places[inliers])
-
-    def _note_step(self, first_from_image: Floats, shape: tuple[int, ...]) -> None:
-        middle = np.array([[shape[1] / 2, shape[0] / 2]])
+        middle = np.array([[image.shape[1] / 2, image.shape[0] / 2]])
         gone = _moved(first_from_image, middle) - _moved(self._first_from_image, middle)
         self._way_px += float(np.hypot(*gone[0]))
         self._step = _composed(_inverse(self._first_from_image), first_from_image)
+        self._first_from_image, self._failures = first_from_image, 0
+        self._look_anew(gray, thumbnail, boxes_px, shrink, here[inliers], places[inliers])
 
     def _lose(self, gray: ImageGray, thumbnail: Floats, boxes_px: Floats, shrink: float) -> None:
         """A picture whose motion is not found: a guess, or another segment."""
         assert self._last is not None
         self._failures += 1
-        is_cut = _likeness(self._last.thumbnail, thumbnail) < _CUT_LIKENESS
+        # Correlation of two thumbnails; 1 for two flat ones.
+        a, b = self._last.thumbnail - self._last.thumbnail.mean(), thumbnail - thumbnail.mean()
+        size = float(np.sqrt((a * a).sum() * (b * b).sum()))
+        is_cut = (float((a * b).sum() / size) if size > 1e-6 else 1.0) < _CUT_LIKENESS
         if self._failures >= _FAILURES or is_cut:
             self._begin_segment()
             self._look_anew(gray, thumbnail, boxes_px, shrink, np.zeros((0, 2)), np.zeros((0, 2)))
@@ -175,12 +182,6 @@ class ImageMotion:
                 here = np.concatenate([here, fresh])
                 places = np.concatenate([places, _moved(first_from_small, fresh)])
         self._last = _View(gray, thumbnail, here, places)
-
-
-def _small_gray(image: ImageRGB, shrink: float) -> ImageGray:
-    size = (round(image.shape[1] * shrink), round(image.shape[0] * shrink))
-    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if shrink < 1 else image
-    return np.asarray(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def _small_from_full(shrink: float) -> Floats:
@@ -236,13 +237,6 @@ def followed_points(
     return end.reshape(-1, 2).astype(np.float64), good
 
 
-def _whole_step(last: ImageGray, gray: ImageGray) -> Floats:
-    """(2,) by how much the picture as a whole has moved (phase correlation)."""
-    window = cv2.createHanningWindow(gray.shape[::-1], cv2.CV_32F)
-    (x, y), _ = cv2.phaseCorrelate(last.astype(np.float32), gray.astype(np.float32), window)
-    return np.array([x, y])
-
-
 def _similarity(here: PointsPx, places: PointsPx) -> tuple[Floats | None, Floats]:
     """(2, 3) first picture from small picture by most points, and which (N,) they are; None where too few agree."""
     nothing = np.zeros(len(here), bool)
@@ -268,13 +262,6 @@ def _similarity(here: PointsPx, places: PointsPx) -> tuple[Floats | None, Floats
         return None, nothing
     fit[:, 2] += origin
     return np.asarray(fit, np.float64), inliers
-
-
-def _likeness(first: Floats, second: Floats) -> float:
-    """Correlation of two thumbnails; 1 for two flat ones."""
-    a, b = first - first.mean(), second - second.mean()
-    size = float(np.sqrt((a * a).sum() * (b * b).sum()))
-    return float((a * b).sum() / size) if size > 1e-6 else 1.0
 
 
 def _moved(transform: Floats, points: PointsPx) -> PointsPx:

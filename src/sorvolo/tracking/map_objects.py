@@ -44,7 +44,13 @@ def objects_on_map(
         kept = np.flatnonzero(~out).tolist()
         laid, crops = [laid[k] for k in kept], [crops[k] for k in kept]
     fused = fuse(laid, frames, least)
-    flight_sigma_m = _gps_sigma_m(frames)
+    # How far the frames lie from their fixes, per axis: what is known of a place where the method
+    # gives none.
+    apart_m: Floats = np.array([each.gps_residual_m[:2] for each in frames]).reshape(-1, 2)
+    apart_m = apart_m[np.isfinite(apart_m).all(axis=1)]
+    flight_sigma_m = (
+        float(np.sqrt((apart_m**2).sum(axis=1).mean() / 2)) if len(apart_m) else math.nan
+    )
     sigmas_m = {
         each.index: each.sigma_m if math.isfinite(each.sigma_m) else flight_sigma_m
         for each in frames
@@ -88,13 +94,6 @@ def _map_object(
         laid[each.best].sighting.frame_name,
         crops[each.best],
     )
-
-
-def _gps_sigma_m(frames: Sequence[PlacedFrame]) -> float:
-    """How far the frames lie from their fixes, per axis: what is known of a place where the method gives none."""
-    apart_m: Floats = np.array([each.gps_residual_m[:2] for each in frames]).reshape(-1, 2)
-    apart_m = apart_m[np.isfinite(apart_m).all(axis=1)]
-    return float(np.sqrt((apart_m**2).sum(axis=1).mean() / 2)) if len(apart_m) else math.nan
 
 
 _AROUND = 0.3  # of a plant's sides: so far beside its box the middle of a detection may lie

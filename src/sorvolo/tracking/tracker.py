@@ -334,8 +334,13 @@ class Tracker:
         for row, stronger in seen.doubles.items():
             if stronger == column:
                 followed.vote(seen.labels[row], float(seen.scores[row]))
+        # How much a sighting of this score speaks for an object, beyond what is usual.
+        share = min(max(seen.scores[column], 0.01), 0.99)
         followed.evidence = min(
-            followed.evidence + max(weight, 0.3) * _log_odds(seen.scores[column]), _MOST_EVIDENCE
+            followed.evidence
+            + max(weight, 0.3)
+            * float(np.clip(np.log(share / (1 - share)) - USUAL_LOG_ODDS, 0.0, 2.5)),
+            _MOST_EVIDENCE,
         )
         followed.ended = False
         is_long = followed.last_ns - followed.first_ns >= _LONG_S * 1e9
@@ -452,13 +457,29 @@ class Tracker:
     def _join(self, now: list[Followed], missing: list[Followed]) -> dict[int, int]:
         """Merge tracks that turn out to be one object; the earlier id stays."""
         reach_m = _NEIGHBOUR_M / self._settings.unit_m
-        _count_meetings(now, missing, reach_m)
+        # Count for each track which neighbours the frame shows together with it, and which
+        # without it.
+        for first, second in neighbours(now, now, reach_m):
+            if first.id < second.id:
+                first.together[second.id] = first.together.get(second.id, 0) + 1
+                second.together[first.id] = second.together.get(first.id, 0) + 1
+        for first, second in neighbours(now, missing, reach_m):
+            first.apart[second.id] = first.apart.get(second.id, 0) + 1
+            second.apart[first.id] = second.apart.get(first.id, 0) + 1
         merged: dict[int, int] = {}
         by_id = {each.id: each for each in self._followed}
         for followed in now:
             if followed.id in merged or followed.id not in by_id:
                 continue
-            other = self._same_object(followed, by_id)
+            # Another track of the same object, if there is one.
+            other = double_of(
+                followed,
+                by_id,
+                _NEIGHBOUR_M / self._settings.unit_m,
+            )
+            if other is None and followed.moves and followed.views <= _FIRST_VIEWS:
+                density = self._settings.new_per_m2 * self._settings.unit_m**2
+                other = earlier_mover(followed, self._followed, density)
             if other is not None:
                 kept, gone = (other, followed) if other.id < followed.id else (followed, other)
                 kept.join(gone)
@@ -467,18 +488,6 @@ class Tracker:
         if merged:
             self._keep([each for each in self._followed if each.id not in merged])
         return merged
-
-    def _same_object(self, followed: Followed, by_id: Mapping[int, Followed]) -> Followed | None:
-        """Another track of the same object, if there is one."""
-        other = double_of(
-            followed,
-            by_id,
-            _NEIGHBOUR_M / self._settings.unit_m,
-        )
-        if other is None and followed.moves and followed.views <= _FIRST_VIEWS:
-            density = self._settings.new_per_m2 * self._settings.unit_m**2
-            other = earlier_mover(followed, self._followed, density)
-        return other
 
     def _keep(self, kept: list[Followed]) -> None:
         ids = {each.id for each in kept}
@@ -500,7 +509,16 @@ class _Seen:
         self.scores = np.array([each.score for each in sightings])
         self.labels = [each.label for each in sightings]
         self.sides_m = np.array([each.size_m[0] for each in sightings])
-        self.own_m2 = _own_covariances(sightings)
+        # (N, 2, 2) what sightings err each for itself.
+        whole = np.array([each.covariance_m2 for each in sightings]).reshape(-1, 2, 2)
+        shared = np.array([each.shared_sigma_m for each in sightings])
+        values, vectors = np.linalg.eigh(whole)
+        least = np.maximum(_LEAST_OWN_SHARE * values.mean(axis=1), 1e-6)
+        own = (
+            np.maximum(values - shared[:, None] ** 2, least[:, None])
+            + (_UNEVEN * shared[:, None]) ** 2
+        )
+        self.own_m2 = (vectors * own[:, None, :]) @ vectors.swapaxes(1, 2)
         boxes_px = np.array([each.box_px for each in sightings]).reshape(-1, 4)
         self.doubles = frame_doubles(boxes_px, self.labels, self.scores)
 
@@ -525,29 +543,6 @@ class _Seen:
         return whole
 
 
-def _count_meetings(now: list[Followed], missing: list[Followed], reach_m: float) -> None:
-    """Count for each track which neighbours the frame shows together with it, and which without it."""
-    for first, second in neighbours(now, now, reach_m):
-        if first.id < second.id:
-            first.together[second.id] = first.together.get(second.id, 0) + 1
-            second.together[first.id] = second.together.get(first.id, 0) + 1
-    for first, second in neighbours(now, missing, reach_m):
-        first.apart[second.id] = first.apart.get(second.id, 0) + 1
-        second.apart[first.id] = second.apart.get(first.id, 0) + 1
-
-
-def _own_covariances(sightings: Sequence[Sighting]) -> Floats:
-    """(N, 2, 2) what sightings err each for itself."""
-    whole = np.array([each.covariance_m2 for each in sightings]).reshape(-1, 2, 2)
-    shared = np.array([each.shared_sigma_m for each in sightings])
-    values, vectors = np.linalg.eigh(whole)
-    least = np.maximum(_LEAST_OWN_SHARE * values.mean(axis=1), 1e-6)
-    own = (
-        np.maximum(values - shared[:, None] ** 2, least[:, None]) + (_UNEVEN * shared[:, None]) ** 2
-    )
-    return (vectors * own[:, None, :]) @ vectors.swapaxes(1, 2)
-
-
 def _stacked(near: list[Followed], time_ns: int) -> Motions:
     """All tracks' motions, moved on to one moment."""
     if not near:
@@ -562,9 +557,3 @@ def _stacked(near: list[Followed], time_ns: int) -> Motions:
         np.concatenate([each.habits for each in motions]),
     )
     return predicted(together, np.array([(time_ns - each.motion_ns) / 1e9 for each in near]))
-
-
-def _log_odds(score: float) -> float:
-    """How much a sighting of this score speaks for an object, beyond what is usual."""
-    share = min(max(score, 0.01), 0.99)
-    return float(np.clip(np.log(share / (1 - share)) - USUAL_LOG_ODDS, 0.0, 2.5))

@@ -54,7 +54,11 @@ def columns_of(stated: LocalSet) -> dict[str, float]:
         "ellipsoidal_height_m": full_m if isfinite(full_m) else stated["sensor_ellipsoid_height_m"],
         **{name: stated[name] for name in _OWN_TAGS},
     }
-    heading, pitch, roll = stated["platform_heading_deg"], _pitch_of(stated), _roll_of(stated)
+    heading, pitch, roll = (
+        stated["platform_heading_deg"],
+        _first_known(stated["platform_pitch_full_deg"], stated["platform_pitch_deg"]),
+        _first_known(stated["platform_roll_full_deg"], stated["platform_roll_deg"]),
+    )
     columns |= {"body_yaw_deg": heading, "body_pitch_deg": pitch, "body_roll_deg": roll}
     relative = stated["sensor_relative_azimuth_deg"], stated["sensor_relative_elevation_deg"]
     if all(map(isfinite, (heading, pitch, roll, *relative))):
@@ -143,7 +147,11 @@ def klv_notices(counts: Mapping[str, int]) -> list[Notice]:
 def klv_streams(container: Any) -> list[Any]:
     """The KLV streams of a PyAV container; private data of unknown kind counts as well."""
     data = (stream for stream in container.streams if stream.type == "data")
-    return [stream for stream in data if _name(stream) in ("klv", "bin_data", "")]
+    return [
+        stream
+        for stream in data
+        if str(getattr(stream, "name", "") or "") in ("klv", "bin_data", "")
+    ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,11 +188,13 @@ def metadata_of(
     counts["no_time"] += len(sets) - len(dated)
     timed, video_ns = [each for _, each in dated], [stamp_ns for stamp_ns, _ in dated]
     is_tied = min(video_ns, default=-1) >= 0  # for all samples or for none
+    # Telemetry's columns over several sets, NaN where one states nothing.
+    rows = [columns_of(each) for each in timed]
     telemetry = clean(
         FORMAT,
         name,
         [each.time_ns for each in timed],
-        _columns_of_all(timed),
+        {column: [row.get(column, nan) for row in rows] for column in TELEMETRY_COLUMNS},
         video_ns if is_tied else None,
         notices=klv_notices(counts),
     )
@@ -217,24 +227,6 @@ def _sets_in(path: Path, counts: Counter[str]) -> list[tuple[int, LocalSet]]:
 
 
 # ---- inside ---------------------------------------------------------------------------------------------------
-
-
-def _columns_of_all(sets: Sequence[LocalSet]) -> dict[str, list[float]]:
-    """Telemetry's columns over several sets, NaN where one states nothing."""
-    rows = [columns_of(each) for each in sets]
-    return {column: [row.get(column, nan) for row in rows] for column in TELEMETRY_COLUMNS}
-
-
-def _name(stream: Any) -> str:
-    return str(getattr(stream, "name", "") or "")
-
-
-def _pitch_of(stated: LocalSet) -> float:
-    return _first_known(stated["platform_pitch_full_deg"], stated["platform_pitch_deg"])
-
-
-def _roll_of(stated: LocalSet) -> float:
-    return _first_known(stated["platform_roll_full_deg"], stated["platform_roll_deg"])
 
 
 def _first_known(*values: float) -> float:
@@ -324,7 +316,8 @@ def _copy(
         copies = {stream.index: output.add_stream_from_template(stream) for stream in known}
         data = output.add_data_stream("klv")
         waiting, first_s = deque(samples), nan
-        for packet in _packets(source, known):
+        # The packets of some streams; one without a time only flushes its stream.
+        for packet in (each for each in source.demux(known) if each.dts is not None):
             stamp = packet.pts if packet.pts is not None else packet.dts
             now_s = float((stamp or 0) * (packet.time_base or _CLOCK))
             if packet.stream.index == pictures.index and isnan(first_s):
@@ -335,11 +328,6 @@ def _copy(
             output.mux(packet)
         for sample in waiting:
             _mux(output, data, sample, 0.0 if isnan(first_s) else first_s)
-
-
-def _packets(source: av.container.InputContainer, streams: Sequence[Any]) -> Iterator[Any]:
-    """The packets of some streams; one without a time only flushes its stream."""
-    return (each for each in source.demux(streams) if each.dts is not None)
 
 
 def _due(waiting: deque[_Sample], video_s: float) -> Iterator[_Sample]:

@@ -222,7 +222,16 @@ class StreamReader:
                 if not container.streams.video:
                     raise ValueError("a stream without video")
                 video, metadata = container.streams.video[0], klv_streams(container)
-                self._listener.opened(_facts_of(container, video, metadata))
+                rate = video.average_rate or video.guessed_rate
+                name = container.format.name.split(",")[0]
+                self._listener.opened(
+                    StreamFacts(
+                        video.codec_context.name,
+                        name,
+                        float(rate) if rate else 25.0,
+                        bool(metadata),
+                    )
+                )
                 self._listener.restarted()
                 self._stamp_ns = -1
                 self._step_ns = round(
@@ -333,14 +342,6 @@ class StreamReader:
         )
         if stamp_ns is not None and microseconds > 0:
             self._listener.reported(stamp_ns, microseconds * 1000)
-
-
-def _facts_of(container: Any, video: Any, metadata: list[Any]) -> StreamFacts:
-    rate = video.average_rate or video.guessed_rate
-    name = container.format.name.split(",")[0]
-    return StreamFacts(
-        video.codec_context.name, name, float(rate) if rate else 25.0, bool(metadata)
-    )
 
 
 def _stamp_of(timed: Any, time_base: Any, *, by_order: bool = False) -> int | None:

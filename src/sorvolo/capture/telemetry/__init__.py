@@ -115,7 +115,12 @@ def find_telemetry_beside(video: Path, same_flight: Sequence[Path] = ()) -> Path
     videos = {each.name for each in files if each.suffix.lower() in _VIDEO_SUFFIXES}
     if videos - {each.name for each in same_flight}:
         return None
-    return _only_one(logs_beside(video))
+    # The only file, or the only one with "telemetry" in its name.
+    known = logs_beside(video)
+    for group in ([each for each in known if "telemetry" in each.stem.lower()], known):
+        if len(group) == 1:
+            return group[0]
+    return None
 
 
 def logs_beside(video: Path) -> list[Path]:
@@ -149,14 +154,6 @@ def _named_like(video: Path, candidates: Sequence[Path]) -> Path | None:
         alike = (each for each in candidates if each.stem.lower() in (wanted, video.name.lower()))
         if found := next(filter(is_telemetry, alike), None):
             return found
-    return None
-
-
-def _only_one(known: Sequence[Path]) -> Path | None:
-    """The only file, or the only one with "telemetry" in its name."""
-    for group in ([each for each in known if "telemetry" in each.stem.lower()], known):
-        if len(group) == 1:
-            return group[0]
     return None
 
 

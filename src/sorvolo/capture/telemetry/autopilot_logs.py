@@ -251,7 +251,16 @@ class TlogReader:
             elif message.get_srcSystem() != vehicle:
                 others |= {message.get_srcSystem()} if vehicle is not None else set()
             elif kind == "GLOBAL_POSITION_INT":
-                fixes.add(message.time_boot_ms / 1e3, **_tlog_fix(message))
+                fixes.add(
+                    message.time_boot_ms / 1e3,
+                    **{
+                        "latitude_deg": message.lat * 1e-7 or float("nan"),
+                        "longitude_deg": message.lon * 1e-7 or float("nan"),
+                        "orthometric_height_m": message.alt * 1e-3,
+                        "height_above_takeoff_m": message.relative_alt * 1e-3,
+                        "speed_m_s": float(np.hypot(message.vx, message.vy)) * 1e-2,
+                    },
+                )
             elif kind == "ATTITUDE":
                 angles = np.degrees([message.yaw, message.pitch, message.roll])
                 attitude.add(
@@ -264,16 +273,6 @@ class TlogReader:
         words = "other vehicles in the log, not used: {}"
         more = notice("other_vehicle", len(others), words)
         return _telemetry("tlog", name, fixes, attitude, dated=bool(ahead_s), notices=more)
-
-
-def _tlog_fix(message: Any) -> dict[str, float]:
-    return {
-        "latitude_deg": message.lat * 1e-7 or float("nan"),
-        "longitude_deg": message.lon * 1e-7 or float("nan"),
-        "orthometric_height_m": message.alt * 1e-3,
-        "height_above_takeoff_m": message.relative_alt * 1e-3,
-        "speed_m_s": float(np.hypot(message.vx, message.vy)) * 1e-2,
-    }
 
 
 def _packets(data: bytes, limit: int | None = None) -> Iterator[tuple[int, int, int]]:

@@ -19,7 +19,6 @@ from sorvolo.capture.telemetry.cleaning import (
     time_ns_from_text,
 )
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Floats
 from sorvolo.geometry.units import SECOND_NS
 from sorvolo.survey.flight import Notice, Telemetry
 
@@ -112,11 +111,16 @@ def read(data: bytes, name: str) -> Telemetry:
     stamps_ns = np.array([cue.stamp_ns for cue in cues], dtype=np.int64)
     times_ns, refined = refine_clock(fill_stamps(stamps_ns, video_ns), video_ns)
     counts["refined"] = len(cues) if refined else 0
+    names = sorted({key for cue in cues for key in cue.values})
+    columns = {key: np.array([cue.values.get(key, np.nan) for cue in cues]) for key in names}
+    if "latitude_deg" in columns:
+        placed = np.isfinite(columns["latitude_deg"])
+        columns["horizontal_sigma_m"] = np.where(placed, SMALLEST_SIGMA_M, np.nan)
     return clean(
         "dji_srt",
         name,
         times_ns,
-        _columns_of(cues),
+        columns,
         video_ns,
         notices=_notices(counts, int((stamps_ns != NO_TIME_NS).sum()), len(cues)),
         position_decimals=max(decimals) or None,
@@ -129,15 +133,6 @@ def _subtitles(data: bytes) -> str:
     if "Dialogue:" not in text:
         return text
     return _DIALOGUE.sub(r"\1 -->\n", text).replace("\\N", "\n")
-
-
-def _columns_of(cues: list[_Cue]) -> dict[str, Floats]:
-    names = sorted({key for cue in cues for key in cue.values})
-    columns = {key: np.array([cue.values.get(key, np.nan) for cue in cues]) for key in names}
-    if "latitude_deg" in columns:
-        placed = np.isfinite(columns["latitude_deg"])
-        columns["horizontal_sigma_m"] = np.where(placed, SMALLEST_SIGMA_M, np.nan)
-    return columns
 
 
 def _notices(counts: Counter[str], dated: int, cues: int) -> list[Notice]:

@@ -64,11 +64,15 @@ def read(data: bytes, name: str) -> Telemetry:
             "without them no picture can be given a place"
         )
     decimals = max(decimals_of(each.get(axis, "")) for each in timed for axis in ("lat", "lon"))
+    columns = {
+        column: [_number(each, tag) for each in texts] for column, tag in _TAG_OF_COLUMN.items()
+    }
     return clean(
         "gpx",
         name,
         stamps_ns,
-        _columns_of(texts),
+        columns
+        | {"horizontal_sigma_m": [sigma_from_hdop_m(_number(each, "hdop")) for each in texts]},
         notices=[
             *notice(
                 "truncated",
@@ -81,15 +85,6 @@ def read(data: bytes, name: str) -> Telemetry:
         ],
         position_decimals=decimals or None,
     )
-
-
-def _columns_of(points: list[dict[str, str]]) -> dict[str, list[float]]:
-    columns = {
-        column: [_number(each, tag) for each in points] for column, tag in _TAG_OF_COLUMN.items()
-    }
-    return columns | {
-        "horizontal_sigma_m": [sigma_from_hdop_m(_number(each, "hdop")) for each in points]
-    }
 
 
 def _time_ns(texts: dict[str, str]) -> int:

@@ -56,6 +56,12 @@ def read(data: bytes, name: str) -> Telemetry:
         )
     epochs, dated = epochs_of(messages)
     names = sorted({key for epoch in epochs for key in epoch.values})
+    # Decimals of a degree that the positions' minutes amount to: 4 of a minute are about 6 of a
+    # degree.
+    printed = 0
+    for message in messages[:1000]:
+        place = 1 if message.msgID == "GGA" else 2
+        printed = max([printed, *map(decimals_of, message.payload[place : place + 1])])
     return clean(
         "nmea",
         name,
@@ -78,7 +84,7 @@ def read(data: bytes, name: str) -> Telemetry:
                 "no sentence states the date: the video dates the {} samples, else they count from 1970-01-01",
             ),
         ],
-        position_decimals=_position_decimals(messages),
+        position_decimals=printed + 2 if printed else None,
     )
 
 
@@ -109,7 +115,9 @@ def messages_in(data: bytes, counts: Counter[str]) -> list[Any]:
 
 def epochs_of(messages: list[Any]) -> tuple[list[Epoch], bool]:
     """The sentences by moment, in the file's order, and whether any of them states the date."""
-    trusted = _dated(messages)
+    # The sentences whose date can be trusted: a receiver without a fix often invents its date.
+    dated = [message for message in messages if isinstance(getattr(message, "date", None), date)]
+    trusted = [message for message in dated if _is_valid(message)] or dated
     days = {id(message) for message in trusted}
     now_ns = _stamp(trusted[0]) if trusted else _time_of_day_ns(messages[0])
     epochs: list[Epoch] = []
@@ -125,12 +133,6 @@ def epochs_of(messages: list[Any]) -> tuple[list[Epoch], bool]:
         if not epoch.has_fix:
             epoch.values = {}
     return epochs, bool(trusted)
-
-
-def _dated(messages: list[Any]) -> list[Any]:
-    """The sentences whose date can be trusted: a receiver without a fix often invents its date."""
-    dated = [message for message in messages if isinstance(getattr(message, "date", None), date)]
-    return [message for message in dated if _is_valid(message)] or dated
 
 
 def _is_valid(message: Any) -> bool:
@@ -184,12 +186,3 @@ def nearest_ns(time_of_day_ns: int, reference_ns: int) -> int:
     """The moment with this time of day that lies nearest to the reference: right across midnight."""
     ahead_ns = (time_of_day_ns - reference_ns + DAY_NS // 2) % DAY_NS - DAY_NS // 2
     return reference_ns + ahead_ns
-
-
-def _position_decimals(messages: list[Any]) -> int | None:
-    """Decimals of a degree that the positions' minutes amount to: 4 of a minute are about 6 of a degree."""
-    printed = 0
-    for message in messages[:1000]:
-        place = 1 if message.msgID == "GGA" else 2
-        printed = max([printed, *map(decimals_of, message.payload[place : place + 1])])
-    return printed + 2 if printed else None

@@ -200,11 +200,12 @@ def _pictures(
                 )
             )
             continue
+        size = _finite([row.get("width"), row.get("height")])
         pictures.append(
             ParsedPicture(
                 found,
                 tuple(boxes.get(image_id, ())),
-                _labelled_size(row),
+                (size[0], size[1]) if size and min(size) > 0 else None,
                 _video(row),
                 next(iter(_finite([row.get("m_per_px")])), float("nan")),
             )
@@ -221,11 +222,6 @@ def _found(
         same = by_name().get(Path(name).name, [])
         found = same[0] if len(same) == 1 else None
     return found
-
-
-def _labelled_size(row: Mapping[str, Any]) -> tuple[float, float] | None:
-    size = _finite([row.get("width"), row.get("height")])
-    return (size[0], size[1]) if size and min(size) > 0 else None
 
 
 def _video(row: Mapping[str, Any]) -> str:

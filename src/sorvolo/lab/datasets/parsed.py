@@ -281,7 +281,10 @@ def paired(
     for path in labels:
         by_stem.setdefault(path.stem, []).append(path)
     label_of = {
-        picture: max(by_stem[picture.stem], key=lambda path: _folders_in_common(path, picture))
+        picture: max(
+            by_stem[picture.stem],
+            key=lambda path: (Counter(path.parts[:-1]) & Counter(picture.parts[:-1])).total(),
+        )
         for picture in pictures
         if picture.stem in by_stem
     }
@@ -323,7 +326,3 @@ def no_frames(place: Path, form: str, videos: Iterable[str]) -> InputError:
         f"{place}: {form} labels of videos, but none of their frames is there; extract them as pictures into a folder "
         f"of the video's name, numbered as in the labels (such as {first}/000123.jpg)"
     )
-
-
-def _folders_in_common(path: Path, other: Path) -> int:
-    return (Counter(path.parts[:-1]) & Counter(other.parts[:-1])).total()

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from sorvolo.geometry.arrays import ImageRGB, ImageRGBA
+from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.store.pages.plots import (
     SIDE_PX,
     Line,
@@ -65,6 +65,7 @@ def detector_page(
     escaped.
     """
     pictures = sum(each.pictures for each in sets)
+    remarks = [f"{each.name}: {text}" for each in sets for text in each.remarks]
     page = render(
         "detector.html",
         package=__package__,
@@ -87,7 +88,12 @@ def detector_page(
             ]
             for each in sets
         ],
-        remarks=_remarks(sets),
+        remarks=remarks
+        + [
+            f"{each.name}: {', '.join(each.left_out)} not labelled there, so not judged"
+            for each in sets
+            if each.left_out
+        ],
         comparisons=[_comparison(each) for each in comparisons],
         class_names=_CLASS_NAMES,
         size_names=_SIZE_NAMES,
@@ -138,15 +144,6 @@ def _class_words(classes: Sequence[Any]) -> str:
         ", ".join(f"{row.label} {_share(row.coco.ap50)}" for row in classes if row.labels)
         or "unknown"
     )
-
-
-def _remarks(sets: Sequence[Any]) -> list[str]:
-    remarks = [f"{each.name}: {text}" for each in sets for text in each.remarks]
-    return remarks + [
-        f"{each.name}: {', '.join(each.left_out)} not labelled there, so not judged"
-        for each in sets
-        if each.left_out
-    ]
 
 
 def _comparison(each: Any) -> dict[str, Any]:
@@ -263,7 +260,10 @@ def _mistakes(
             {
                 "words": _mistake_words(mistake),
                 "picture": name,
-                "address": picture_uri(_opaque(crop), 24_000),
+                "address": picture_uri(
+                    np.asarray(np.dstack([crop, np.full(crop.shape[:2], 255, np.uint8)]), np.uint8),
+                    24_000,
+                ),
             }
             for mistake, name, crop in worst
             if mistake.kind == kind
@@ -283,10 +283,6 @@ def _mistake_words(mistake: Any) -> str:
         return f"{mistake.true_label} reported as {mistake.label}, {mistake.score:.2f}"
     beside = f", overlaps a label by {mistake.overlap:.2f}" if mistake.overlap >= 0.1 else ""
     return f"{mistake.label}, {mistake.score:.2f}{beside}"
-
-
-def _opaque(rgb: ImageRGB) -> ImageRGBA:
-    return np.asarray(np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)]), np.uint8)
 
 
 def _range(low: float, high: float, unit: str) -> str:

@@ -200,12 +200,18 @@ def evaluate_mosaic(
         errors: tuple[TruthErrors, ...] = ()
         if truth:
             tallies, errors = _against_truth(flights, truth_file(truth), described)
+        # The thesis's 4.1.1 over up to 120 keyframes, evenly chosen.
+        keyframes = archive.keyframes()
+        keyframes = [keyframes[i] for i in frames_to_compare(len(keyframes), _DEVIATION_FRAMES)]
+        deviation = MapDeviation(archive.tiles(), archive.site_grid())
         return MosaicEvaluation(
             described.name,
             described.m_per_px,
             tallies,
             errors,
-            _deviation(archive),
+            summed_up(
+                [deviation.of(archive.image(each), each.site_from_image) for each in keyframes]
+            ),
             _against_reference(archive.mosaic_path, reference) if reference else None,
             _against_positions(flights, positions, described) if positions else None,
         )
@@ -268,16 +274,6 @@ def _paired(
         for name, rows in flights.items()
     }
     return {name: found for name, found in pairs.items() if found}
-
-
-def _deviation(archive: Archive) -> DeviationSummary:
-    """The thesis's 4.1.1 over up to 120 keyframes, evenly chosen."""
-    keyframes = archive.keyframes()
-    keyframes = [keyframes[i] for i in frames_to_compare(len(keyframes), _DEVIATION_FRAMES)]
-    deviation = MapDeviation(archive.tiles(), archive.site_grid())
-    return summed_up(
-        [deviation.of(archive.image(each), each.site_from_image) for each in keyframes]
-    )
 
 
 def _against_reference(mosaic_path: Path, reference: Path) -> ReferenceMatch:

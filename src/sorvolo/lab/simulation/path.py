@@ -262,7 +262,10 @@ def observe(
             np.ceil(-spare_s * rate_hz), np.floor((path.duration_s + spare_s) * rate_hz) + 1
         )
         true_s = ticks / rate_hz - settings.clock_offset_s
-        true_s = true_s[_outside_gaps(true_s, settings.gaps, path.duration_s, rng)]
+        keep = np.ones(len(true_s), bool)
+        for start in rng.uniform(0.1, 0.8, settings.gaps) * path.duration_s:
+            keep &= (true_s < start) | (true_s > start + _GAP_S)
+        true_s = true_s[keep]
     else:
         true_s = np.asarray(at_s, dtype=np.float64) - settings.clock_offset_s
     count = len(true_s)
@@ -308,15 +311,6 @@ def observe(
 
 def _ns(time_s: Floats) -> TimesNs:
     return np.round(time_s * 1e9).astype(np.int64)
-
-
-def _outside_gaps(
-    time_s: Floats, gaps: int, duration_s: float, rng: np.random.Generator
-) -> NDArray[np.bool_]:
-    keep = np.ones(len(time_s), bool)
-    for start in rng.uniform(0.1, 0.8, gaps) * duration_s:
-        keep &= (time_s < start) | (time_s > start + _GAP_S)
-    return keep
 
 
 def _attitudes(

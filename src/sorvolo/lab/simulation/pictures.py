@@ -218,7 +218,8 @@ def simulate_picture(
     is_thermal = bool(rng.uniform() < settings.thermal_share)
     largest_m = None if orthophoto is None else min(orthophoto.raster.area.size_m)
     camera, pose = _new_shot(settings, is_thermal, largest_m, rng)
-    m_per_px = _m_per_px(camera, pose)
+    middle = ground_from_pixels(camera, pose, np.array([[camera.cx_px, camera.cy_px]]))[0]
+    m_per_px = float(np.linalg.norm(pose.translation_m - [*middle, 0.0])) / camera.fx_px
     area = _needed_area(camera, pose)
     ground = settings.ground or str(rng.choice(list(GroundKind), p=(0.25, 0.35, 0.3, 0.1)))
     if orthophoto is not None:
@@ -295,11 +296,6 @@ def _new_shot(
         f"no camera sees the ground at {settings.m_per_px[0]:g} to {settings.m_per_px[1]:g} m per pixel from"
         f" {settings.height_m[0]:g} to {settings.height_m[1]:g} m{bound}; widen one of them"
     )
-
-
-def _m_per_px(camera: Camera, pose: Pose) -> float:
-    middle = ground_from_pixels(camera, pose, np.array([[camera.cx_px, camera.cy_px]]))[0]
-    return float(np.linalg.norm(pose.translation_m - [*middle, 0.0])) / camera.fx_px
 
 
 def _needed_area(camera: Camera, pose: Pose) -> GroundArea:

@@ -243,7 +243,12 @@ class BucketEnd:
                 raise StoreError(
                     f"the site at {self.name} is gone; copy it there again: sorvolo site copy"
                 )
-            self._refuse_foreign()
+            own = ("tiles", "files", "catalogues", MANIFEST, *SHOWN)
+            foreign = sorted(key for key in self._objects.first() if key.split("/")[0] not in own)
+            if foreign:
+                raise StoreError(
+                    f"{self.name} is not empty and holds no site (there is {foreign[0][:80]!r}); choose another place"
+                )
         else:
             if self._base not in (None, manifest.id):
                 raise self._conflict()
@@ -374,14 +379,6 @@ class BucketEnd:
             self._objects.remove([name])
         else:
             self._objects.copy(key_of(file), name)
-
-    def _refuse_foreign(self) -> None:
-        own = ("tiles", "files", "catalogues", MANIFEST, *SHOWN)
-        foreign = sorted(key for key in self._objects.first() if key.split("/")[0] not in own)
-        if foreign:
-            raise StoreError(
-                f"{self.name} is not empty and holds no site (there is {foreign[0][:80]!r}); choose another place"
-            )
 
     def _conflict(self) -> OvertakenError:
         return OvertakenError(

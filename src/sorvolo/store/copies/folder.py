@@ -332,16 +332,11 @@ class FolderEnd:
             held, files, _ = self._snapshot(scratch / f"held-{CATALOGUE}")
             if held is not None:
                 refuse_other(self.name, held.identity, new.held)
-                self._refuse_loss(held, files, new)
+                refuse_loss(self.name, missing_from(held, files, new))
         self.folder.mkdir(exist_ok=True)
         note = {"identity": new.held.identity, "newest_version": new.held.newest}
         atomic_write_bytes(self.folder / COPYING, json.dumps(note).encode())
         remove_leftovers([self.folder, *(each for each in self.folder.rglob("*") if each.is_dir())])
-
-    def _refuse_loss(
-        self, held: CatalogueState, files: Mapping[str, SiteFile], new: SiteState
-    ) -> None:
-        refuse_loss(self.name, missing_from(held, files, new))
 
     def find_held(self) -> CatalogueState | None:
         """What the folder's catalogue holds, unfinished runs apart; None for no map."""
@@ -378,14 +373,26 @@ class FolderEnd:
         if catalogue.is_file():
             _overwrite_catalogue(catalogue, state.catalogue)
         elif is_site(self.folder):
-            _overwrite_rows(self.folder, state.catalogue, self._catalogues)
+            # The same for a catalogue in a PostgreSQL database.
+            with (
+                closing(
+                    Catalogue.open(self.folder, write=True, catalogues=self._catalogues)
+                ) as target,
+                target.changing() as written,
+                closing(Catalogue.at(state.catalogue, write=False)) as source,
+                source.reading() as read,
+            ):
+                copy_rows(read, written)
         else:
             with atomic_path(catalogue) as temporary, writing(temporary):
                 shutil.copyfile(state.catalogue, temporary)
         for path in _paths(self.folder):
             if path not in state.files and (is_site_path(path) or tile_of(path)):
                 (self.folder / path).unlink(missing_ok=True)
-        _remove_empty(self.folder / "flights")
+        # Remove empty folders.
+        for root, _, _ in os.walk(self.folder / "flights", topdown=False):
+            if not any(os.scandir(root)):
+                os.rmdir(root)
         (self.folder / COPYING).unlink(missing_ok=True)
         sync_file(self.folder)
 
@@ -480,17 +487,6 @@ def _overwrite_catalogue(path: Path, new: Path) -> None:
         ) from error
 
 
-def _overwrite_rows(folder: Path, new: Path, catalogues: Catalogues | None) -> None:
-    """The same for a catalogue in a PostgreSQL database."""
-    with (
-        closing(Catalogue.open(folder, write=True, catalogues=catalogues)) as target,
-        target.changing() as written,
-        closing(Catalogue.at(new, write=False)) as source,
-        source.reading() as read,
-    ):
-        copy_rows(read, written)
-
-
 def copy_rows(source: Connection, target: Connection) -> None:
     """Make the target's rows the source's, inside the callers' transactions."""
     for table in reversed(schema.metadata.sorted_tables):
@@ -547,10 +543,3 @@ def _foreign(folder: Path) -> Iterator[str]:
             TEMPORARY_PREFIX
         ):
             yield path.name
-
-
-def _remove_empty(folder: Path) -> None:
-    """Remove empty folders."""
-    for root, _, _ in os.walk(folder, topdown=False):
-        if not any(os.scandir(root)):
-            os.rmdir(root)

@@ -98,7 +98,12 @@ def claimed_folder(
     with _held(folder):
         with writing(folder):
             if goes_on and not replaces:
-                _keep_annotated(folder)
+                # Keep the annotated video of a watch that was killed beside the one that is about
+                # to begin.
+                cut_off = folder / f"{TEMPORARY_PREFIX}{ANNOTATED_VIDEO}"
+                if cut_off.is_file():
+                    numbers = (folder / f"annotated-{number}.mp4" for number in range(1, 10_000))
+                    cut_off.rename(next(each for each in numbers if not each.exists()))
             remove_leftovers([folder])
             for name in () if goes_on else _OURS:
                 if (folder / name).is_dir():
@@ -321,14 +326,6 @@ def _held(folder: Path) -> Iterator[None]:
     finally:
         path.unlink(missing_ok=True)
         os.close(lock)
-
-
-def _keep_annotated(folder: Path) -> None:
-    """Keep the annotated video of a watch that was killed beside the one that is about to begin."""
-    cut_off = folder / f"{TEMPORARY_PREFIX}{ANNOTATED_VIDEO}"
-    if cut_off.is_file():
-        numbers = (folder / f"annotated-{number}.mp4" for number in range(1, 10_000))
-        cut_off.rename(next(each for each in numbers if not each.exists()))
 
 
 def _mark_of(folder: Path) -> dict[str, Any] | None:

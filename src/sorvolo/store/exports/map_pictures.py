@@ -50,7 +50,13 @@ class SmallMap:
         columns, rows = np.array(sorted(indexes)).T
         self._left, self._top = int(columns.min()), int(rows.min())
         width, height = int(columns.max()) - self._left + 1, int(rows.max()) - self._top + 1
-        self._tile_px, self._step = tile_px, _thinning(max(width, height), tile_px, max_px)
+        # By how much tiles are made smaller, a power of two that divides a tile, so that `tiles`
+        # in a row fit `max_px`.
+        tiles = max(width, height)
+        step = 1
+        while tile_px % (2 * step) == 0 and tiles * tile_px > step * max_px:
+            step *= 2
+        self._tile_px, self._step = tile_px, step
         self._side = tile_px // self._step
         self._canvas: ImageRGBA = np.zeros((height * self._side, width * self._side, 4), np.uint8)
         self._shown_px: dict[TileIndex, int] = {}
@@ -175,14 +181,6 @@ def pictures(
             else:
                 each.take(index, tiles[index])
     return [each.picture(*small) for each in small]
-
-
-def _thinning(tiles: int, tile_px: int, max_px: int) -> int:
-    """By how much tiles are made smaller, a power of two that divides a tile, so that `tiles` in a row fit `max_px`."""
-    step = 1
-    while tile_px % (2 * step) == 0 and tiles * tile_px > step * max_px:
-        step *= 2
-    return step
 
 
 def write_preview(

@@ -31,10 +31,6 @@ def plain_json(value: Any) -> Any:
         return plain_json(value.tolist())
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    return _plain_members(value)
-
-
-def _plain_members(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {str(key): plain_json(item) for key, item in value.items()}
     if isinstance(value, list | tuple | set | frozenset):

@@ -117,7 +117,24 @@ def cot_track(frames: Sequence[CorrectedFrame], name: str, *, is_ellipsoidal: bo
         SubElement(detail, "contact", {"callsign": name})
         SubElement(detail, "sensor", _sensor(each))
         if number:
-            SubElement(detail, "track", _course(frames[number - 1], each))
+            before = frames[number - 1]
+            latitude = math.radians(each.latitude_deg)
+            east_m = (
+                math.radians(each.longitude_deg - before.longitude_deg)
+                * _EARTH_M
+                * math.cos(latitude)
+            )
+            north_m = (latitude - math.radians(before.latitude_deg)) * _EARTH_M
+            passed_s = (each.time_ns - before.time_ns) / 1e9
+            speed = math.hypot(east_m, north_m) / passed_s if passed_s > 0 else 0.0
+            SubElement(
+                detail,
+                "track",
+                {
+                    "course": f"{math.degrees(math.atan2(east_m, north_m)) % 360:.1f}",
+                    "speed": f"{speed:.2f}",
+                },
+            )
         SubElement(detail, "remarks").text = f"frame {each.name}, corrected by Sorvolo"
         lines.append(event_bytes(event))
     return b"\n".join(lines) + b"\n"
@@ -146,15 +163,3 @@ def _body_angles_deg(each: CorrectedFrame) -> tuple[float, float, float]:
     return body_nadir_angles_from_rotation(
         site_from_gimbal_rotation(each.yaw_deg, each.pitch_deg, each.roll_deg)
     )
-
-
-def _course(before: CorrectedFrame, now: CorrectedFrame) -> dict[str, str]:
-    latitude = math.radians(now.latitude_deg)
-    east_m = math.radians(now.longitude_deg - before.longitude_deg) * _EARTH_M * math.cos(latitude)
-    north_m = (latitude - math.radians(before.latitude_deg)) * _EARTH_M
-    passed_s = (now.time_ns - before.time_ns) / 1e9
-    speed = math.hypot(east_m, north_m) / passed_s if passed_s > 0 else 0.0
-    return {
-        "course": f"{math.degrees(math.atan2(east_m, north_m)) % 360:.1f}",
-        "speed": f"{speed:.2f}",
-    }

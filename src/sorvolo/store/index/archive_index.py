@@ -175,9 +175,11 @@ def _written(feature: Any, kept: Collection[str]) -> _Row | None:
     """A frame as the file has it; None for one that was not placed or is damaged."""
     try:
         outline = np.array(feature["geometry"]["coordinates"][0], np.float64)[:4, :2]
+        moment = datetime.fromisoformat(feature["properties"]["time"])
+        utc = moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
         name, time_ns = (
             str(feature["properties"]["frame"]),
-            _nanoseconds(feature["properties"]["time"]),
+            round(utc.timestamp() * 1e6) * 1000,
         )
     except (TypeError, ValueError, KeyError, IndexError):
         return None
@@ -248,12 +250,6 @@ def _is_usable(outline: Floats) -> bool:
     )
 
 
-def _nanoseconds(text: str) -> int:
-    moment = datetime.fromisoformat(text)
-    utc = moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
-    return round(utc.timestamp() * 1e6) * 1000
-
-
 INDEX = "archive-index.db"
 POINTER = "archive-index.json"
 _AT_ONCE = 5000  # rows
@@ -303,7 +299,13 @@ class ArchiveIndex:
                 raise StoreError(
                     f"{root} has no index; make one with: sorvolo archive index {root}"
                 )
-            _create(root, address)
+            url = parsed_url(address)
+            if url is None:
+                SqliteDatabase(root / INDEX, write=True, layout=tables.LAYOUT).create()
+            else:
+                create_pointed(
+                    root, POINTER, url, f"sorvolo_archive_{root.resolve().name}", tables.LAYOUT
+                )
         is_file = (root / INDEX).is_file()
         if address and is_file != (parsed_url(address) is None):
             lies = "in its folder" if is_file else "in PostgreSQL"
@@ -409,14 +411,6 @@ class ArchiveIndex:
 def has_index(root: Path) -> bool:
     """Whether the folder has an index."""
     return (root / INDEX).is_file() or (root / POINTER).is_file()
-
-
-def _create(root: Path, address: str) -> None:
-    url = parsed_url(address)
-    if url is None:
-        SqliteDatabase(root / INDEX, write=True, layout=tables.LAYOUT).create()
-    else:
-        create_pointed(root, POINTER, url, f"sorvolo_archive_{root.resolve().name}", tables.LAYOUT)
 
 
 def _add_flight(connection: Connection, site_id: int, rows: FlightRows) -> None:

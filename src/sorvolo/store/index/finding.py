@@ -131,7 +131,10 @@ def _seen(
         np.frombuffer(b"".join(kept), np.bool_),
     )
     origin, scale = [longitude_deg, place.latitude_deg], _metres_per_degree(place.latitude_deg)
-    corners_m = (_corners(outlines) - origin) * scale
+    # (N, 4, 2) the corners of collections of polygons of four corners each, as well-known binary
+    # has them.
+    polygons = np.frombuffer(b"".join(each[_HEAD_BYTES:] for each in outlines), _POLYGON)
+    corners_m = (np.asarray(polygons["corners"][:, :4], np.float64) - origin) * scale
     inside = _contain_origin(corners_m) & (times_ns >= place.first_ns) & (times_ns <= place.last_ns)
     frames = np.flatnonzero(inside)
     if not len(frames):
@@ -171,12 +174,6 @@ def _seen(
             *(each.tolist() for each in columns_of_found)
         )
     ]
-
-
-def _corners(outlines: Sequence[bytes]) -> Floats:
-    """(N, 4, 2) the corners of collections of polygons of four corners each, as well-known binary has them."""
-    polygons = np.frombuffer(b"".join(each[_HEAD_BYTES:] for each in outlines), _POLYGON)
-    return np.asarray(polygons["corners"][:, :4], np.float64)
 
 
 def _contain_origin(corners_m: Floats) -> NDArray[np.bool_]:

@@ -96,6 +96,7 @@ def changes_page(
     ]
     listed = [each for group in groups for each in group]
     is_reviewed = any(each.verdict is not None for each in changes)
+    measured = [name for name, _ in listed[0].cells] if listed else []
     page = render(
         "changes.html",
         title=f"{report.get('flight')} - changes",
@@ -115,7 +116,7 @@ def changes_page(
         is_reviewed=is_reviewed,
         has_metres=not site.is_local,
         systems=() if site.is_local else tuple(SYSTEMS.items()),
-        columns=_columns(listed, is_reviewed),
+        columns=["", "kind", *(["verdict"] if is_reviewed else []), *measured, "place", "id"],
         files=_files(site),
         view_rows=_view_rows(report),
         not_announced=[
@@ -270,16 +271,12 @@ def _summary(report: Mapping[str, Any], changes: Sequence[StoredChange]) -> list
         sentences.append(
             f"The map grew by {area_words(grown_m2)}, shown by {plural(extending, 'frame')}."
         )
-    return sentences + _reviewed_words(changes)
-
-
-def _reviewed_words(changes: Sequence[StoredChange]) -> list[str]:
-    """One sentence, or none where nothing was reviewed."""
+    # One sentence, or none where nothing was reviewed.
     reviewed = Counter(each.verdict for each in changes if each.verdict is not None)
     counts = " and ".join(
         f"{reviewed[verdict]} {verdict.value}" for verdict in Verdict if reviewed[verdict]
     )
-    return [f"Reviewed by a person: {counts}."] if reviewed else []
+    return sentences + ([f"Reviewed by a person: {counts}."] if reviewed else [])
 
 
 def _warnings(report: Mapping[str, Any]) -> list[str]:
@@ -333,11 +330,6 @@ def _legend(changes: Sequence[StoredChange]) -> list[dict[str, Any]]:
     ]
     rejected = sum(each.verdict is Verdict.REJECTED for each in changes)
     return entries + ([{"name": "rejected", "meaning": "", "count": rejected}] if rejected else [])
-
-
-def _columns(listed: Sequence[_Listed], is_reviewed: bool) -> list[str]:
-    measured = [name for name, _ in listed[0].cells] if listed else []
-    return ["", "kind", *(["verdict"] if is_reviewed else []), *measured, "place", "id"]
 
 
 def _cells(change: StoredChange, site: Site) -> tuple[tuple[str, str], ...]:

@@ -84,6 +84,13 @@ def report_page(
     `object_crops` are the JPEG pictures of the objects, by their ids; `site` gives them coordinates. What is None, NaN
     or missing in the report is shown as unknown or left out. All text is escaped.
     """
+    total, cpu_s = number_at(report, "seconds", "total"), number_at(report, "cpu_s", "total")
+    parts = [
+        None if total is None else f"{seconds_words(total)} in all",
+        None if cpu_s is None else f"{seconds_words(cpu_s)} of processor time",
+        with_unit("at most {:.0f} MB of memory", number_at(report, "peak_memory_mb")),
+        _reading(report),
+    ]
     page = render(
         "flight.html",
         title=f"{report.get('flight')} - flight report",
@@ -109,7 +116,7 @@ def report_page(
             for each in at(report, "notices") or []
         ],
         stages=_stages(report),
-        effort=_effort(report),
+        effort=", ".join(part for part in parts if part),
         settings=[
             (name, _setting_words(value)) for name, value in (at(report, "settings") or {}).items()
         ],
@@ -417,7 +424,16 @@ def _clock_offset(report: Mapping[str, Any]) -> str:
 
 def _stages(report: Mapping[str, Any]) -> list[dict[str, Any]]:
     """What each stage took, and the rest."""
-    rows = _stage_rows(report)
+    # Name, seconds, and seconds of processor time where known, of each stage and of the rest.
+    wall, cpu = at(report, "seconds") or {}, at(report, "cpu_s") or {}
+    stages = {name: finite_or_none(value) or 0.0 for name, value in wall.items() if name != "total"}
+    rest = (finite_or_none(wall.get("total")) or 0.0) - sum(stages.values())
+    rows = [
+        (_STAGE_WORDS.get(name, name), value, finite_or_none(cpu.get(name)))
+        for name, value in stages.items()
+    ]
+    if rest > 0:
+        rows.append(("reading frames, and the rest", rest, None))
     longest = max([value for _, value, _ in rows] + [1e-9])
     return [
         {
@@ -428,31 +444,6 @@ def _stages(report: Mapping[str, Any]) -> list[dict[str, Any]]:
         }
         for name, value, cpu_s in rows
     ]
-
-
-def _stage_rows(report: Mapping[str, Any]) -> list[tuple[str, float, float | None]]:
-    """Name, seconds, and seconds of processor time where known, of each stage and of the rest."""
-    wall, cpu = at(report, "seconds") or {}, at(report, "cpu_s") or {}
-    stages = {name: finite_or_none(value) or 0.0 for name, value in wall.items() if name != "total"}
-    rest = (finite_or_none(wall.get("total")) or 0.0) - sum(stages.values())
-    rows = [
-        (_STAGE_WORDS.get(name, name), value, finite_or_none(cpu.get(name)))
-        for name, value in stages.items()
-    ]
-    if rest > 0:
-        rows.append(("reading frames, and the rest", rest, None))
-    return rows
-
-
-def _effort(report: Mapping[str, Any]) -> str:
-    total, cpu_s = number_at(report, "seconds", "total"), number_at(report, "cpu_s", "total")
-    parts = [
-        None if total is None else f"{seconds_words(total)} in all",
-        None if cpu_s is None else f"{seconds_words(cpu_s)} of processor time",
-        with_unit("at most {:.0f} MB of memory", number_at(report, "peak_memory_mb")),
-        _reading(report),
-    ]
-    return ", ".join(part for part in parts if part)
 
 
 def _reading(report: Mapping[str, Any]) -> str | None:

@@ -71,7 +71,10 @@ def watch_page(
         notices=[str(each["text"]) for each in report.get("notices") or []],
         model=_model_rows(report.get("model") or {}),
         others=[_model_rows(each) for each in report.get("other_models") or []],
-        versions=join_words(f"Sorvolo {known(report.get('sorvolo'))},", _versions(report)),
+        versions=join_words(
+            f"Sorvolo {known(report.get('sorvolo'))},",
+            ", ".join(f"{name} {value}" for name, value in (report.get("versions") or {}).items()),
+        ),
     )
     return str(page)
 
@@ -80,10 +83,6 @@ def _model_rows(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
     return [
         (_FACTS.get(str(name), str(name)), known(_plain(value))) for name, value in facts.items()
     ]
-
-
-def _versions(report: Mapping[str, Any]) -> str:
-    return ", ".join(f"{name} {value}" for name, value in (report.get("versions") or {}).items())
 
 
 @dataclass(frozen=True)
@@ -266,13 +265,23 @@ def _course(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     seconds = {
         name: value for name, value in (report.get("seconds") or {}).items() if name != "total"
     }
+    missing = (
+        f"{known(at(report, 'detections', 'not_placed'))} without"
+        if report.get("georeferenced")
+        else "none with"
+    )
+    short = at(report, "detections", "set_aside")
+    aside = f"; {short} dropped, of a size that their class cannot have" if short else ""
     rows = [
         (
             "frames",
             f"{known(frames.get('detected'))} searched of {known(frames.get('read'))} read, "
             f"{known(frames.get('skipped'))} left, {known(frames.get('lost'))} unusable",
         ),
-        ("detections", _detections(report)),
+        (
+            "detections",
+            f"{known(at(report, 'detections', 'total'))}, of which {missing} a place on the ground{aside}",
+        ),
         (
             "time taken",
             join_words(
@@ -297,17 +306,6 @@ def _course(report: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("ended", known(report.get("ended"))),
     ]
     return [(name, words) for name, words in rows if words]
-
-
-def _detections(report: Mapping[str, Any]) -> str:
-    missing = (
-        f"{known(at(report, 'detections', 'not_placed'))} without"
-        if report.get("georeferenced")
-        else "none with"
-    )
-    short = at(report, "detections", "set_aside")
-    aside = f"; {short} dropped, of a size that their class cannot have" if short else ""
-    return f"{known(at(report, 'detections', 'total'))}, of which {missing} a place on the ground{aside}"
 
 
 def _plain(value: Any) -> Any:

@@ -270,7 +270,9 @@ class FlightWriter:
             "report.json": json_bytes(report),
             "report.html": report_html.encode(),
         }
-        flown_ns = _flown_ns(placed)
+        # Times of the first and the last frame, ns; None without frames.
+        times_ns = [int(frame.time_ns) for frame in placed]
+        flown_ns = (min(times_ns), max(times_ns)) if times_ns else None
         frames = {
             status.value: sum(frame.status is status for frame in placed) for status in Status
         }
@@ -356,9 +358,3 @@ class FlightWriter:
             for frame in placed
             if frame.index in image_paths and frame.status is not Status.REJECTED
         ]
-
-
-def _flown_ns(placed: Sequence[PlacedFrame]) -> tuple[int, int] | None:
-    """Times of the first and the last frame, ns; None without frames."""
-    times_ns = [int(frame.time_ns) for frame in placed]
-    return (min(times_ns), max(times_ns)) if times_ns else None

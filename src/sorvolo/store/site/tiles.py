@@ -223,15 +223,12 @@ class GrowingTiles(MutableMapping[TileIndex, ImageRGBA]):
     def __delitem__(self, index: TileIndex) -> None:
         if index not in self:
             raise KeyError(index)
-        self._let_go(index)
-        self._replace_hash(index, None)
-        self._changed.add(index)
-
-    def _let_go(self, index: TileIndex) -> None:
         self._settle(index)
         dropped = self._loaded.pop(index, None)
         self._bytes -= 0 if dropped is None else dropped.nbytes
         self._unsaved.discard(index)
+        self._replace_hash(index, None)
+        self._changed.add(index)
 
     def __iter__(self) -> Iterator[TileIndex]:
         return iter(self._hashes.keys() | self._unsaved | self._writing.keys())
