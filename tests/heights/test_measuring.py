@@ -9,7 +9,6 @@ from sorvolo.geometry.grid import SiteGrid
 from sorvolo.heights.field import HeightField, along
 from sorvolo.heights.lattice import MOST_SIDE, Lattice
 from sorvolo.heights.volumes import (
-    VolumeSettings,
     above_rim,
     between,
     contours,
@@ -75,12 +74,14 @@ def test_areas_without_heights_or_ground_to_tie_by_are_refused() -> None:
         above_rim(first, [[20 * SQUARE[0][0]]])
 
 
-def test_what_lies_beyond_the_heights_is_not_known() -> None:
+def test_what_lies_beyond_the_heights_is_not_known(monkeypatch: pytest.MonkeyPatch) -> None:
     """An area half beside the height model: half of its volume is not known, and one elsewhere is named as such."""
     pile = field(GRID, lambda x, y: 0.1 * x + np.maximum(0, 2 - np.hypot(x, y)))
     reach = float(BOX[:, 0].max())
     half = np.array([[-2, -4], [2 * reach + 2, -4], [2 * reach + 2, 4], [-2, 4]], float)
-    found = above_rim(pile, [[half]], VolumeSettings(least_known=0.3))
+    with monkeypatch.context() as patch:
+        patch.setattr("sorvolo.heights.volumes._LEAST_KNOWN", 0.3)
+        found = above_rim(pile, [[half]])
     assert found.area_m2 == pytest.approx(
         8 * (2 * reach + 4)
     ) and found.known_share == pytest.approx(0.5, abs=0.02)

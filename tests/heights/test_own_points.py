@@ -7,7 +7,7 @@ from scenes import survey_views
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.heights.cameras import Cameras3D
-from sorvolo.heights.figures import OwnPointSettings, judged_by_points
+from sorvolo.heights.figures import judged_by_points
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.smooth_sigma import SmoothSigma
 from sorvolo.heights.surface import Surface
@@ -75,14 +75,15 @@ def test_a_sigma_that_is_large_enough_stays() -> None:
     assert judgement.median_m == pytest.approx(0.6745 * np.hypot(0.5 * MATCH_M, 0.01), rel=0.1)
 
 
-def test_points_of_two_views_and_few_points_judge_nothing() -> None:
+def test_points_of_two_views_and_few_points_judge_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     surface, solved = level(error_m=3 * MATCH_M, views=2)
     same, judgement = judged_by_points(surface, solved)
     assert same is surface and judgement.points == 0 and np.isnan(judgement.within_2_sigma)
     surface, solved = level(error_m=3 * MATCH_M, points=80)
     same, judgement = judged_by_points(surface, solved)
     assert same is surface and 0 < judgement.points <= 80 and judgement.factor == 1
-    assert judged_by_points(surface, solved, OwnPointSettings(least_points=40))[1].factor > 2
+    monkeypatch.setattr("sorvolo.heights.figures._LEAST_POINTS", 40)
+    assert judged_by_points(surface, solved)[1].factor > 2
 
 
 def test_holes_are_not_judged_and_stay_holes() -> None:

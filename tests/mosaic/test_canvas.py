@@ -12,7 +12,7 @@ from real_data import real_data
 from sorvolo.errors import GeometryError
 from sorvolo.geometry.grid import Grid
 from sorvolo.geometry.homography import apply_homography
-from sorvolo.mosaic.canvas import Canvas, CanvasSettings
+from sorvolo.mosaic.canvas import Canvas
 from sorvolo.mosaic.canvas_frame import CanvasFrame, coverage, warp
 
 WIDTH, HEIGHT = 320, 240
@@ -78,11 +78,9 @@ def whole(tiles: dict, side: int) -> np.ndarray:
     return result
 
 
-def painted(frames, images, side=512, **options) -> np.ndarray:
+def painted(frames, images, side=512) -> np.ndarray:
     tiles: dict = {}
-    Canvas(
-        Grid((0.0, 0.0), 0.05, side), tiles, images.__getitem__, CanvasSettings(**options)
-    ).paint(frames)
+    Canvas(Grid((0.0, 0.0), 0.05, side), tiles, images.__getitem__).paint(frames)
     return whole(tiles, side)
 
 
@@ -108,13 +106,14 @@ def test_the_picture_is_the_ground(reference):
 
 
 @pytest.mark.parametrize("side", [64, 256])
-def test_tiles_meet_without_seams(scene, reference, side):
-    small = painted(*scene, side=side, window_px=256)
+def test_tiles_meet_without_seams(scene, reference, side, monkeypatch):
+    monkeypatch.setattr("sorvolo.mosaic.canvas._WINDOW_PX", 256)
+    small = painted(*scene, side=side)
     assert np.array_equal(small[..., 3], reference[..., 3])
     assert np.abs(small.astype(int) - reference).max() <= 2
 
 
-def test_each_tile_is_stored_once(scene, reference):
+def test_each_tile_is_stored_once(scene, reference, monkeypatch):
     """Where much is painted at once: tiles are compressed when memory runs out."""
 
     class Counted(dict):
@@ -127,8 +126,8 @@ def test_each_tile_is_stored_once(scene, reference):
     frames, images = scene
     for side, window_px in ((128, 256), (256, 300), (64, 200)):
         tiles = Counted()
-        settings = CanvasSettings(window_px=window_px)
-        Canvas(Grid((0.0, 0.0), 0.05, side), tiles, images.__getitem__, settings).paint(frames)
+        monkeypatch.setattr("sorvolo.mosaic.canvas._WINDOW_PX", window_px)
+        Canvas(Grid((0.0, 0.0), 0.05, side), tiles, images.__getitem__).paint(frames)
         assert len(tiles) == tiles.stored > 9
         assert np.abs(whole(tiles, side).astype(int) - reference).max() <= 2
 

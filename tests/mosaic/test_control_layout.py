@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sorvolo.mosaic.control import ControlSettings, layout_remarks
+from sorvolo.mosaic.control import layout_remarks
 
 _CAMERAS_M = np.column_stack(
     [each.ravel() for each in np.meshgrid(np.linspace(-100, 100, 9), [-60.0, 0.0, 60.0])]
@@ -32,5 +32,5 @@ def test_badly_laid_points_are_named(
     points_m: np.ndarray, cameras_m: np.ndarray, words: str
 ) -> None:
     turn = np.array([[0.8, -0.6], [0.6, 0.8]])
-    remarks = layout_remarks(points_m @ turn, cameras_m @ turn, 60.0, ControlSettings())
+    remarks = layout_remarks(points_m @ turn, cameras_m @ turn, 60.0)
     assert len(remarks) == bool(words) and all(words in each for each in remarks)

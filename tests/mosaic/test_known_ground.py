@@ -8,7 +8,7 @@ import pytest
 from test_canvas import GROUND, HEIGHT, WIDTH, flight, pose, whole
 
 from sorvolo.geometry.grid import Grid
-from sorvolo.mosaic.canvas import Canvas, CanvasSettings
+from sorvolo.mosaic.canvas import Canvas
 from sorvolo.mosaic.canvas_frame import CanvasFrame
 from sorvolo.mosaic.known_ground import KnownGround, settled
 
@@ -34,14 +34,13 @@ def halves():
     return early, late, images, tiles
 
 
-def extended(halves, frames=None, window_px=1024) -> dict:
+def extended(halves, frames=None) -> dict:
     early, late, images, tiles = halves
     tiles = dict(tiles)
     canvas = Canvas(
         GRID,
         tiles,
         images.__getitem__,
-        CanvasSettings(window_px=window_px),
         early,
         keeps_known_ground=True,
     )
@@ -68,12 +67,11 @@ def test_known_pixels_stay_and_the_new_side_meets_them(halves):
     assert abs(step) < 2.0  # blending half-way, the known side held, would have left 3.7
 
 
-def test_new_ground_is_the_same_however_it_is_cut_and_ordered(halves):
+def test_new_ground_is_the_same_however_it_is_cut_and_ordered(halves, monkeypatch):
     late = halves[1]
-    one, other = (
-        whole(extended(halves), 512),
-        whole(extended(halves, late[::-1], window_px=192), 512),
-    )
+    one = whole(extended(halves), 512)
+    monkeypatch.setattr("sorvolo.mosaic.canvas._WINDOW_PX", 192)
+    other = whole(extended(halves, late[::-1]), 512)
     assert np.abs(one.astype(int) - other).max() <= 2
 
 

@@ -9,7 +9,7 @@ from sorvolo.geometry.homography import apply_homography, fit_similarity, site_f
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
 from sorvolo.mosaic.graph_settings import PoseGraphSettings
-from sorvolo.mosaic.planar import KnownKeyframe, PlanarMapper, PlanarSettings
+from sorvolo.mosaic.planar import KnownKeyframe, PlanarMapper
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Status
 
@@ -117,9 +117,10 @@ def test_a_flight_is_placed_by_vision(has_gps):
     assert mapper.recent_exposure().gains.keys() == mapper.exposure().gains.keys()
 
 
-def test_while_a_flight_goes_on_gains_come_from_its_newest_links():
+def test_while_a_flight_goes_on_gains_come_from_its_newest_links(monkeypatch):
+    monkeypatch.setattr("sorvolo.mosaic.planar._RECENT_LINKS", 2)
     rng, poses = np.random.default_rng(2), flown(2)[:6]
-    mapper = PlanarMapper(PoseGraphSettings(), PlanarSettings(recent_links=2))
+    mapper = PlanarMapper(PoseGraphSettings())
     for k, pose in enumerate(poses):
         mapper.add(k, CAMERA, seen(pose, seed=k), measured(pose, rng))
     recent = mapper.recent_exposure()

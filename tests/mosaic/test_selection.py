@@ -178,10 +178,8 @@ def test_of_frames_over_known_ground_those_that_show_enough_new_ground_are_taken
 def test_one_gray_and_noise_alone_are_no_texture(noise_levels):
     noise = np.random.default_rng(0).normal(0, noise_levels, (480, 640, 1))
     bare = np.repeat(np.clip(128 + noise, 0, 255).astype(np.uint8), 3, axis=2)
-    assert not has_texture(bare, SelectionSettings())
+    assert not has_texture(bare)
     seen = posed(0, 0).frame.image
-    assert has_texture(seen, SelectionSettings())
+    assert has_texture(seen)
     # a field in fog: a twentieth of its contrast
-    assert has_texture(
-        np.clip(128 + (seen.astype(float) - 128) / 20, 0, 255).astype(np.uint8), SelectionSettings()
-    )
+    assert has_texture(np.clip(128 + (seen.astype(float) - 128) / 20, 0, 255).astype(np.uint8))

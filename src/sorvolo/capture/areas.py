@@ -21,7 +21,7 @@ from defusedxml import ElementTree
 from defusedxml.common import DefusedXmlException
 from pyproj import Proj
 
-from sorvolo.capture.small_files import read_small_file, text_of
+from sorvolo.capture.small_files import MOST_BYTES, read_small_file, text_of
 from sorvolo.errors import GeometryError, InputError
 from sorvolo.geometry.arrays import Floats
 from sorvolo.geometry.crs import crs_from_words, transformer
@@ -33,7 +33,6 @@ CORRIDOR_M = 30.0
 """How far to either side of a path its area reaches: about half a frame's width from 50 m, so that frames
 taken along the path are kept although GPS is off by some metres."""
 
-_MOST_BYTES = 20_000_000  # a field's outline has kilobytes; by choice
 _MOST_POLYGONS = 10_000  # in one file; a field has a few; by choice
 # zipfile trusts the offsets in a file: a negative one is a ValueError, one beyond 63 bits an OverflowError
 _BROKEN_ZIP = (
@@ -63,7 +62,7 @@ def read_area(path: AnyPath) -> Area:
     CRS, in its member `crs`).
     """
     path = Path(path)
-    raw = read_small_file(path, "area file", _MOST_BYTES)
+    raw = read_small_file(path, "area file")
     if raw[:2] == b"PK":
         raw = _kml_in_kmz(path, raw)
     try:
@@ -102,7 +101,7 @@ def read_segments(path: Path) -> list[tuple[str, Area, float]]:
     """
     text = text_of(
         path,
-        read_small_file(path, "file of segments", _MOST_BYTES),
+        read_small_file(path, "file of segments"),
         "file of segments",
         "GeoJSON polygons",
     )
@@ -175,11 +174,11 @@ def _kml_in_kmz(path: Path, raw: bytes) -> bytes:
             # programs take doc.kml, else the first at the archive's root; what is in folders is linked from there
             main = min(names, key=lambda name: (name.lower() != "doc.kml", name.count("/") > 0))
             with archive.open(main) as file:
-                kml = file.read(_MOST_BYTES + 1)
+                kml = file.read(MOST_BYTES + 1)
     except _BROKEN_ZIP as error:
         raise InputError(f"{path}: broken KMZ: {error}; export it again") from error
-    if len(kml) > _MOST_BYTES:
-        raise InputError(f"{path}: its KML is larger than {_MOST_BYTES // 1_000_000} MB")
+    if len(kml) > MOST_BYTES:
+        raise InputError(f"{path}: its KML is larger than {MOST_BYTES // 1_000_000} MB")
     return kml
 
 

@@ -23,7 +23,6 @@ LEAST_POINTS = 3
 """Fewer cannot show that one of them is wrong."""
 
 _KIND, _NEEDED = "control point file", "a CRS in the first line, then x y z px py image a line"
-_MOST_BYTES = 10_000_000  # some hundred thousand lines; by choice
 
 
 @dataclass(frozen=True)
@@ -137,7 +136,7 @@ def read_control_points(path: Path) -> ControlFile:
     Lines without a label belong together where their coordinates are the same. Raises InputError for what cannot be
     read, naming the line.
     """
-    text = text_of(path, read_small_file(path, _KIND, _MOST_BYTES), _KIND, _NEEDED)
+    text = text_of(path, read_small_file(path, _KIND), _KIND, _NEEDED)
     numbered = [
         (number, line.strip())
         for number, line in enumerate(text.splitlines(), start=1)

@@ -18,7 +18,6 @@ from sorvolo.survey.flight import CameraModel
 
 Node: TypeAlias = float | str | Floats
 
-_MOST_BYTES = 4_000_000  # a camera file has kilobytes; by choice
 _NUMBER = re.compile(
     r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?\.?(?:inf|nan)", re.IGNORECASE
 )
@@ -29,7 +28,7 @@ def read_nodes(path: Path) -> Mapping[str, Node]:
 
     Raises InputError for a file that is missing, empty, far too large, or no XML or YAML.
     """
-    raw = read_small_file(path, "camera file", _MOST_BYTES)
+    raw = read_small_file(path, "camera file")
     text = text_of(path, raw, "camera file", "XML or YAML with named values")
     if text.startswith("<"):
         nodes = _from_xml(path, text)

@@ -16,7 +16,6 @@ from sorvolo.geometry.pose import gimbal_angles_from_rotation, site_from_body_na
 from sorvolo.geometry.units import SECOND_NS
 
 _KIND, _NEEDED = "file of positions", "ODM's geo.txt or DJI's Timestamp.MRK"
-_MOST_BYTES = 20_000_000  # some hundred thousand photos; by choice
 _HEAD_BYTES = 4_096
 _SUFFIXES = (".txt", ".mrk")
 # number, second of the week, [week], three offsets of the antenna in mm, place, three sigmas, quality
@@ -59,7 +58,7 @@ def read_positions(
     whose name ends in the number and whose clock runs with the file's. Raises InputError for what cannot be read, and
     where no photo is placed.
     """
-    text = text_of(path, read_small_file(path, _KIND, _MOST_BYTES), _KIND, _NEEDED)
+    text = text_of(path, read_small_file(path, _KIND), _KIND, _NEEDED)
     is_mrk = _MRK_LINE.search(text) is not None
     found, words = (_of_mrk(text, photos), "") if is_mrk else _of_geo(path, text, photos)
     if not found:

@@ -4,19 +4,21 @@ from pathlib import Path
 
 from sorvolo.errors import InputError
 
+MOST_BYTES = 20_000_000  # a file of some hundred thousand lines; by choice
 
-def read_small_file(path: Path, kind: str, most_bytes: int) -> bytes:
+
+def read_small_file(path: Path, kind: str) -> bytes:
     """The bytes of a file, `kind` being what it is in words ("area file").
 
     Raises InputError for one that cannot be read or is larger than any of its kind.
     """
     try:
         with path.open("rb") as file:
-            raw = file.read(most_bytes + 1)
+            raw = file.read(MOST_BYTES + 1)
     except OSError as error:
         raise InputError(f"{path}: the {kind} cannot be read: {error.strerror or error}") from error
-    if len(raw) > most_bytes:
-        raise InputError(f"{path}: larger than {most_bytes // 1_000_000} MB, so no {kind}")
+    if len(raw) > MOST_BYTES:
+        raise InputError(f"{path}: larger than {MOST_BYTES // 1_000_000} MB, so no {kind}")
     return raw
 
 

@@ -17,14 +17,10 @@ _SHARES = (0.6827, 0.9545)  # of a Gaussian, within one and two sigma
 _ROUNDS = 30  # in which the factor settles
 
 
-@dataclass(frozen=True)
-class OwnPointSettings:
-    """Which points judge the heights."""
-
-    least_views: int = (
-        3  # see a point: where two see it, a wrong match along the line between them goes unseen
-    )
-    least_points: int = 100  # fewer judge nothing: five of them would be the share beyond two sigma
+_LEAST_VIEWS = (
+    3  # see a point that judges: where two do, a wrong match along their line goes unseen
+)
+_LEAST_POINTS = 100  # fewer judge nothing: five of them would be the share beyond two sigma
 
 
 @dataclass(frozen=True)
@@ -42,20 +38,18 @@ class PointJudgement:
     factor: float = 1.0
 
 
-def judged_by_points(
-    surface: Surface, solved: Cameras3D, settings: OwnPointSettings = OwnPointSettings()
-) -> tuple[Surface, PointJudgement]:
+def judged_by_points(surface: Surface, solved: Cameras3D) -> tuple[Surface, PointJudgement]:
     """The surface with its sigma raised to what the flight's own points in space show, and their judgement.
 
     A point and the cell there have the cameras in common: what these err is left out of the comparison, and stays in
     the sigma as it is. The sigma is never lowered: points lie where the ground has texture, and show nothing for the
     heights of ground that has none.
     """
-    judges = solved.point_views >= settings.least_views
+    judges = solved.point_views >= _LEAST_VIEWS
     points_m, sigma_m = solved.points_m[judges], solved.point_sigma_m[judges]
     at_m, stated_m = HeightField(surface.lattice, surface.up_m, surface.sigma_m).at(points_m[:, :2])
     known = np.isfinite(at_m)
-    if known.sum() < settings.least_points:
+    if known.sum() < _LEAST_POINTS:
         return surface, PointJudgement(int(known.sum()))
     off_m, points_m, sigma_m = np.abs(at_m - points_m[:, 2])[known], points_m[known], sigma_m[known]
     match_m = _without(stated_m[known], solved.height_sigma.at(points_m[:, :2]))

@@ -20,32 +20,25 @@ from sorvolo.heights.sweep import SweepSettings, choose_views, likeness_on
 from sorvolo.heights.terrain import filled
 from sorvolo.heights.views import View
 
-
-@dataclass(frozen=True)
-class IslandSettings:
-    """What counts as a match by chance (peaks of Hirschmueller 2008)."""
-
-    step_cells: float = (
-        4.0  # a height this much beside its neighbour's, in cells, is another piece of ground
-    )
-    most_cells: int = 340  # of an island: one and a half of the larger patch that is compared
-    photos: int = 2  # one pair of photos: nothing confirms what it shows
-    window_cells: int = 1000  # worked on at a time ...
-    margin_cells: int = 48  # ... with so many around
+# matches by chance (peaks of Hirschmueller 2008)
+_STEP_CELLS = 4.0  # a height this much beside its neighbour's, in cells, is another piece of ground
+_MOST_CELLS = 340  # of an island: one and a half of the larger patch that is compared
+PAIR = 2
+"""Photos of one pair: nothing confirms what they show."""
+_WINDOW_CELLS = 1000  # worked on at a time ...
+_MARGIN_CELLS = 48  # ... with so many around
 
 
-def islands(
-    up_m: Floats32, shown_by: ImageGray, cell_m: float, settings: IslandSettings = IslandSettings()
-) -> Mask:
+def islands(up_m: Floats32, shown_by: ImageGray, cell_m: float) -> Mask:
     """(H, W) the cells of a height model, NaN in holes, that stand alone where `shown_by` (H, W) photos are too few."""
     found = np.zeros(up_m.shape, bool)
-    margin = settings.margin_cells
-    for x0, y0, x1, y1 in _windows(up_m.shape, settings.window_cells):
+    margin = _MARGIN_CELLS
+    for x0, y0, x1, y1 in _windows(up_m.shape, _WINDOW_CELLS):
         left, top = max(0, x0 - margin), max(0, y0 - margin)
         here = slice(top, y1 + margin), slice(left, x1 + margin)
-        alone = _alone(up_m[here], settings.step_cells * cell_m, settings.most_cells)
+        alone = _alone(up_m[here], _STEP_CELLS * cell_m, _MOST_CELLS)
         found[y0:y1, x0:x1] = alone[y0 - top : y1 - top, x0 - left : x1 - left]
-    return found & (shown_by <= settings.photos)
+    return found & (shown_by <= PAIR)
 
 
 def _windows(shape: tuple[int, ...], side: int) -> Iterator[tuple[int, int, int, int]]:

@@ -4,8 +4,6 @@ A progressive morphological filter (Zhang 2003; Pingel 2013): what an opening ta
 than the ground's slope explains, is no ground; windows grow up to the widest thing.
 """
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from cv2.typing import MatLike
@@ -18,20 +16,14 @@ _SLOPE = 0.2  # of the ground, at most
 _LEAST_HEIGHT_M = 0.3  # above the ground around: lower things are ground
 
 
-@dataclass(frozen=True)
-class TerrainSettings:
-    """What counts as standing on the ground."""
-
-    widest_m: float = 30.0  # of a building or a grove
+_WIDEST_M = 30.0  # of a building or a grove
 
 
-def terrain(
-    lattice: Lattice, up_m: Floats32, settings: TerrainSettings = TerrainSettings()
-) -> tuple[Floats32, Mask]:
+def terrain(lattice: Lattice, up_m: Floats32) -> tuple[Floats32, Mask]:
     """(H, W) the ground's height, everywhere, and which cells show it; `up_m` (H, W) may have holes (NaN)."""
     factor = max(1, round(_CELL_M / lattice.cell_m))
     low, known = _lowest(up_m, factor)
-    is_ground = _ground_cells(filled(low, known), known, lattice.cell_m * factor, settings)
+    is_ground = _ground_cells(filled(low, known), known, lattice.cell_m * factor)
     ground = cv2.GaussianBlur(filled(low, is_ground), (0, 0), 1.0)
     height, width = up_m.shape
     share, shift = 1 / factor, (1 - factor) / (2 * factor)
@@ -82,13 +74,13 @@ def _lowest(up_m: Floats32, factor: int) -> tuple[Floats32, Mask]:
     return np.where(known, low, np.nan).astype(np.float32), known & np.isfinite(low)
 
 
-def _ground_cells(low: Floats32, known: Mask, cell_m: float, settings: TerrainSettings) -> Mask:
+def _ground_cells(low: Floats32, known: Mask, cell_m: float) -> Mask:
     # lone low cells are false matches: an opening of the negative takes them off before they pull the ground down
     surface = cv2.morphologyEx(cv2.medianBlur(low.astype(np.float32), 3), cv2.MORPH_CLOSE, _disk(1))
     is_ground = known.copy()
     opened = surface
     radius, before = 1, 0
-    while radius * cell_m <= settings.widest_m / 2 + cell_m:
+    while radius * cell_m <= _WIDEST_M / 2 + cell_m:
         opened_now = cv2.morphologyEx(
             opened, cv2.MORPH_OPEN, _disk(radius), borderType=cv2.BORDER_REPLICATE
         )

@@ -28,11 +28,7 @@ _BEYOND = (
 )
 
 
-@dataclass(frozen=True)
-class VolumeSettings:
-    """How two dates are tied to each other, and how errors of cells add up."""
-
-    least_known: float = 0.5  # of the area
+_LEAST_KNOWN = 0.5  # of an area
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +68,6 @@ def tie(
     earlier: HeightField,
     later: HeightField,
     stable: Mask,
-    settings: VolumeSettings = VolumeSettings(),
 ) -> Tie:
     """How `later` is to be moved onto `earlier`, by the cells of `earlier` that are `stable`, (H, W).
 
@@ -109,7 +104,7 @@ def tie(
         step = _step(off[usable], east[usable], north[usable])
         shift_m += step
         sigma, count = (
-            _offset_sigma(off - step[2], usable, earlier.lattice.cell_m, settings),
+            _offset_sigma(off - step[2], usable, earlier.lattice.cell_m),
             int(usable.sum()),
         )
         if np.abs(step).max() < 1e-3:
@@ -122,14 +117,13 @@ def between(
     later: HeightField,
     polygons: Polygons,
     tied: Tie,
-    settings: VolumeSettings = VolumeSettings(),
 ) -> Volume:
     """Cut and fill within polygons of rings, site metres. Raises InputError where most of them has no heights."""
     moved = later.on(earlier.lattice, tied.shift_m[:2])
     rise = np.asarray(moved.up_m + tied.shift_m[2] - earlier.up_m, np.float32)
     sigma = np.asarray(np.hypot(earlier.sigma_m, moved.sigma_m), np.float32)
     risen = HeightField(earlier.lattice, rise, sigma)
-    return _added_up(risen, risen.inside(polygons), polygons, tied.sigma_m, settings)
+    return _added_up(risen, risen.inside(polygons), polygons, tied.sigma_m)
 
 
 def height_changes(
@@ -137,7 +131,6 @@ def height_changes(
     later: HeightField,
     outlines_m: Sequence[PointsM],
     changed_m: Sequence[PointsM],
-    settings: VolumeSettings = VolumeSettings(),
 ) -> list[HeightChange | None]:
     """How much higher the ground within each outline, (N, 2) site metres, lies on the mean than before.
 
@@ -145,10 +138,10 @@ def height_changes(
     an outline has heights on both dates; for all of them where the two share too little unchanged ground.
     """
     try:
-        tied = tie(earlier, later, ~earlier.inside([[each] for each in changed_m]), settings)
+        tied = tie(earlier, later, ~earlier.inside([[each] for each in changed_m]))
     except InputError:
         return [None] * len(outlines_m)
-    return [_height_change(earlier, later, [[each]], tied, settings) for each in outlines_m]
+    return [_height_change(earlier, later, [[each]], tied) for each in outlines_m]
 
 
 def _height_change(
@@ -156,19 +149,16 @@ def _height_change(
     later: HeightField,
     polygons: Polygons,
     tied: Tie,
-    settings: VolumeSettings,
 ) -> HeightChange | None:
     try:
-        volume = between(earlier, later, polygons, tied, settings)
+        volume = between(earlier, later, polygons, tied)
     except InputError:
         return None
     known_m2 = volume.area_m2 * volume.known_share
     return HeightChange(volume.net_m3 / known_m2, volume.sigma_m3 / known_m2)
 
 
-def above_rim(
-    surface: HeightField, polygons: Polygons, settings: VolumeSettings = VolumeSettings()
-) -> Volume:
+def above_rim(surface: HeightField, polygons: Polygons) -> Volume:
     """What stands above (fill) and below (cut) the ground that goes on from around polygons of rings, site metres."""
     inside = surface.inside(polygons)
     around = np.isfinite(surface.up_m) & ~inside
@@ -179,23 +169,21 @@ def above_rim(
     base = filled(surface.up_m, around)
     rim = _rim_sigma(surface, inside)
     risen = HeightField(surface.lattice, surface.up_m - base, surface.sigma_m)
-    return _added_up(risen, inside, polygons, rim, settings)
+    return _added_up(risen, inside, polygons, rim)
 
 
-def _added_up(
-    risen: HeightField, inside: Mask, polygons: Polygons, common_m: float, settings: VolumeSettings
-) -> Volume:
+def _added_up(risen: HeightField, inside: Mask, polygons: Polygons, common_m: float) -> Volume:
     rise, sigma, cell_m = risen.up_m, risen.sigma_m, risen.lattice.cell_m
     known, cell_m2 = inside & np.isfinite(rise) & np.isfinite(sigma), cell_m**2
     area_m2 = max(sum(polygon_area(each) for each in polygons), float(inside.sum()) * cell_m2)
     share = float(known.sum()) * cell_m2 / area_m2 if area_m2 > 0 else 0.0
-    if share < settings.least_known:
+    if share < _LEAST_KNOWN:
         beyond = 1 - float(inside.sum()) * cell_m2 / area_m2 if area_m2 > 0 else 0.0
         advice = "fly it with more overlap"
         if beyond > _BEYOND:
             advice = f"{beyond:.0%} of it is beyond the flight's heights: draw it on flown ground (check its CRS)"
         raise InputError(
-            f"only {share:.0%} of the area has heights, {settings.least_known:.0%} are needed; {advice}"
+            f"only {share:.0%} of the area has heights, {_LEAST_KNOWN:.0%} are needed; {advice}"
         )
     alike = max(1.0, (_BLOCK_M / cell_m) ** 2)  # cells whose errors are one
     scatter = float(
@@ -219,7 +207,7 @@ def _step(off: Floats, east: Floats, north: Floats) -> Floats:
     return np.asarray(np.linalg.solve(normal, columns.T @ off), np.float64)
 
 
-def _offset_sigma(off: Floats, usable: Mask, cell_m: float, settings: VolumeSettings) -> float:
+def _offset_sigma(off: Floats, usable: Mask, cell_m: float) -> float:
     """One sigma of the height of the tie: blocks of cells whose errors are alike count once."""
     side = max(1, round(_BLOCK_M / cell_m))
     rows, columns = np.nonzero(usable)

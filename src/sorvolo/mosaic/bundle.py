@@ -31,6 +31,7 @@ the calibration left over, the constant offsets of the altitude's zero and of GP
 turn of the camera, about its own axes, against the attitude that telemetry states (mounting, gimbal, compass)."""
 
 
+ROBUST_SIGMAS = 3.0  # of the Cauchy loss
 LINKS_AT_ONCE = 256  # some megabytes of derivatives
 _STEPS_AS_ONE = 4  # of the whole map at once, before its cameras move one by one
 
@@ -241,7 +242,6 @@ def solve(
     shared_sigma: Floats,
     free: NDArray[np.bool_],
     iterations: int,
-    robust_sigmas: float = 3.0,
     ground: Ground = NO_GROUND,
 ) -> Solution:
     """Levenberg-Marquardt with a Cauchy loss over the free nodes, (N,) bool, and the shared unknowns.
@@ -249,7 +249,7 @@ def solve(
     `shared_sigma` (8,) is each shared unknown's prior sigma about 0; 0 holds it at its present value.
     """
     damping = 1e-6
-    problem = _Problem.of(pairs, ground, shared_sigma, free, robust_sigmas)
+    problem = _Problem.of(pairs, ground, shared_sigma, free)
     if iterations and free.sum() > 2 and np.array_equal(free, nodes.own):
         nodes, shared = _moved_as_one(problem, nodes, shared)
     equations = _normal_equations(problem, nodes, shared)
@@ -277,7 +277,6 @@ class _Problem:
     pairs: Linked
     ground: Ground
     shared_sigma: Floats  # (8,)
-    robust_sigmas: float
     position: Rows  # (N,) of each node among those that move, -1 for those held
     elimination: Elimination
 
@@ -288,7 +287,6 @@ class _Problem:
         ground: Ground,
         shared_sigma: Floats,
         free: NDArray[np.bool_],
-        robust_sigmas: float,
     ) -> "_Problem":
         """With the nodes that are `free`, (N,) bool."""
         position = np.full(len(free), -1)
@@ -299,7 +297,6 @@ class _Problem:
             pairs,
             ground,
             shared_sigma,
-            robust_sigmas,
             position,
             Elimination(int(free.sum()), one[both], other[both]),
         )
@@ -350,12 +347,12 @@ def _move_as_one(nodes: Nodes, middle_m: Floats, step: Floats) -> Nodes:
 def _normal_equations(problem: _Problem, nodes: Nodes, shared: Floats) -> NormalEquations:
     into = NormalEquations(problem.elimination, len(SHARED))
     if len(problem.pairs.old):
-        _add_links(into, nodes, problem.pairs, shared, problem.position, problem.robust_sigmas)
+        _add_links(into, nodes, problem.pairs, shared, problem.position)
     if len(problem.ground.node):
         rows = linearise_ground(nodes, problem.ground, shared)
         residual = rows.residual_px / rows.sigma_px[:, None]
-        squared = (residual**2).sum(-1) / problem.robust_sigmas**2
-        into.cost += float((rows.seen * np.log1p(squared)).sum()) * problem.robust_sigmas**2
+        squared = (residual**2).sum(-1) / ROBUST_SIGMAS**2
+        into.cost += float((rows.seen * np.log1p(squared)).sum()) * ROBUST_SIGMAS**2
         root = np.sqrt(rows.seen / (1 + squared))[:, None]
         jacobian = (
             np.concatenate([rows.by_camera, rows.by_shared], axis=-1) / rows.sigma_px[:, None, None]
@@ -363,7 +360,7 @@ def _normal_equations(problem: _Problem, nodes: Nodes, shared: Floats) -> Normal
         into.add(
             jacobian * root[..., None], residual * root, (problem.position[problem.ground.node],)
         )
-    _add_telemetry(into, nodes, shared, problem.position, problem.robust_sigmas)
+    _add_telemetry(into, nodes, shared, problem.position)
     held = problem.shared_sigma <= 0
     prior = np.where(held, 1e12, 1 / np.maximum(problem.shared_sigma, 1e-12) ** 2)
     into.add_shared(np.diag(prior), np.where(held, 0.0, -prior * shared))
@@ -378,15 +375,14 @@ def _add_links(
     pairs: Linked,
     shared: Floats,
     position: Rows,
-    robust: float,
 ) -> None:
     for some in pairs.batches():
         line = linearise(nodes, some, shared)
         white = whiten(line, some)
         residual = np.einsum("lkij,lkj->lki", white, line.residual_px)
         weight = some.weight * line.seen
-        squared = (residual**2).sum(-1) / robust**2
-        into.cost += float((weight * np.log1p(squared)).sum()) * robust**2
+        squared = (residual**2).sum(-1) / ROBUST_SIGMAS**2
+        into.cost += float((weight * np.log1p(squared)).sum()) * ROBUST_SIGMAS**2
         root = np.sqrt(weight / (1 + squared))[..., None]
         residual = (residual * root).reshape(len(some.old), -1)
         jacobian = np.concatenate([line.by_old, line.by_new, line.by_shared], axis=-1)
@@ -396,9 +392,7 @@ def _add_links(
         into.add(jacobian, residual, (position[some.old], position[some.new]))
 
 
-def _add_telemetry(
-    into: NormalEquations, nodes: Nodes, shared: Floats, position: Rows, robust: float
-) -> None:
+def _add_telemetry(into: NormalEquations, nodes: Nodes, shared: Floats, position: Rows) -> None:
     index = np.flatnonzero(position >= 0)  # in the order of their positions
     blocks, coupling = np.zeros((len(index), 6, 6)), np.zeros((len(index), 6, len(SHARED)))
     own, shared_pull = np.zeros((len(SHARED), len(SHARED))), np.zeros(len(SHARED))
@@ -408,9 +402,9 @@ def _add_telemetry(
     white = miss * root
     squared = (
         np.column_stack([(white[:, :2] ** 2).sum(1), (white[:, :2] ** 2).sum(1), white[:, 2] ** 2])
-        / robust**2
+        / ROBUST_SIGMAS**2
     )
-    into.cost += float((np.log1p(squared[:, 1]) + np.log1p(squared[:, 2])).sum()) * robust**2
+    into.cost += float((np.log1p(squared[:, 1]) + np.log1p(squared[:, 2])).sum()) * ROBUST_SIGMAS**2
     information = root**2 / (1 + squared)
     blocks[:, [3, 4, 5], [3, 4, 5]] = information
     coupling[:, [3, 4, 5], [3, 4, 2]] = information
@@ -422,8 +416,8 @@ def _add_telemetry(
     relative = nodes.prior_rotations[index].transpose(0, 2, 1) @ rotation
     error = rotation_vector(relative) - shared[5:]
     root = 1 / nodes.prior_sigma_rad[index]
-    squared = (error * root) ** 2 / robust**2
-    into.cost += float(np.log1p(squared).sum()) * robust**2
+    squared = (error * root) ** 2 / ROBUST_SIGMAS**2
+    into.cost += float(np.log1p(squared).sum()) * ROBUST_SIGMAS**2
     information = root**2 / (1 + squared)
     blocks[:, :3, :3] = (rotation * information[:, None, :]) @ rotation.transpose(0, 2, 1)
     turn_pull = -np.einsum("nij,nj->ni", rotation, information * error)

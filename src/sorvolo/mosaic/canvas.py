@@ -9,14 +9,12 @@ images.
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass
 from itertools import pairwise
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import ImageRGB, ImageRGBA, Mask, PointsPx
 from sorvolo.geometry.grid import Grid, SiteGrid, TileIndex
 from sorvolo.mosaic.blending import (
@@ -36,23 +34,11 @@ from sorvolo.mosaic.known_ground import SETTLING_PX, KnownGround, settled
 _CHUNK_CELLS = 64  # a side: cells are looked up in blocks, so that an endless map needs no array
 _NOBODY = -1  # in place of a frame's number
 _FILLINGS = 32  # kept: each has a 64th of its picture's pixels
+_MOVED_PX = 0.5  # a smaller move of all corners cannot be seen
+_GAIN_STEP = 0.01  # a smaller change of gain is below one gray level in the mid-tones
+_WINDOW_PX = 1024  # longest side of a piece rendered at once: bounds the memory
 # A changed winner is felt as far as the bands spread (62 px) and its outline is smoothed (2 cells) around it.
 _REACH_CELLS = 10
-
-
-@dataclass(frozen=True)
-class CanvasSettings:
-    """When a frame is painted again, and how much is rendered at once."""
-
-    moved_px: float = 0.5  # a smaller move of all corners cannot be seen
-    gain_step: float = 0.01  # a smaller change of gain is below one gray level in the mid-tones
-    window_px: int = 1024  # longest side of a piece rendered at once: bounds the memory
-
-    def __post_init__(self) -> None:
-        if self.moved_px < 0 or self.gain_step < 0 or self.window_px < 64:
-            raise SettingsError(
-                "canvas: moved_px and gain_step must not be negative, window_px at least 64"
-            )
 
 
 class _Chunk:
@@ -79,12 +65,11 @@ class Canvas:
         grid: Grid,
         tiles: MutableMapping[TileIndex, ImageRGBA],
         images: Callable[[int], ImageRGB],
-        settings: CanvasSettings = CanvasSettings(),
         painted: Iterable[CanvasFrame] = (),
         *,
         keeps_known_ground: bool = False,
     ) -> None:
-        self._grid, self._tiles, self._images, self._settings = grid, tiles, images, settings
+        self._grid, self._tiles, self._images = grid, tiles, images
         self._frames: dict[int, CanvasFrame] = {}
         self._chunks: dict[TileIndex, _Chunk] = {}
         self._known = KnownGround(grid, tiles) if keeps_known_ground else None
@@ -103,7 +88,7 @@ class Canvas:
     ) -> frozenset[TileIndex]:
         """Put new or moved frames in place, drop those to forget, and return the tiles whose picture changed.
 
-        Known frames that moved by no more than `moved_px` at every corner, with the same gains, are left as
+        Known frames that moved by no more than half a pixel at every corner, with the same gains, are left as
         they are. A tile that nothing covers any more is deleted.
         """
         changed = {frame.id: frame for frame in frames if self._differs(frame)}
@@ -146,9 +131,7 @@ class Canvas:
             np.log(np.maximum(frame.gains, 1e-6) / np.maximum(known.gains, 1e-6))
         ).max()
         shaded = np.abs(frame.vignette - known.vignette).max()
-        return bool(
-            moved_px > self._settings.moved_px or max(brighter, shaded) > self._settings.gain_step
-        )
+        return bool(moved_px > _MOVED_PX or max(brighter, shaded) > _GAIN_STEP)
 
     @staticmethod
     def _chunks_of(frame: CanvasFrame) -> frozenset[TileIndex]:
@@ -266,7 +249,7 @@ class Canvas:
 
         What is too large for one is cut at borders of tiles: then each tile is painted, and stored, once.
         """
-        tile_px, most_px = self._grid.tile_px, self._settings.window_px
+        tile_px, most_px = self._grid.tile_px, _WINDOW_PX
         if count * CELL_PX <= most_px:
             return np.array([first, first + count])
         whole_px = most_px // tile_px * tile_px if tile_px % ALIGN_PX == 0 else 0

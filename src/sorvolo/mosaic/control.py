@@ -145,9 +145,9 @@ def tie_control(
     cameras_m = np.array([mapper.pose(each).translation_m for each in mapper.placed()])
     picture_m = float(np.median(cameras_m[:, 2])) * problem.camera.width_px / problem.camera.fx_px
     remarks = (
-        *_misfit_remarks(mapper, problem, seen, used, expected_m, settings),
+        *_misfit_remarks(mapper, seen, used, expected_m),
         *layout_remarks(
-            np.unique(seen.of(used).place_m[:, :2], axis=0), cameras_m[:, :2], picture_m, settings
+            np.unique(seen.of(used).place_m[:, :2], axis=0), cameras_m[:, :2], picture_m
         ),
     )
     missed_m = _rms_m(misses[np.array([label not in excluded for label in seen.labels], bool)])
@@ -158,12 +158,7 @@ def tie_control(
 
 
 def _misfit_remarks(
-    mapper: PlanarMapper,
-    problem: ControlProblem,
-    seen: _Seen,
-    used: set[str],
-    expected_m: float,
-    settings: ControlSettings,
+    mapper: PlanarMapper, seen: _Seen, used: set[str], expected_m: float
 ) -> tuple[str, ...]:
     """In words, that the points miss the tied map by more than they err: its ground is not level, or their heights are
     wrong. Whether heights in feet would fit is judged by how well map and points fit each other after a similarity."""
@@ -193,9 +188,7 @@ def _rms_m(off_m: PointsM) -> float:
     return float(np.sqrt((off_m**2).sum(axis=1).mean()))
 
 
-def layout_remarks(
-    places_m: PointsM, cameras_m: PointsM, picture_m: float, settings: ControlSettings
-) -> tuple[str, ...]:
+def layout_remarks(places_m: PointsM, cameras_m: PointsM, picture_m: float) -> tuple[str, ...]:
     """In words, how control points at (P, 2) lie badly for a flight with cameras over (N, 2), whose pictures are
     `picture_m` wide on the ground: on one line, or all in one corner. Their residuals are small, however far off the
     map is elsewhere."""
@@ -334,12 +327,10 @@ def _disagreement(
     miss_m = np.sort(np.linalg.norm(apply_homography(change, b) - a, axis=1))[(len(a) + 1) // 2]
     if miss_m > _MOST_MISFIT * spread_m:
         return f"the control points miss those marked by {miss_m:.1f} m on ground {2 * spread_m:.0f} m wide"
-    return "" if problem.is_datum else _against_gps(a, b, change, spread_m, settings)
+    return "" if problem.is_datum else _against_gps(a, b, change, spread_m)
 
 
-def _against_gps(
-    a: PointsM, b: PointsM, change: Matrix3, spread_m: float, settings: ControlSettings
-) -> str:
+def _against_gps(a: PointsM, b: PointsM, change: Matrix3, spread_m: float) -> str:
     """How surveyed places `a` cannot be those that a map by GPS has at `b`, (P, 2) each; "" where they can."""
     off_m = float(np.median(np.linalg.norm(a - b, axis=1)))
     scale = float(np.hypot(change[0, 0], change[1, 0]))

@@ -6,8 +6,8 @@ undoes its exposure: what two frames a and b show of the same ground agrees when
 V(r_a) = log I_b + log g_b - log V(r_b). That is linear in log g, a2 and a4.
 """
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array, diags_array
 from scipy.sparse.linalg import splu
 
-from sorvolo.errors import GeometryError, SettingsError
 from sorvolo.geometry.arrays import (
     Floats,
     Floats16,
@@ -35,23 +34,13 @@ _SHOULDER = 200.0  # level from which on brightening is compressed; by choice
 _SIGMA_FROM_MEDIAN = 1.126  # of the root mean square of three normal numbers
 
 
-@dataclass(frozen=True)
-class ExposureSettings:
-    """How far gains may go; sigmas are of the logarithm (0.1 is about 10 %)."""
-
-    gain_sigma: float = (
-        0.15  # prior about gain 1: keeps the whole map from drifting along a chain of links
-    )
-    vignette_sigma: float = 0.3  # prior about no vignette: where radii do not differ it stays at 0
-    colour_sigma: float = 0.03  # least spread of a point's colour: noise, texture and misplacement
-    points_per_link: int = 48  # colours of the ground that both pictures show
-    largest_gain: float = 2.0  # a picture that would need more is left darker; by choice
-
-    def __post_init__(self) -> None:
-        if min(self.gain_sigma, self.vignette_sigma, self.colour_sigma, self.points_per_link) <= 0:
-            raise SettingsError("exposure: sigmas and points_per_link must be positive")
-        if self.largest_gain < 1:
-            raise SettingsError("exposure: largest_gain must be at least 1")
+# sigmas are of the logarithm of a gain (0.1 is about 10 %)
+_GAIN_SIGMA = 0.15  # prior about gain 1: keeps the whole map from drifting along a chain of links
+_VIGNETTE_SIGMA = 0.3  # prior about no vignette: where radii do not differ it stays at 0
+_COLOUR_SIGMA = 0.03  # least spread of a point's colour: noise, texture and misplacement
+_LARGEST_LOG_GAIN = np.log(2.0)  # a picture that would need more is left darker; by choice
+POINTS_PER_LINK = 48
+"""Colours of the ground that both pictures show."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,10 +58,6 @@ class ColourPairs:
     def __post_init__(self) -> None:
         for name in ("colours_a", "colours_b", "radius2_a", "radius2_b"):
             object.__setattr__(self, name, frozen(getattr(self, name), np.float16))
-        if self.colours_a.shape != self.colours_b.shape or self.colours_a.shape[1:] != (3,):
-            raise GeometryError("colour pairs need (N, 3) on both sides")
-        if not len(self.colours_a) == len(self.radius2_a) == len(self.radius2_b):
-            raise GeometryError("colour pairs need a radius for each colour")
 
     def __len__(self) -> int:
         return len(self.colours_a)
@@ -89,28 +74,23 @@ class ColourPairs:
 
 @dataclass(frozen=True, eq=False)
 class Exposure:
-    """Gains (3,) that multiply each frame's channels, vignettes (a2, a4) of each camera, and the spread left.
+    """Gains (3,) that multiply each frame's channels, the camera's `vignette` (a2, a4), and the spread left.
 
     `spread` is the robust relative difference of the colours of the same ground after correction.
     """
 
     gains: Mapping[int, Floats]
-    vignettes: Mapping[int, Floats]
-    spread: float
+    vignette: Floats = field(default_factory=lambda: np.zeros(2))
+    spread: float = 0.0
 
     def gains_of(self, frame_id: int) -> Floats:
         """(3,) the frame's gains; ones where nothing is known of it."""
         return self.gains.get(frame_id, np.ones(3))
 
-    def vignette_of(self, camera_id: int) -> Floats:
-        """(2,) the camera's vignette; none where nothing is known of it."""
-        return self.vignettes.get(camera_id, np.zeros(2))
-
     def updated(self, newer: "Exposure") -> "Exposure":
         """With all that the newer one knows, and what only this one does."""
-        return Exposure(
-            {**self.gains, **newer.gains}, {**self.vignettes, **newer.vignettes}, newer.spread
-        )
+        vignette = newer.vignette if newer.gains else self.vignette
+        return Exposure({**self.gains, **newer.gains}, vignette, newer.spread)
 
 
 def tie_colours(
@@ -132,30 +112,17 @@ def tie_colours(
     )
 
 
-def solve_exposure(
-    pairs: Mapping[tuple[int, int], ColourPairs],
-    camera_of: Mapping[int, int] | None = None,
-    settings: ExposureSettings = ExposureSettings(),
-) -> Exposure:
+def solve_exposure(pairs: Mapping[tuple[int, int], ColourPairs]) -> Exposure:
     """Gains of all frames named in `pairs` (frame a, frame b), by robust least squares of log colours.
 
-    `camera_of` is the camera of each frame, each with its own vignette; without it there is one, 0. Frames and
-    cameras with few pairs stay near gain 1 and near no vignette.
+    Frames with few pairs stay near gain 1, and few pairs leave the vignette near none.
     """
     ids = sorted({each for link in pairs for each in link})
-    camera_of = camera_of or dict.fromkeys(ids, 0)
-    cameras = sorted({camera_of[each] for each in ids})
-    lens = {camera: len(ids) + 2 * i for i, camera in enumerate(cameras)}
-    unknowns = _Unknowns(
-        {each: i for i, each in enumerate(ids)}, lens, {each: lens[camera_of[each]] for each in ids}
-    )
     if not any(len(each) for each in pairs.values()):
-        return Exposure({e: np.ones(3) for e in ids}, {c: np.zeros(2) for c in unknowns.lens}, 0.0)
-    solution, spread = _robust_solution(_equations(pairs, unknowns, settings), unknowns, settings)
-    limit = np.log(settings.largest_gain)
-    gains = {e: np.exp(np.clip(solution[i], -limit, limit)) for e, i in unknowns.column.items()}
-    vignettes = {c: solution[i : i + 2, 0].copy() for c, i in unknowns.lens.items()}
-    return Exposure(gains, vignettes, spread)
+        return Exposure({each: np.ones(3) for each in ids})
+    solution, spread = _robust_solution(_equations(pairs, ids), len(ids))
+    gains = np.exp(np.clip(solution[:-2], -_LARGEST_LOG_GAIN, _LARGEST_LOG_GAIN))
+    return Exposure(dict(zip(ids, gains)), solution[-2:, 0].copy(), spread)
 
 
 def corrected(
@@ -203,21 +170,12 @@ def _brightened(levels: Floats, gain: float) -> NDArray[np.uint8]:
     return np.where(levels < 255, np.minimum(brightened + 0.5, 254), 255).astype(np.uint8)
 
 
-@dataclass(frozen=True)
-class _Unknowns:
-    """The places of the unknowns: a column for each frame's gain, then two for each camera's vignette."""
-
-    column: Mapping[int, int]  # of each frame
-    lens: Mapping[int, int]  # of each camera: the first of its two
-    lens_of: Mapping[int, int]  # of each frame: that of its camera
-
-
 @dataclass(frozen=True, eq=False)
 class _Equations:
     """Colour pairs as equations, those of a link beside each other, L links of up to P pairs.
 
-    `columns` (L, 6) of their unknowns, squared radii (L, P), log-colour `difference` (L, P, 3); `exists` (L, P) is
-    False where a link has fewer pairs.
+    `columns` (L, 6) of their unknowns, gains and then the vignette's two, squared radii (L, P),
+    log-colour `difference` (L, P, 3); `exists` (L, P) is False where a link has fewer pairs.
     """
 
     columns: Rows
@@ -235,18 +193,16 @@ class _Equations:
             yield some, np.stack([one, -one, -a, -(a**2), b, b**2], axis=-1)
 
 
-def _equations(
-    pairs: Mapping[tuple[int, int], ColourPairs], unknowns: _Unknowns, settings: ExposureSettings
-) -> _Equations:
+def _equations(pairs: Mapping[tuple[int, int], ColourPairs], ids: Sequence[int]) -> _Equations:
     """The equations of all links, at least one of which has pairs."""
     links = sorted(pairs)
-    counts = np.array([min(len(pairs[each]), settings.points_per_link) for each in links])
+    counts = np.array([min(len(pairs[each]), POINTS_PER_LINK) for each in links])
     links, counts = [each for each, count in zip(links, counts) if count], counts[counts > 0]
     exists = np.arange(counts.max()) < counts[:, None]
     radius2_a, radius2_b = np.zeros((2, *exists.shape), np.float32)
     difference = np.zeros((*exists.shape, 3), np.float32)
     for row, (link, count) in enumerate(zip(links, counts.tolist(), strict=True)):
-        chosen = pairs[link].thinned(settings.points_per_link)
+        chosen = pairs[link].thinned(POINTS_PER_LINK)
         radius2_a[row, :count], radius2_b[row, :count] = chosen.radius2_a, chosen.radius2_b
         colours_a, colours_b = (
             each.astype(np.float32) for each in (chosen.colours_a, chosen.colours_b)
@@ -254,25 +210,16 @@ def _equations(
         difference[row, :count] = np.log(np.maximum(colours_a, 1.0)) - np.log(
             np.maximum(colours_b, 1.0)
         )
-    columns = np.array([_columns_of(each, unknowns) for each in links])
+    lens = [len(ids), len(ids) + 1]
+    columns = np.column_stack(
+        [np.searchsorted(ids, links), np.tile([*lens, *lens], (len(links), 1))]
+    )
     return _Equations(columns, radius2_a, radius2_b, difference, exists)
 
 
-def _columns_of(link: tuple[int, int], unknowns: _Unknowns) -> list[int]:
-    """The columns of a link's six unknowns: two gains, two vignettes of two."""
-    a, b = link
-    lens_a, lens_b = unknowns.lens_of[a], unknowns.lens_of[b]
-    return [unknowns.column[a], unknowns.column[b], lens_a, lens_a + 1, lens_b, lens_b + 1]
-
-
-def _robust_solution(
-    equations: _Equations, unknowns: _Unknowns, settings: ExposureSettings
-) -> tuple[Floats, float]:
+def _robust_solution(equations: _Equations, frames: int) -> tuple[Floats, float]:
     """(U, 3) unknowns per channel, logarithms of gains first, and the robust spread of what is left."""
-    frames = len(unknowns.column)
-    prior = np.repeat(
-        [settings.gain_sigma**-2, settings.vignette_sigma**-2], [frames, 2 * len(unknowns.lens)]
-    )
+    prior = np.repeat([_GAIN_SIGMA**-2, _VIGNETTE_SIGMA**-2], [frames, 2])
     solution, typical = np.zeros((len(prior), 3)), 0.0
     for _ in range(_ITERATIONS):
         length = np.concatenate(
@@ -285,7 +232,7 @@ def _robust_solution(
             ]
         ) / np.sqrt(3)
         typical = float(np.median(length[equations.exists]))
-        spread = max(settings.colour_sigma, _SIGMA_FROM_MEDIAN * typical)
+        spread = max(_COLOUR_SIGMA, _SIGMA_FROM_MEDIAN * typical)
         weight = equations.exists / (1 + (length / spread) ** 2) / spread**2
         solution = _solve(equations, weight, prior, frames)
     return solution, typical * _SIGMA_FROM_MEDIAN

@@ -13,6 +13,7 @@ from sorvolo.geometry.homography import apply_homography, fit_similarity
 from sorvolo.geometry.pose import Pose
 from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 from sorvolo.mosaic.bundle import LINKS_AT_ONCE, Linked, Nodes, Pairs, linearise, rotation_vector
+from sorvolo.mosaic.graph_settings import INDEPENDENT_PAIRS, PAIRS_PER_LINK
 from sorvolo.mosaic.ground_ties import similarity_of_most
 from sorvolo.mosaic.shelf import Shelf, ShelvedRows
 from sorvolo.survey.flight import CameraPrior
@@ -144,10 +145,7 @@ class NodeRows:
 class LinkRows:
     """The links and their matched points; the points of older ones lie on the `shelf`, if there is one."""
 
-    def __init__(
-        self, pairs_per_link: int, independent_pairs: float, shelf: Shelf | None = None
-    ) -> None:
-        self._most, self._independent = pairs_per_link, independent_pairs
+    def __init__(self, shelf: Shelf | None = None) -> None:
         self._rows = _Columns(
             old=(int, ()),
             new=(int, ()),
@@ -157,7 +155,7 @@ class LinkRows:
             sigma_px=(float, ()),
             relief_m=(float, ()),
         )
-        self._points = ShelvedRows("points", (2, pairs_per_link, 2), float, shelf)
+        self._points = ShelvedRows("points", (2, PAIRS_PER_LINK, 2), float, shelf)
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -187,9 +185,9 @@ class LinkRows:
     ) -> None:
         """A link more, between two nodes and their registration cameras; its relief is that of the others."""
         pick = np.arange(len(each.new_px))
-        if len(pick) > self._most:
-            pick = np.linspace(0, len(pick) - 1, self._most).round().astype(int)
-        points = np.zeros((2, self._most, 2))
+        if len(pick) > PAIRS_PER_LINK:
+            pick = np.linspace(0, len(pick) - 1, PAIRS_PER_LINK).round().astype(int)
+        points = np.zeros((2, PAIRS_PER_LINK, 2))
         points[0, : len(pick)] = _ideal(old[1], each.old_px[pick])
         points[1, : len(pick)] = _ideal(new[1], each.new_px[pick])
         self._rows.append(
@@ -213,8 +211,8 @@ class LinkRows:
             self._rows.column(name)[chosen]
             for name in ("old", "new", "pairs", "points", "focal_px", "sigma_px", "relief_m")
         )
-        exists = np.arange(self._most) < pairs[:, None]
-        weight = exists * np.minimum(1.0, self._independent / np.maximum(pairs, 1))[:, None]
+        exists = np.arange(PAIRS_PER_LINK) < pairs[:, None]
+        weight = exists * np.minimum(1.0, INDEPENDENT_PAIRS / np.maximum(pairs, 1))[:, None]
         found = self._points.read(points)
         return Pairs(old, new, found[:, 0], found[:, 1], weight, focal_px, sigma_px, relief_m)
 

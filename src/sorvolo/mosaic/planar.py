@@ -15,9 +15,9 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import apply_homography, site_from_image_homography
 from sorvolo.geometry.pose import Pose
 from sorvolo.mosaic.exposure import (
+    POINTS_PER_LINK,
     ColourPairs,
     Exposure,
-    ExposureSettings,
     solve_exposure,
     tie_colours,
 )
@@ -185,13 +185,8 @@ _DEAR_WORTH = 0.1  # share of them that link, below which they are not
 _DEAR_BOUND = 2  # so many of them a frame are enough then
 
 
-@dataclass(frozen=True)
-class PlanarSettings:
-    """How a keyframe is tied to others."""
-
-    recent_links: int = 400  # of which colours are compared while the flight goes on
-    links: LinkSettings = field(default_factory=LinkSettings)
-    exposure: ExposureSettings = field(default_factory=ExposureSettings)
+_RECENT_LINKS = 400  # of which colours are compared while the flight goes on
+_LINKS = LinkSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,23 +269,21 @@ class PlanarMapper:
     def __init__(
         self,
         graph: PoseGraphSettings,
-        settings: PlanarSettings = PlanarSettings(),
         known: Sequence[KnownKeyframe] = (),
         shelf: Shelf | None = None,
         keyframe_bytes: int = 1 << 28,
     ) -> None:
-        self._settings = settings
         self._graph = PoseGraph(graph, shelf)
         self._ground_miss_m = 0.0  # per axis: see `note_ground_miss`
         self._clock_miss_m = 0.0  # per axis: see `note_clock_miss`
-        self._cache = LinkCache(settings.links.features)
+        self._cache = LinkCache(_LINKS.features)
         self._keyframes = Keyframes(shelf, keyframe_bytes)
         self._own: list[int] = []
         self._known = {each.id: each for each in known}
         self._known_centres_m = np.array(
             [each.site_from_camera.translation_m for each in known]
         ).reshape(-1, 3)
-        self._colours = LinkedColours(settings.exposure.points_per_link, shelf)
+        self._colours = LinkedColours(POINTS_PER_LINK, shelf)
         self._failures: dict[int, str] = {}
         self._dear = 0, 0  # fits of the flight that were asked the dear way, and those that linked
         self._met: list[int] = []  # of the known map, in the order in which they were loaded
@@ -481,13 +474,13 @@ class PlanarMapper:
 
     def exposure(self) -> Exposure:
         """Gains and vignette from the colours that linked keyframes share."""
-        return solve_exposure(self._colours, settings=self._settings.exposure)
+        return solve_exposure(self._colours)
 
     def recent_exposure(self) -> Exposure:
         """The same from the newest links alone: good enough for a map that still moves, at a price that does not grow
         with the flight."""
-        newest = self._colours.newest(self._settings.recent_links)
-        return solve_exposure(newest, settings=self._settings.exposure)
+        newest = self._colours.newest(_RECENT_LINKS)
+        return solve_exposure(newest)
 
     # ---- inside -----------------------------------------------------------------------------------------------
 
@@ -501,9 +494,7 @@ class PlanarMapper:
             gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
             camera = camera.resized(*size)
         gray = normalise_contrast(gray)
-        return Keyframe(
-            keyframe_id, camera, gray, orb_features(gray, self._settings.links.features), prior
-        )
+        return Keyframe(keyframe_id, camera, gray, orb_features(gray, _LINKS.features), prior)
 
     def _tie(self, new: Keyframe) -> tuple[_Tie, str]:
         """The links of a new keyframe, where it stands by them or by telemetry, and what failed.
@@ -544,9 +535,7 @@ class PlanarMapper:
         self, tie: _Tie, other: int, prediction: LinkPrediction | None, effort: Effort
     ) -> None:
         """Try to link one picture; the first link places the new keyframe."""
-        found = link(
-            tie.new, self._picture(other), prediction, self._settings.links, self._cache, effort
-        )
+        found = link(tie.new, self._picture(other), prediction, _LINKS, self._cache, effort)
         if effort is not Effort.CHEAP:
             tie.dear = tie.dear[0] + 1, tie.dear[1] + isinstance(found, Link)
         if isinstance(found, NoLink):

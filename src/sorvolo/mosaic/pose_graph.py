@@ -36,13 +36,11 @@ from sorvolo.mosaic.graph_rows import (
     telemetry_trust,
 )
 from sorvolo.mosaic.graph_settings import (
-    INDEPENDENT_PAIRS,
     OFFSET_ALTITUDE_M,
     OFFSET_HEADING_RAD,
     OFFSET_LEAST_SIGMAS,
     OFFSET_TILT_RAD,
     OFFSET_WIDEST_SIGMA,
-    PAIRS_PER_LINK,
     STRAINED,
     UNEVEN,
     WINDOW,
@@ -143,7 +141,7 @@ class PoseGraph:
         self._names: list[int] = []
         self._nodes: list[_Node] = []
         self._rows = NodeRows()
-        self._links = LinkRows(PAIRS_PER_LINK, INDEPENDENT_PAIRS, shelf)
+        self._links = LinkRows(shelf)
         self._shared = np.zeros(len(SHARED))
         self._dropped = 0
         self._solved_at = self._region_solved_at = 0

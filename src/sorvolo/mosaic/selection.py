@@ -237,7 +237,7 @@ def small_gray(image: ImageRGB) -> ImageGray:
     return gray_from_rgb(cv2.resize(image, size, interpolation=cv2.INTER_AREA))  # type: ignore[arg-type]
 
 
-def has_texture(image: ImageRGB, settings: SelectionSettings) -> bool:
+def has_texture(image: ImageRGB) -> bool:
     """Whether a picture shows anything but one gray, or noise alone, as a covered lens gives."""
     gray = small_gray(image)
     scale = _COARSE_PX / max(gray.shape)

@@ -119,9 +119,7 @@ def beyond_edges(
     """
     outward_m, spread_m2 = np.zeros((len(names), 2)), np.zeros((len(names), 2, 2))
     for row, axis in np.argwhere(cut[:, :2] | cut[:, 2:]):
-        beyond_m = _unseen_m(
-            names[row], float(sides_m[row, axis]), _AS_MUCH_AGAIN, has_metres=has_metres
-        )
+        beyond_m = _unseen_m(names[row], float(sides_m[row, axis]), has_metres=has_metres)
         out = axes[row, axis]
         outward_m[row] += (
             _BEYOND * (float(cut[row, 2 + axis]) - float(cut[row, axis])) * beyond_m * out
@@ -130,11 +128,11 @@ def beyond_edges(
     return outward_m, spread_m2
 
 
-def _unseen_m(name: str, side_m: float, as_much_again: float, *, has_metres: bool) -> float:
+def _unseen_m(name: str, side_m: float, *, has_metres: bool) -> float:
     """How much of something may lie beyond the picture's edge: what it lacks to its usual length, or as much again."""
     if not has_metres or name not in TYPICAL_SIZE_M:
         return side_m
-    return max(TYPICAL_SIZE_M[name][0] - side_m, as_much_again * side_m)
+    return max(TYPICAL_SIZE_M[name][0] - side_m, _AS_MUCH_AGAIN * side_m)
 
 
 _CAR, _PERSON = "car", "person"

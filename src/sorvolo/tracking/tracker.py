@@ -125,7 +125,7 @@ class Tracker:
             raise GeometryError(
                 f"{len(sightings)} sightings but {len(appearance)} appearance vectors"
             )
-        seen = _Seen(sightings, appearance, self._settings)
+        seen = _Seen(sightings, appearance)
         time_ns, elapsed_s = self._move_on(seen, time_ns)
         near = self._near(seen, time_ns, footprint_m)
         motions = _stacked(near, time_ns)
@@ -498,9 +498,7 @@ class Tracker:
 class _Seen:
     """One frame's sightings as columns."""
 
-    def __init__(
-        self, sightings: Sequence[Sighting], looks: Floats | None, settings: TrackerSettings
-    ) -> None:
+    def __init__(self, sightings: Sequence[Sighting], looks: Floats | None) -> None:
         self.sightings, self.looks = (
             sightings,
             None if looks is None else np.asarray(looks, np.float64),

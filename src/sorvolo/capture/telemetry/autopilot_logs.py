@@ -78,7 +78,7 @@ def _telemetry(
     )
 
 
-def _needed(name: str, kind: str, error: ImportError) -> InputError:
+def _needed(name: str, kind: str) -> InputError:
     return InputError(f"{name} is {kind}, which needs an extra: pip install 'sorvolo[logs]'")
 
 
@@ -108,7 +108,7 @@ class UlogReader:
         try:
             from pyulog.core import ULog
         except ImportError as error:
-            raise _needed(name, "a PX4 log (.ulg)", error) from error
+            raise _needed(name, "a PX4 log (.ulg)") from error
         topics = ["vehicle_gps_position", "vehicle_attitude", "vehicle_local_position"]
         try:
             with _quiet():
@@ -182,7 +182,7 @@ class DataflashReader:
         try:
             from pymavlink.DFReader import DFReader_binary
         except ImportError as error:
-            raise _needed(name, "an ArduPilot log (.bin)", error) from error
+            raise _needed(name, "an ArduPilot log (.bin)") from error
         fixes, attitude, height = _Rows(), _Rows(), _Rows()
         with tempfile.NamedTemporaryFile(suffix=".bin") as file, _quiet():
             file.write(data)  # the library reads files alone
@@ -237,7 +237,7 @@ class TlogReader:
         try:
             from pymavlink.dialects.v20 import ardupilotmega
         except ImportError as error:
-            raise _needed(name, "a MAVLink log (.tlog)", error) from error
+            raise _needed(name, "a MAVLink log (.tlog)") from error
         fixes, attitude = _Rows(), _Rows()
         ahead_s: list[float] = []
         vehicle = None

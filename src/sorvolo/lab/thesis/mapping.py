@@ -129,7 +129,7 @@ class StitchedFlight:
     def exposure(self) -> Exposure:
         """The gain of each frame; no vignette."""
         gains = self._stitcher.gains()
-        return Exposure({self._first_id + k: np.full(3, g) for k, g in gains.items()}, {}, 0.0)
+        return Exposure({self._first_id + k: np.full(3, g) for k, g in gains.items()})
 
     recent_exposure = exposure
 

@@ -6,7 +6,7 @@ from itertools import islice
 from sorvolo.capture.source import LiveSource, Source
 from sorvolo.capture.video import VideoSource
 from sorvolo.errors import InputError
-from sorvolo.mosaic.selection import SelectionSettings, evenly, every, has_texture
+from sorvolo.mosaic.selection import evenly, every, has_texture
 from sorvolo.survey.flight import Frame
 
 _SAMPLES = 5  # frames of a flight; by choice
@@ -47,10 +47,9 @@ def refuse_without_texture(source: Source) -> None:
     """Raise InputError for a recorded flight whose sample frames all show one gray, or noise alone."""
     if isinstance(source, LiveSource):
         return
-    settings = SelectionSettings()
     seen = 0
     for frame in _spread_frames(source):
-        if has_texture(frame.image, settings):
+        if has_texture(frame.image):
             return
         seen += 1
     if not seen:

@@ -12,7 +12,7 @@ from sorvolo.errors import InputError, NoHeightsError, SettingsError
 from sorvolo.geometry.coordinates import lonlat_from_text
 from sorvolo.heights.field import HeightField, along
 from sorvolo.heights.lattice import Lattice
-from sorvolo.heights.volumes import Tie, Volume, VolumeSettings, above_rim, between, contours, tie
+from sorvolo.heights.volumes import Tie, Volume, above_rim, between, contours, tie
 from sorvolo.missions.heights.run import height_grid, newest_flight, run_of
 from sorvolo.paths import AnyPath
 from sorvolo.store.atomic import atomic_write_bytes
@@ -54,7 +54,6 @@ def measure_volume(
     *,
     flight: str = "",
     since: str = "",
-    settings: VolumeSettings = VolumeSettings(),
 ) -> MeasuredVolume:
     """What was dug and heaped in an area from the flight `since` to `flight`; without `since`, above the area's rim.
 
@@ -66,16 +65,14 @@ def measure_volume(
         later = read_field(archive, later_id, HeightFile.SURFACE)
         polygons = wanted.polygons_m(archive.site().frame)
         if not since:
-            return MeasuredVolume(later_id, "", above_rim(later, polygons, settings), None)
+            return MeasuredVolume(later_id, "", above_rim(later, polygons), None)
         if since == later_id:
             raise SettingsError(
                 f"--since {since} is the flight that is measured; name an earlier one"
             )
         earlier = read_field(archive, since, HeightFile.SURFACE)
-        tied = tie(earlier, later, ~earlier.inside(polygons), settings)
-        return MeasuredVolume(
-            later_id, since, between(earlier, later, polygons, tied, settings), tied
-        )
+        tied = tie(earlier, later, ~earlier.inside(polygons))
+        return MeasuredVolume(later_id, since, between(earlier, later, polygons, tied), tied)
 
 
 def measure_profile(

@@ -195,7 +195,7 @@ class FlightPainter:
         """When readers could see the newest key frame of a live flight, by the monotonic clock."""
         self.images: dict[int, str] = {}
         """Where each frame's picture is stored, by frame index: what `FlightWriter.commit` wants."""
-        self.exposure = Exposure({}, {}, 0.0)
+        self.exposure = Exposure({})
         self._stored: Camera = lens.camera
         shrink = native_m_per_px / archive.site_grid().grid.m_per_px
         if shrink < _COARSE_MAP:
@@ -351,7 +351,7 @@ class FlightPainter:
                 self._mapper.site_from_image(keyframe_id, camera),
                 site_grid,
                 self.exposure.gains_of(keyframe_id),
-                self.exposure.vignette_of(0),
+                self.exposure.vignette,
                 valid,
             )
             for keyframe_id in sorted(keyframe_ids)

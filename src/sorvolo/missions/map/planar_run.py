@@ -487,7 +487,7 @@ class PlanarRun(FlightRun):
 
     @property
     def _exposure(self) -> Exposure:
-        return Exposure({}, {}, 0.0) if self._painter is None else self._painter.exposure
+        return Exposure({}) if self._painter is None else self._painter.exposure
 
     def _keep(self, keyframe_id: int, image: Callable[[], ImageRGB]) -> None:
         """Store a keyframe's picture, or hold it until it is known how large it is on the map."""
@@ -646,7 +646,7 @@ class PlanarRun(FlightRun):
             unknown,
             unknown,
             self._exposure.gains_of(keyframe_id),
-            vignette=self._exposure.vignette_of(0),
+            vignette=self._exposure.vignette,
         )
 
     def _rejected(self, ending: Ending, reason: str, camera: Camera) -> PlacedFrame:

@@ -261,10 +261,10 @@ def track_placemarks(tracks: Iterable[Track], site: Site) -> list[Placemark]:
     return placemarks
 
 
-def crop_around(image: ImageRGB, box_px: Iterable[float], *, margin: float = 0.6) -> ImageRGB:
-    """The part of the picture around a box (BoxesPx), wider by `margin` of its longer side, at least 24 px a side."""
+def crop_around(image: ImageRGB, box_px: Iterable[float]) -> ImageRGB:
+    """The part of the picture around a box (BoxesPx), wider by 0.6 of its longer side, at least 24 px a side."""
     left, top, right, bottom = (float(edge) for edge in box_px)
-    reach_px = max((0.5 + margin) * max(right - left, bottom - top), 12.0)
+    reach_px = max(1.1 * max(right - left, bottom - top), 12.0)
     x, y = (left + right) / 2, (top + bottom) / 2
     height, width = image.shape[:2]
     columns = slice(int(max(0, np.floor(x - reach_px))), int(min(width, np.ceil(x + reach_px))))
@@ -375,7 +375,6 @@ def picture_of_detections(
     height_px: int,
     group: str,
     detections: Detections,
-    m_per_px: float = float("nan"),
 ) -> LabelledPicture:
     """What a detector saw in a picture, as labels to correct and to learn from; scores are not kept."""
     no_regions = np.zeros((0, 4), np.float32)
@@ -387,7 +386,6 @@ def picture_of_detections(
         detections.boxes_px,
         np.asarray(detections.labels, np.int64),
         no_regions,
-        m_per_px,
     )
 
 

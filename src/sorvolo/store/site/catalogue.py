@@ -142,7 +142,7 @@ class Catalogue:
     Both raise StoreError for rows that are damaged.
     """
 
-    def __init__(self, database: Database, site: Path, *, write: bool) -> None:
+    def __init__(self, database: Database, site: Path) -> None:
         """Raises StoreError when it is damaged, no catalogue, of a format that is not known, or out of reach; for a
         writer, also when another process writes.
         """
@@ -162,14 +162,14 @@ class Catalogue:
     @classmethod
     def open(cls, folder: Path, *, write: bool, catalogues: Catalogues | None = None) -> Self:
         """The catalogue of a site folder, wherever it lies. Raises as the constructor."""
-        return cls(open_database(folder, write=write, catalogues=catalogues), folder, write=write)
+        return cls(open_database(folder, write=write, catalogues=catalogues), folder)
 
     @classmethod
     def at(cls, path: Path, *, write: bool, place: str = "") -> Self:
         """A catalogue in a file of SQLite's, which messages call `place`. Raises as the constructor."""
         database = SqliteDatabase(path, write=write)
         database.place = place or database.place
-        return cls(database, path.parent, write=write)
+        return cls(database, path.parent)
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:

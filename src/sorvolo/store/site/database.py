@@ -6,9 +6,8 @@ import os
 import sqlite3
 import threading
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -59,52 +58,13 @@ class ConnectionLostError(UnavailableError):
     """The connection to the database was lost: what was not committed is rolled back, the rest is kept."""
 
 
-class Database(ABC):
-    """A file of SQLite's or a schema of PostgreSQL's. Threads may share it.
-
-    Faults of the database become a StoreError in every method; its text never holds a password.
-    """
-
-    place: str  # what messages call it
-
-    def __init__(self, layout: DatabaseLayout, *, write: bool) -> None:
-        self._layout, self._write, self._number = layout, write, next(_opened)
-
-    @abstractmethod
-    def create(self) -> None:
-        """Make the empty tables, whole or not at all."""
-
-    @abstractmethod
-    def check(self) -> None:
-        """Raise StoreError where this is no catalogue, or a damaged one; a writer takes the right to write."""
-
-    @abstractmethod
-    def reading(self) -> AbstractContextManager[Connection]:
-        """A transaction that sees one state of the catalogue."""
-
-    @abstractmethod
-    def changing(self) -> AbstractContextManager[Connection]:
-        """A transaction, durable when it ends."""
-
-    @abstractmethod
-    def change_mark(self) -> tuple[int, int]:
-        """A mark that changes with each transaction of others; what is read after it is at least as new."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """Close every connection and release the lock."""
-
-    def fold_log(self) -> None:  # noqa: B027 - only SQLite keeps one
-        """Give back the space that a write-ahead log takes beside the site."""
-
-
-class SqliteDatabase(Database):
-    """A file; a reader's connections cannot write."""
+class SqliteDatabase:
+    """A file; a reader's connections cannot write. See `Database`."""
 
     def __init__(
         self, path: Path, *, write: bool, layout: DatabaseLayout = CATALOGUE_LAYOUT
     ) -> None:
-        super().__init__(layout, write=write)
+        self._layout, self._write, self._number = layout, write, next(_opened)
         self.place, self._path = str(path), path
         self._made: Engine | None = None
         self._watching: PoolProxiedConnection | None = None
@@ -117,6 +77,7 @@ class SqliteDatabase(Database):
         return self._made
 
     def create(self) -> None:
+        """Make the empty tables, whole or not at all."""
         with self._naming_faults(), atomic_path(self._path) as temporary:
             connection = sqlite3.connect(temporary)
             connection.execute(f"PRAGMA page_size = {self._layout.page_bytes:d}")
@@ -129,6 +90,7 @@ class SqliteDatabase(Database):
             engine.dispose()
 
     def check(self) -> None:
+        """Raise StoreError where this is no catalogue, or a damaged one; a writer takes the right to write."""
         with self.reading() as connection:
             mark = connection.exec_driver_sql("PRAGMA application_id").scalar_one()
             if mark != self._layout.application_id:
@@ -142,12 +104,14 @@ class SqliteDatabase(Database):
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
+        """A transaction that sees one state of the catalogue."""
         with self._naming_faults(), self._engine.begin() as connection:
             yield connection
 
-    changing = reading
+    changing = reading  # durable when it ends
 
     def fold_log(self) -> None:
+        """Give back the space that the write-ahead log takes beside the site."""
         connection = self._engine.raw_connection()
         try:
             connection.cursor().execute("PRAGMA wal_checkpoint(TRUNCATE)")
@@ -159,6 +123,7 @@ class SqliteDatabase(Database):
             connection.close()
 
     def change_mark(self) -> tuple[int, int]:
+        """A mark that changes with each transaction of others; what is read after it is at least as new."""
         # The file's time is no such mark: a transaction writes the log, waits for the disk, and only then is visible.
         with self._naming_faults(), self._watching_lock:
             if self._watching is None:
@@ -172,6 +137,7 @@ class SqliteDatabase(Database):
                 cursor.close()
 
     def close(self) -> None:
+        """Close every connection and release the lock."""
         with self._watching_lock:
             if self._watching is not None:
                 self._watching.close()
@@ -288,7 +254,7 @@ _LOST_WORDS = (
 )
 
 
-class PostgresDatabase(Database):
+class PostgresDatabase:
     """A schema of a database. Its one writer holds an advisory lock on the connection that it writes with.
 
     A lock is lost with its connection; the writer takes it again, and refuses to go on when another process wrote
@@ -299,7 +265,7 @@ class PostgresDatabase(Database):
         self, url: URL, name: str, *, write: bool, layout: DatabaseLayout = CATALOGUE_LAYOUT
     ) -> None:
         """`url` may have a password; `name` is the schema's, checked: letters, digits and underscores."""
-        super().__init__(layout, write=write)
+        self._layout, self._write, self._number = layout, write, next(_opened)
         self._url, self._name = url, name
         self.place = f"{shown_url(url)} (schema {name})"
         self._readers = _open_engine_postgres(url, name, layout.beside, write=False)
@@ -351,6 +317,9 @@ class PostgresDatabase(Database):
         with self._mutex:
             self._drop_writer()
         self._readers.dispose()
+
+    def fold_log(self) -> None:
+        """A server looks after its own log."""
 
     def _check_server(self, connection: Connection) -> None:
         version = int(connection.execute(text("SHOW server_version_num")).scalar_one()) // 10_000
@@ -449,6 +418,13 @@ class PostgresDatabase(Database):
         if advice is None:
             return ConnectionLostError(text)
         return DiskFullError(text) if advice == _FULL else StoreError(text)
+
+
+Database = SqliteDatabase | PostgresDatabase
+"""A file of SQLite's or a schema of PostgreSQL's. Threads may share it; `place` is what messages call it.
+
+Faults of the database become a StoreError in every method; its text never holds a password.
+"""
 
 
 def shown_url(url: URL) -> str:
