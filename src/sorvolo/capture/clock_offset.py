@@ -274,7 +274,27 @@ def _offset_sigma_s(times_s: Floats, fixes_m: PointsM, places_m: PointsM) -> flo
     for memory_s in np.geomspace(float(np.median(np.diff(at_s))), at_s[-1] - at_s[0], _MEMORIES):
         for share in _SHARES:
             alike = (1 - share) * np.eye(len(at_s)) + share * np.exp(-apart_s / memory_s)
-            likelihood, noise = _restricted_likelihood(alike, model, misses)
+            # The logarithm of the restricted likelihood of misses, (2N,), whose two axes both
+            # have the correlations `alike`, (N, N), less a constant; and the variance of one.
+            # `model` (2N, P) are the unknowns that were fitted.
+            root = np.linalg.cholesky(alike)
+            count = len(alike)
+            white_model, white = (
+                np.concatenate(
+                    [np.linalg.solve(root, each[:count]), np.linalg.solve(root, each[count:])]
+                )
+                for each in (model, misses)
+            )
+            normal = white_model.T @ white_model
+            right = white_model.T @ white
+            left_over = max(float(white @ white - right @ np.linalg.solve(normal, right)), 1e-12)
+            freedom = len(misses) - model.shape[1]
+            of_noise = 4 * float(np.log(np.diag(root)).sum())  # of both axes
+            of_model = float(np.linalg.slogdet(normal)[1])
+            likelihood, noise = (
+                -0.5 * (freedom * float(np.log(left_over)) + of_noise + of_model),
+                left_over / freedom,
+            )
             likelihoods.append(likelihood)
             pull = motion.reshape(2, -1)
             variances.append(
@@ -313,21 +333,3 @@ def shared_motion_m_s(times_s: Sequence[float], places_m: PointsM) -> float:
     similar = _similar(known_m)
     taken_up, *_ = np.linalg.lstsq(similar, velocity_m_s, rcond=None)
     return float(np.sqrt(np.mean((similar @ taken_up) ** 2)))
-
-
-def _restricted_likelihood(alike: Floats, model: Floats, misses: Floats) -> tuple[float, float]:
-    """The logarithm of the restricted likelihood of misses, (2N,), whose two axes both have the correlations `alike`,
-    (N, N), less a constant; and the variance of one. `model` (2N, P) are the unknowns that were fitted."""
-    root = np.linalg.cholesky(alike)
-    count = len(alike)
-    white_model, white = (
-        np.concatenate([np.linalg.solve(root, each[:count]), np.linalg.solve(root, each[count:])])
-        for each in (model, misses)
-    )
-    normal = white_model.T @ white_model
-    right = white_model.T @ white
-    left_over = max(float(white @ white - right @ np.linalg.solve(normal, right)), 1e-12)
-    freedom = len(misses) - model.shape[1]
-    of_noise = 4 * float(np.log(np.diag(root)).sum())  # of both axes
-    of_model = float(np.linalg.slogdet(normal)[1])
-    return -0.5 * (freedom * float(np.log(left_over)) + of_noise + of_model), left_over / freedom

@@ -110,7 +110,21 @@ def telemetry_faults(
     near = beside_deg <= _COMPASS_OUTLYING_DEG
     turned = np.zeros(len(priors), bool)
     turned[knows_heading] = ~near
-    apart_m = _apart_m(priors, moved)
+    # (N,) how far each frame's place lies beside where fixes usually put it, m; 0 where near, or
+    # nothing is known. `moved_m` (N, 3) are the fixes less the places. Far is beyond
+    # `_FAR_SIGMAS`, along an axis, of what fixes and heights state or scatter by, whichever is
+    # more, from what they usually are off.
+    stated_m = np.array([each.position_sigma_m for each in priors]).reshape(-1, 3)
+    beside_m = np.zeros_like(moved)
+    far = np.zeros(len(priors), bool)
+    for axis in range(3):
+        known = np.isfinite(stated_m[:, axis])
+        usual = _bias(moved[known, axis])
+        beside_m[known, axis] = np.abs(moved[known, axis] - usual.value)
+        far[known] |= beside_m[known, axis] > _FAR_SIGMAS * np.maximum(
+            stated_m[known, axis], usual.scatter
+        )
+    apart_m = np.where(far, np.linalg.norm(beside_m, axis=1), 0.0)
     is_misplaced = (apart_m > 0) & turned
     misplaced, apart = np.flatnonzero(is_misplaced), np.flatnonzero((apart_m > 0) & ~turned)
     outlying = turned & ~is_misplaced
@@ -327,25 +341,6 @@ def _usual_angle(angles_deg: Floats, outlying_deg: float) -> float:
 def _wrapped(angles_deg: Floats) -> Floats:
     """The same angles from -180 to 180 degrees."""
     return (angles_deg + 180.0) % 360.0 - 180.0
-
-
-def _apart_m(priors: Sequence[CameraPrior], moved_m: PointsM) -> Floats:
-    """(N,) how far each frame's place lies beside where fixes usually put it, m; 0 where near, or nothing is known.
-
-    `moved_m` (N, 3) are the fixes less the places. Far is beyond `_FAR_SIGMAS`, along an axis, of what fixes and
-    heights state or scatter by, whichever is more, from what they usually are off.
-    """
-    stated_m = np.array([each.position_sigma_m for each in priors]).reshape(-1, 3)
-    beside_m = np.zeros_like(moved_m)
-    far = np.zeros(len(priors), bool)
-    for axis in range(3):
-        known = np.isfinite(stated_m[:, axis])
-        usual = _bias(moved_m[known, axis])
-        beside_m[known, axis] = np.abs(moved_m[known, axis] - usual.value)
-        far[known] |= beside_m[known, axis] > _FAR_SIGMAS * np.maximum(
-            stated_m[known, axis], usual.scatter
-        )
-    return np.where(far, np.linalg.norm(beside_m, axis=1), 0.0)
 
 
 def _agree(near: Mask) -> bool:

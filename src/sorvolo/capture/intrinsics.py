@@ -31,29 +31,24 @@ def read_nodes(path: Path) -> Mapping[str, Node]:
     raw = read_small_file(path, "camera file")
     text = text_of(path, raw, "camera file", "XML or YAML with named values")
     if text.startswith("<"):
-        nodes = _from_xml(path, text)
+        try:
+            root = ElementTree.fromstring(text)
+        except (ElementTree.ParseError, DefusedXmlException, ValueError) as error:
+            raise InputError(f"{path}: broken XML: {error}") from error
+        nodes: dict[str, Node] = {}
+        for element in _named_elements(root):
+            children = {child.tag: (child.text or "") for child in element}
+            if "data" in children:
+                value: Node = _camera_nodes_matrix(path, element.tag, children)
+            else:
+                value = _scalar_or_array(element.text or "")
+            nodes.setdefault(_key(element.tag), value)
     else:
         nodes = _from_yaml(path, text)
     if not nodes:
         raise InputError(
             f"{path}: not a camera file: neither XML nor YAML with named values was found"
         )
-    return nodes
-
-
-def _from_xml(path: Path, text: str) -> dict[str, Node]:
-    try:
-        root = ElementTree.fromstring(text)
-    except (ElementTree.ParseError, DefusedXmlException, ValueError) as error:
-        raise InputError(f"{path}: broken XML: {error}") from error
-    nodes: dict[str, Node] = {}
-    for element in _named_elements(root):
-        children = {child.tag: (child.text or "") for child in element}
-        if "data" in children:
-            value: Node = _camera_nodes_matrix(path, element.tag, children)
-        else:
-            value = _scalar_or_array(element.text or "")
-        nodes.setdefault(_key(element.tag), value)
     return nodes
 
 

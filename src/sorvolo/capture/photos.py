@@ -196,7 +196,22 @@ def read_album(
         )
     found, camera_notices = _of_one_camera(found)
     found, place_notices = _placed(found, positions, strict=strict)
-    timed, start_origin, time_notices = _put_in_time(found)
+    # Sort photos, given by name, by strictly increasing times; and name where the times come
+    # from.
+    times_ns, start_origin, time_notices = _best_times(found)
+    known = [time_ns for time_ns in times_ns if time_ns]
+    if known:
+        # a photo without a time stands behind its neighbour by name
+        previous = known[0]
+        for index, time_ns in enumerate(times_ns):
+            previous = times_ns[index] = time_ns or previous
+    else:
+        times_ns = [index * _UNTIMED_STEP_NS for index in range(len(found))]
+    ordered = sorted(zip(times_ns, range(len(found))))
+    timed: list[Photo] = []
+    for time_ns, index in ordered:
+        earliest = timed[-1].time_ns + _STEP_NS if timed else time_ns
+        timed.append(replace(found[index], time_ns=max(time_ns, earliest)))
     distinct = _mark_duplicates(timed)
     # Width and height that most usable photos have as shown; of equally many the larger.
     sizes = Counter(photo.metadata.used_size_px for photo in distinct if not photo.problem)
@@ -362,25 +377,6 @@ def _natural(name: str) -> list[tuple[int, int, str]]:
     ]
 
 
-def _put_in_time(photos: Sequence[Photo]) -> tuple[list[Photo], str, list[Notice]]:
-    """Sort photos, given by name, by strictly increasing times; and name where the times come from."""
-    times_ns, origin, notices = _best_times(photos)
-    known = [time_ns for time_ns in times_ns if time_ns]
-    if known:
-        # a photo without a time stands behind its neighbour by name
-        previous = known[0]
-        for index, time_ns in enumerate(times_ns):
-            previous = times_ns[index] = time_ns or previous
-    else:
-        times_ns = [index * _UNTIMED_STEP_NS for index in range(len(photos))]
-    ordered = sorted(zip(times_ns, range(len(photos))))
-    timed: list[Photo] = []
-    for time_ns, index in ordered:
-        earliest = timed[-1].time_ns + _STEP_NS if timed else time_ns
-        timed.append(replace(photos[index], time_ns=max(time_ns, earliest)))
-    return timed, origin, notices
-
-
 def _best_times(photos: Sequence[Photo]) -> tuple[list[int], str, list[Notice]]:
     """Each photo's UTC, 0 where unknown; where the times come from; and notices."""
     utc_ns = [photo.metadata.utc_ns for photo in photos]
@@ -541,6 +537,8 @@ def _telemetry_of(photos: Sequence[Photo]) -> tuple[Telemetry, list[Notice]]:
 
 def _picture_notices(photos: Sequence[Photo], width_px: int, height_px: int) -> list[Notice]:
     used = [photo.metadata for photo in photos if not photo.problem]
+    cameras = {(metadata.make, metadata.model) for metadata in used}
+    focal_mm = {metadata.focal_length_mm for metadata in used if metadata.focal_length_mm > 0}
     return [
         *notice(
             "duplicate_photo",
@@ -558,7 +556,18 @@ def _picture_notices(photos: Sequence[Photo], width_px: int, height_px: int) -> 
             sum(bool(metadata.unreadable) for metadata in used),
             "photos with damaged EXIF or XMP, which is not used: {}",
         ),
-        *_camera_notices(used),
+        *[
+            *notice(
+                "mixed_cameras",
+                len(cameras) if len(cameras) > 1 else 0,
+                "different cameras, mapped as if they were one: {}",
+            ),
+            *notice(
+                "zoom",
+                len(focal_mm) if len(focal_mm) > 1 else 0,
+                "different focal lengths, mapped as if they were one: {}",
+            ),
+        ],
     ]
 
 
@@ -585,22 +594,5 @@ def _size_notices(
             "reduced_photo",
             sum(metadata.reduction > 1 for metadata in used),
             f"photos of more than {LARGEST_FRAME_PX // 1_000_000} megapixels, used at half their size: {{}}",
-        ),
-    ]
-
-
-def _camera_notices(used: Sequence[PhotoMetadata]) -> list[Notice]:
-    cameras = {(metadata.make, metadata.model) for metadata in used}
-    focal_mm = {metadata.focal_length_mm for metadata in used if metadata.focal_length_mm > 0}
-    return [
-        *notice(
-            "mixed_cameras",
-            len(cameras) if len(cameras) > 1 else 0,
-            "different cameras, mapped as if they were one: {}",
-        ),
-        *notice(
-            "zoom",
-            len(focal_mm) if len(focal_mm) > 1 else 0,
-            "different focal lengths, mapped as if they were one: {}",
         ),
     ]

@@ -129,7 +129,20 @@ def merge_tiles(tiles: Sequence[SeenTile], size_px: tuple[int, int]) -> Seen:
     whatever its class: a car's corner that alone looked like something else.
     """
     views = _views(tiles, size_px)
-    objects = _gathered(views, tiles)
+    # Indices of the boxes that are one object, most alike first; no two from one tile.
+    pairs = [
+        pair
+        for first, second in combinations(range(len(tiles)), 2)
+        for pair in _alike(views, tiles, first, second)
+    ]
+    groups = [[each] for each in range(len(views.scores))]
+    for _, one, other in sorted(pairs, key=lambda pair: -pair[0]):
+        a, b = groups[one], groups[other]
+        if a is not b and not {*views.tiles[a].tolist()} & {*views.tiles[b].tolist()}:
+            a += b
+            for each in b:
+                groups[each] = a
+    objects = [np.array(group) for index, group in enumerate(groups) if group[0] == index]
     boxes = np.zeros((len(objects), 4), np.float32)
     scores, labels, is_piece = (
         np.zeros(len(objects)),
@@ -179,23 +192,6 @@ def _views(tiles: Sequence[SeenTile], size_px: tuple[int, int]) -> _Views:
         (room <= reach).any(axis=1),
         room.min(axis=1, initial=np.inf),
     )
-
-
-def _gathered(views: _Views, tiles: Sequence[SeenTile]) -> list[Rows]:
-    """Indices of the boxes that are one object, most alike first; no two from one tile."""
-    pairs = [
-        pair
-        for first, second in combinations(range(len(tiles)), 2)
-        for pair in _alike(views, tiles, first, second)
-    ]
-    groups = [[each] for each in range(len(views.scores))]
-    for _, one, other in sorted(pairs, key=lambda pair: -pair[0]):
-        a, b = groups[one], groups[other]
-        if a is not b and not {*views.tiles[a].tolist()} & {*views.tiles[b].tolist()}:
-            a += b
-            for each in b:
-                groups[each] = a
-    return [np.array(group) for index, group in enumerate(groups) if group[0] == index]
 
 
 def _alike(

@@ -133,7 +133,23 @@ def adjust(scene: Scene, priors: Priors, settings: AdjustmentSettings) -> Scene:
     damping = 1e-4
     normal = _linearise(scene, priors, settings)
     for _ in range(_ITERATIONS):
-        moved = _advance(scene, *_step(normal, damping))
+        # The steps of the cameras and shared unknowns, (6 N + 5,), and of the points, (P, 3).
+        damped = normal.points * (1 + damping * np.eye(3)) + 1e-9 * np.eye(3)
+        inverse: Floats = np.asarray(np.linalg.inv(damped), np.float64)
+        reduced, through = _eliminated(normal, inverse)
+        system = normal.cameras - reduced.toarray()
+        system[np.diag_indices_from(system)] += damping * np.diag(normal.cameras) + 1e-9
+        gradient = normal.gradient - through @ normal.point_gradient.ravel()
+        try:
+            cameras = cho_solve(cho_factor(system), gradient)
+        except LinAlgError:
+            cameras = np.linalg.lstsq(system, gradient, rcond=None)[0]
+        points = np.einsum(
+            "pij,pj->pi",
+            inverse,
+            normal.point_gradient - (normal.coupling.T @ cameras).reshape(-1, 3),
+        )
+        moved = _advance(scene, *(cameras, points))
         trial = _linearise(moved, priors, settings)
         if not trial.cost <= normal.cost:
             damping *= 20
@@ -212,9 +228,22 @@ def _linearise(scene: Scene, priors: Priors, settings: AdjustmentSettings) -> _N
     shared_coupling = _summed(_products(by_shared, by_point), scene.point, points).reshape(
         -1, _SHARED, 3
     )
-    coupling = _coupling(
-        _products(by_camera, by_point).reshape(-1, 6, 3), shared_coupling, scene, size
+    # (6 N + 5, 3 P) how cameras, (M, 6, 3), and shared unknowns, (P, 5, 3), depend on points.
+    rows = [
+        (6 * scene.view[:, None] + _SIX)[:, :, None],
+        np.full((len(shared_coupling), 1, 1), size - _SHARED) + np.arange(_SHARED)[:, None],
+    ]
+    columns = [
+        3 * scene.point[:, None, None] + np.arange(3),
+        3 * np.arange(len(shared_coupling))[:, None, None] + np.arange(3),
+    ]
+    values = [_products(by_camera, by_point).reshape(-1, 6, 3), shared_coupling]
+    flat_rows = np.concatenate([np.broadcast_to(r, v.shape).ravel() for r, v in zip(rows, values)])
+    flat_columns = np.concatenate(
+        [np.broadcast_to(c, v.shape).ravel() for c, v in zip(columns, values)]
     )
+    flat = np.concatenate([v.ravel() for v in values])
+    coupling = csr_matrix((flat, (flat_rows, flat_columns)), shape=(size, 3 * len(shared_coupling)))
     return _Normal(cost, system, gradient, coupling, blocks, point_gradient)
 
 
@@ -272,43 +301,6 @@ def _add_priors(
     system[rows[:, :3], rows[:, :3]] += weight
     gradient[rows[:, :3]] -= weight * axis
     return float(9.0 * np.log1p(squared)[known].sum() + weight * (axis**2).sum())
-
-
-def _coupling(by_camera: Floats, by_shared: Floats, scene: Scene, size: int) -> csr_matrix:
-    """(6 N + 5, 3 P) how cameras, (M, 6, 3), and shared unknowns, (P, 5, 3), depend on points."""
-    rows = [
-        (6 * scene.view[:, None] + _SIX)[:, :, None],
-        np.full((len(by_shared), 1, 1), size - _SHARED) + np.arange(_SHARED)[:, None],
-    ]
-    columns = [
-        3 * scene.point[:, None, None] + np.arange(3),
-        3 * np.arange(len(by_shared))[:, None, None] + np.arange(3),
-    ]
-    values = [by_camera, by_shared]
-    flat_rows = np.concatenate([np.broadcast_to(r, v.shape).ravel() for r, v in zip(rows, values)])
-    flat_columns = np.concatenate(
-        [np.broadcast_to(c, v.shape).ravel() for c, v in zip(columns, values)]
-    )
-    flat = np.concatenate([v.ravel() for v in values])
-    return csr_matrix((flat, (flat_rows, flat_columns)), shape=(size, 3 * len(by_shared)))
-
-
-def _step(normal: _Normal, damping: float) -> tuple[Floats, Floats]:
-    """The steps of the cameras and shared unknowns, (6 N + 5,), and of the points, (P, 3)."""
-    damped = normal.points * (1 + damping * np.eye(3)) + 1e-9 * np.eye(3)
-    inverse: Floats = np.asarray(np.linalg.inv(damped), np.float64)
-    reduced, through = _eliminated(normal, inverse)
-    system = normal.cameras - reduced.toarray()
-    system[np.diag_indices_from(system)] += damping * np.diag(normal.cameras) + 1e-9
-    gradient = normal.gradient - through @ normal.point_gradient.ravel()
-    try:
-        cameras = cho_solve(cho_factor(system), gradient)
-    except LinAlgError:
-        cameras = np.linalg.lstsq(system, gradient, rcond=None)[0]
-    points = np.einsum(
-        "pij,pj->pi", inverse, normal.point_gradient - (normal.coupling.T @ cameras).reshape(-1, 3)
-    )
-    return cameras, points
 
 
 def _eliminated(normal: _Normal, inverse: Floats) -> tuple[csr_matrix, csr_matrix]:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, Floats32, ImageRGB, ImageRGBA, Mask, Matrix3
+from sorvolo.geometry.arrays import Floats32, ImageRGB, ImageRGBA, Mask, Matrix3
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.surface import Surface
@@ -86,7 +86,21 @@ def choose_photos(lattice: Lattice, up_m: Floats32, views: Sequence[View]) -> Wi
         window = lattice.window(x0, y0, x1, y1)
         heights: Floats32 = np.ascontiguousarray(up_m[here])
         seen = cv2.medianBlur(visible(window, heights, view).view(np.uint8), 5) > 0
-        merit = _merit(window, heights, view) * np.where(seen, 1.0, _HIDDEN_MERIT)
+        # (H, W) how well a view shows each cell, 0 (not at all) to 1: from above, and not at the
+        # picture's border.
+        u, v = laid_pixels(view, window.site_from_cells, heights)
+        across = (u - (view.camera.width_px - 1) / 2) / (view.camera.width_px / 2)
+        down = (v - (view.camera.height_px - 1) / 2) / (view.camera.height_px / 2)
+        eye = window.cells_from_site(view.site_from_camera.translation_m[None, :2])[0]
+        column, row = np.meshgrid(np.arange(window.width), np.arange(window.height))
+        far_m = window.cell_m * np.hypot(column - eye[0], row - eye[1])
+        depth_m = np.maximum(view.site_from_camera.translation_m[2] - heights, 0.1)
+        steep = depth_m / np.hypot(depth_m, far_m)
+        border = np.clip(1 - across**2, 0, 1) * np.clip(1 - down**2, 0, 1)
+        inside = (np.abs(across) < 1) & (np.abs(down) < 1)
+        merit = np.where(inside, 0.05 + 0.95 * steep**4 * np.sqrt(border), 0.0) * np.where(
+            seen, 1.0, _HIDDEN_MERIT
+        )
         wins = merit > best[here]
         labels[here][wins] = number
         best[here][wins] = merit[wins]
@@ -249,18 +263,3 @@ def _window_of(view: View, lattice: Lattice, up_m: Floats32) -> tuple[int, int, 
         np.ceil(cells.max(axis=0)).astype(int) + 2, 0, [lattice.width, lattice.height]
     ).tolist()
     return x0, y0, x1, y1
-
-
-def _merit(window: Lattice, up_m: Floats32, view: View) -> Floats:
-    """(H, W) how well a view shows each cell, 0 (not at all) to 1: from above, and not at the picture's border."""
-    u, v = laid_pixels(view, window.site_from_cells, up_m)
-    across = (u - (view.camera.width_px - 1) / 2) / (view.camera.width_px / 2)
-    down = (v - (view.camera.height_px - 1) / 2) / (view.camera.height_px / 2)
-    eye = window.cells_from_site(view.site_from_camera.translation_m[None, :2])[0]
-    column, row = np.meshgrid(np.arange(window.width), np.arange(window.height))
-    far_m = window.cell_m * np.hypot(column - eye[0], row - eye[1])
-    depth_m = np.maximum(view.site_from_camera.translation_m[2] - up_m, 0.1)
-    steep = depth_m / np.hypot(depth_m, far_m)
-    border = np.clip(1 - across**2, 0, 1) * np.clip(1 - down**2, 0, 1)
-    inside = (np.abs(across) < 1) & (np.abs(down) < 1)
-    return np.where(inside, 0.05 + 0.95 * steep**4 * np.sqrt(border), 0.0)

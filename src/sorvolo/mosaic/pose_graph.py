@@ -70,7 +70,27 @@ def shared_sigma(settings: PoseGraphSettings, as_reported: NDArray[np.bool_]) ->
             heading,
         ]
     )
-    return np.where(as_reported, np.minimum(sigma, _held_sigma()), sigma)
+    # (8,) prior sigma of an offset that is taken as telemetry reports it.
+    tilt_rad = OFFSET_TILT_RAD
+    return np.where(
+        as_reported,
+        np.minimum(
+            sigma,
+            np.array(
+                [
+                    np.inf,
+                    np.inf,
+                    OFFSET_ALTITUDE_M,
+                    np.inf,
+                    np.inf,
+                    tilt_rad,
+                    tilt_rad,
+                    OFFSET_HEADING_RAD,
+                ]
+            ),
+        ),
+        sigma,
+    )
 
 
 def unconfirmed(shared: Floats, sigma: Floats, factors: Factors) -> list[int]:
@@ -98,23 +118,6 @@ def shared_variances(factors: Factors) -> Floats:
     units = np.zeros((factors.size, len(SHARED)))
     units[-len(SHARED) :] = np.eye(len(SHARED))
     return np.diag(factors.solve(units)[-len(SHARED) :])
-
-
-def _held_sigma() -> Floats:
-    """(8,) prior sigma of an offset that is taken as telemetry reports it."""
-    tilt_rad = OFFSET_TILT_RAD
-    return np.array(
-        [
-            np.inf,
-            np.inf,
-            OFFSET_ALTITUDE_M,
-            np.inf,
-            np.inf,
-            tilt_rad,
-            tilt_rad,
-            OFFSET_HEADING_RAD,
-        ]
-    )
 
 
 @dataclass(eq=False)

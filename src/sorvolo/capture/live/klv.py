@@ -89,7 +89,27 @@ def local_sets(data: bytes, counts: Counter[str]) -> Iterator[LocalSet]:
             length, body = _ber_length(data, after)
             if length > _LONGEST_SET_BYTES or body + length > len(data):
                 raise InputError("a local set that is cut")
-            found = _local_set(data[start : body + length], body - start)
+            # The set in a packet whose value begins at `body`; None where the checksum does not
+            # fit.
+            packet = data[start : body + length]
+            time_ns, version, is_sound = 0, 0, False
+            values: dict[str, float] = {}
+            for tag, at, value in _items_in(packet, body - start):
+                if tag == CHECKSUM_TAG:
+                    is_sound = len(value) == 2 and int.from_bytes(value, "big") == checksum(
+                        packet[:at]
+                    )
+                elif tag == VERSION_TAG:
+                    version = int.from_bytes(value[:2], "big")
+                elif not 0 < len(value) <= 8:
+                    continue
+                elif tag == TIME_TAG:
+                    time_ns = int.from_bytes(value, "big") * 1000
+                elif tag in ITEMS:
+                    values[ITEMS[tag].name] = _number(ITEMS[tag], value)
+            found = (
+                LocalSet(time_ns if time_ns < 2**63 else 0, version, values) if is_sound else None
+            )
         except InputError:
             counts["damaged"] += 1
         else:
@@ -127,24 +147,6 @@ def checksum(data: bytes) -> int:
 
 
 # ---- inside ---------------------------------------------------------------------------------------------------
-
-
-def _local_set(packet: bytes, body: int) -> LocalSet | None:
-    """The set in a packet whose value begins at `body`; None where the checksum does not fit."""
-    time_ns, version, is_sound = 0, 0, False
-    values: dict[str, float] = {}
-    for tag, at, value in _items_in(packet, body):
-        if tag == CHECKSUM_TAG:
-            is_sound = len(value) == 2 and int.from_bytes(value, "big") == checksum(packet[:at])
-        elif tag == VERSION_TAG:
-            version = int.from_bytes(value[:2], "big")
-        elif not 0 < len(value) <= 8:
-            continue
-        elif tag == TIME_TAG:
-            time_ns = int.from_bytes(value, "big") * 1000
-        elif tag in ITEMS:
-            values[ITEMS[tag].name] = _number(ITEMS[tag], value)
-    return LocalSet(time_ns if time_ns < 2**63 else 0, version, values) if is_sound else None
 
 
 def _items_in(packet: bytes, at: int) -> Iterator[tuple[int, int, bytes]]:

@@ -65,7 +65,18 @@ def read_umcd(place: Path) -> ParsedSet:
     Lines `Box: FRAME LEFT TOP WIDTH HEIGHT` in an object's block (ours, in pixels) give its places. Raises InputError
     when nothing is of this form, times are given without `Fps:`, or no frame is there or of use.
     """
-    videos = _videos(place)
+    # The videos of all metadata files that describe objects. Raises InputError when none does.
+    files = (
+        [place]
+        if place.is_file()
+        else [path for path in files_below(place, ".txt") if looks_like_umcd(path)]
+    )
+    videos = {path: _parsed(path) for path in files}
+    videos = {path: video for path, video in videos.items() if video.objects}
+    if not videos:
+        raise InputError(
+            f"{place}: no text file describes objects as {FORM}'s do (Type:, Shape:, Dimension:, ...)"
+        )
     frames = frames_by_video(pictures_around(place, FORM), [path.stem for path in videos])
     if not any(frames.values()):
         raise no_frames(place, FORM, frames)
@@ -141,22 +152,6 @@ def looks_like_umcd(path: Path) -> bool:
     return len(keys) >= 2 and (
         "type" in keys or any(key == "object" and value for key, value in fields)
     )
-
-
-def _videos(place: Path) -> dict[Path, _Video]:
-    """The videos of all metadata files that describe objects. Raises InputError when none does."""
-    files = (
-        [place]
-        if place.is_file()
-        else [path for path in files_below(place, ".txt") if looks_like_umcd(path)]
-    )
-    videos = {path: _parsed(path) for path in files}
-    videos = {path: video for path, video in videos.items() if video.objects}
-    if not videos:
-        raise InputError(
-            f"{place}: no text file describes objects as {FORM}'s do (Type:, Shape:, Dimension:, ...)"
-        )
-    return videos
 
 
 def _labelled_frames(

@@ -21,6 +21,17 @@ def training_page(report: Mapping[str, Any]) -> str:
     """training.html of training.json's content. All text is escaped."""
     ap50 = at(report, "held_out", "ap50")
     best = report["best_step"]
+    checks = report["checks"]
+    lines: dict[str, list[tuple[float, float]]] = {
+        "all classes": [(row["step"], row["ap50"]) for row in checks]
+    }
+    for row in checks:
+        for name, value in row["classes"].items():
+            lines.setdefault(name, []).append((row["step"], value))
+    if (
+        list(lines.values()).count(lines["all classes"]) == len(lines) == 2
+    ):  # the mean over one class is that class
+        del lines["all classes"]
     page = render(
         "training.html",
         package=__package__,
@@ -32,7 +43,7 @@ def training_page(report: Mapping[str, Any]) -> str:
         summary=_summary(report),
         notices=report["notices"],
         losses=_losses(report),
-        checks=_checks(report),
+        checks=_plot("AP50 over steps", lines, high=1.0),
         kept=f"The weights of step {best} were kept." if best is not None else "",
         classes=_classes(report),
         sets=_sets(report),
@@ -53,21 +64,6 @@ def _losses(report: Mapping[str, Any]) -> dict[str, Any] | None:
     rows = report["losses"]
     lines = {words: [(row["step"], row[key]) for row in rows] for key, words in _LOSSES.items()}
     return _plot("Losses over steps", lines)
-
-
-def _checks(report: Mapping[str, Any]) -> dict[str, Any] | None:
-    checks = report["checks"]
-    lines: dict[str, list[tuple[float, float]]] = {
-        "all classes": [(row["step"], row["ap50"]) for row in checks]
-    }
-    for row in checks:
-        for name, value in row["classes"].items():
-            lines.setdefault(name, []).append((row["step"], value))
-    if (
-        list(lines.values()).count(lines["all classes"]) == len(lines) == 2
-    ):  # the mean over one class is that class
-        del lines["all classes"]
-    return _plot("AP50 over steps", lines, high=1.0)
 
 
 def _classes(report: Mapping[str, Any]) -> list[list[str]]:

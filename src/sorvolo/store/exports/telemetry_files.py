@@ -115,7 +115,25 @@ def cot_track(frames: Sequence[CorrectedFrame], name: str, *, is_ellipsoidal: bo
             error_m=each.sigma_m,
         )
         SubElement(detail, "contact", {"callsign": name})
-        SubElement(detail, "sensor", _sensor(each))
+        down = math.sin(math.radians(-each.pitch_deg))
+        azimuth_deg, roll_deg = each.yaw_deg, each.roll_deg
+        if each.pitch_deg < _NADIR_DEG:
+            azimuth_deg, roll_deg = _body_angles_deg(each)[0], 0.0
+        SubElement(
+            detail,
+            "sensor",
+            {
+                "azimuth": f"{azimuth_deg % 360:.1f}",
+                "elevation": f"{each.pitch_deg:.1f}",
+                "roll": f"{roll_deg:.1f}",
+                "fov": f"{each.horizontal_fov_deg:.1f}",
+                "vfov": f"{each.vertical_fov_deg:.1f}",
+                "range": f"{each.above_ground_m / down:.0f}" if down > 0.05 else "0",
+                "model": "camera",
+                "type": "r-e",
+                "version": "0.6",
+            },
+        )
         if number:
             before = frames[number - 1]
             latitude = math.radians(each.latitude_deg)
@@ -138,24 +156,6 @@ def cot_track(frames: Sequence[CorrectedFrame], name: str, *, is_ellipsoidal: bo
         SubElement(detail, "remarks").text = f"frame {each.name}, corrected by Sorvolo"
         lines.append(event_bytes(event))
     return b"\n".join(lines) + b"\n"
-
-
-def _sensor(each: CorrectedFrame) -> dict[str, str]:
-    down = math.sin(math.radians(-each.pitch_deg))
-    azimuth_deg, roll_deg = each.yaw_deg, each.roll_deg
-    if each.pitch_deg < _NADIR_DEG:
-        azimuth_deg, roll_deg = _body_angles_deg(each)[0], 0.0
-    return {
-        "azimuth": f"{azimuth_deg % 360:.1f}",
-        "elevation": f"{each.pitch_deg:.1f}",
-        "roll": f"{roll_deg:.1f}",
-        "fov": f"{each.horizontal_fov_deg:.1f}",
-        "vfov": f"{each.vertical_fov_deg:.1f}",
-        "range": f"{each.above_ground_m / down:.0f}" if down > 0.05 else "0",
-        "model": "camera",
-        "type": "r-e",
-        "version": "0.6",
-    }
 
 
 def _body_angles_deg(each: CorrectedFrame) -> tuple[float, float, float]:

@@ -280,7 +280,20 @@ def _summary(report: Mapping[str, Any], changes: Sequence[StoredChange]) -> list
 
 
 def _warnings(report: Mapping[str, Any]) -> list[str]:
-    warnings = [str(each) for each in at(report, "warnings") or []] + _view_warnings(report)
+    # Reasons for which more than a tenth of the views could not be compared.
+    views = at(report, "comparison", "views") or {}
+    total = sum(views.values())
+    counts = {
+        status: views.get(status.value, 0)
+        for status in (ViewStatus.NOT_ALIGNED, ViewStatus.ALL_CHANGED)
+    }
+    warnings = [str(each) for each in at(report, "warnings") or []] + (
+        [
+            f"{count} of {total} views: {status.value}; each {_VIEW_WORDS[status]}."
+            for status, count in counts.items()
+            if total and count > 0.1 * total
+        ]
+    )
     unknown = number_at(report, "comparison", "unknown_share")
     if unknown is not None and unknown > _UNKNOWN_SHARE:
         warnings.append(
@@ -294,21 +307,6 @@ def _warnings(report: Mapping[str, Any]) -> list[str]:
     if at(report, "comparison", "map_updated") is False:
         warnings.append("The map was not updated: both halves of the picture show the map before.")
     return warnings
-
-
-def _view_warnings(report: Mapping[str, Any]) -> list[str]:
-    """Reasons for which more than a tenth of the views could not be compared."""
-    views = at(report, "comparison", "views") or {}
-    total = sum(views.values())
-    counts = {
-        status: views.get(status.value, 0)
-        for status in (ViewStatus.NOT_ALIGNED, ViewStatus.ALL_CHANGED)
-    }
-    return [
-        f"{count} of {total} views: {status.value}; each {_VIEW_WORDS[status]}."
-        for status, count in counts.items()
-        if total and count > 0.1 * total
-    ]
 
 
 def _map(before: Picture, after: Picture) -> dict[str, Any]:
