@@ -185,7 +185,7 @@ def test_the_gradient_is_that_of_the_cost(attitude_sigma_rad, has_ground):
         changed = moved(nodes, at, step[:6]) if at < 4 else nodes
         return _normal_equations(problem, changed, shared + (step if at == 4 else 0.0)).cost
 
-    problem = _Problem.of(pairs, ground, sigma, free, 3.0)
+    problem = _Problem.of(pairs, ground, sigma, free)
     equations = _normal_equations(problem, nodes, shared)
     gradient = equations.gradient()
     expected = []
