@@ -18,7 +18,6 @@ from sorvolo.errors import SorvoloError as SorvoloError
 from sorvolo.errors import StoreError as StoreError
 from sorvolo.geometry.geodesy import LocalFrame as LocalFrame
 from sorvolo.geometry.planning import FlightPlan as FlightPlan
-from sorvolo.heights.volumes import VolumeSettings as VolumeSettings
 from sorvolo.lab.datasets import LabelOptions as LabelOptions
 from sorvolo.lab.datasets import read_dataset as read_dataset
 from sorvolo.lab.evaluation.changes import MeasuredChanges as MeasuredChanges

@@ -1,15 +1,11 @@
 """Heights that stand alone: a piece as large as one patch that one pair of photos shows is a chance match."""
 
 import numpy as np
-import pytest
 
-from sorvolo.heights import free_space
-from sorvolo.heights.free_space import islands
+from sorvolo.heights.free_space import IslandSettings, islands
 
 
-def test_lone_pieces_of_one_pair_of_photos_are_found_and_nothing_else(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_lone_pieces_of_one_pair_of_photos_are_found_and_nothing_else() -> None:
     up_m = np.zeros((120, 150), np.float32)
     up_m[:, 75:] = np.linspace(0, 6, 75)  # a slope is one piece
     up_m[:, :8] = np.nan
@@ -27,6 +23,6 @@ def test_lone_pieces_of_one_pair_of_photos_are_found_and_nothing_else(
     expected = np.zeros(up_m.shape, bool)
     expected[chance] = expected[shed] = True
     np.testing.assert_array_equal(found, expected)
-    monkeypatch.setattr(free_space, "_WINDOW_CELLS", 37)
-    monkeypatch.setattr(free_space, "_MARGIN_CELLS", 40)
-    np.testing.assert_array_equal(islands(up_m, shown_by, 0.1), found)
+    np.testing.assert_array_equal(
+        islands(up_m, shown_by, 0.1, IslandSettings(window_cells=37, margin_cells=40)), found
+    )

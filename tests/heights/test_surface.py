@@ -24,7 +24,7 @@ from sorvolo.heights.orthophoto import choose_photos, paint_orthophoto, visible
 from sorvolo.heights.smooth_sigma import SmoothSigma
 from sorvolo.heights.surface import Surface, SurfaceSettings, sweep_surface
 from sorvolo.heights.sweep import SweepSettings, choose_views
-from sorvolo.heights.terrain import TerrainSettings, filled, terrain
+from sorvolo.heights.terrain import filled, terrain
 from sorvolo.heights.views import inside
 from sorvolo.kernels import path_costs
 from sorvolo.registration.features import gray_from_rgb
@@ -102,7 +102,7 @@ def test_the_ground_beside_walls_is_not_as_high_as_the_roof(surface: Surface) ->
 
 
 def test_bare_ground_is_what_the_houses_stand_on(surface: Surface) -> None:
-    ground, shows = terrain(surface.lattice, surface.up_m, TerrainSettings(widest_m=10.0))
+    ground, shows = terrain(surface.lattice, surface.up_m)
     points = surface.lattice.points_m()
     off = ground - hills(points[..., 0], points[..., 1])
     assert np.sqrt((off**2).mean()) < 0.4

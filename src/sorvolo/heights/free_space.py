@@ -20,25 +20,32 @@ from sorvolo.heights.sweep import SweepSettings, choose_views, likeness_on
 from sorvolo.heights.terrain import filled
 from sorvolo.heights.views import View
 
-# matches by chance (peaks of Hirschmueller 2008)
-_STEP_CELLS = 4.0  # a height this much beside its neighbour's, in cells, is another piece of ground
-_MOST_CELLS = 340  # of an island: one and a half of the larger patch that is compared
-PAIR = 2
-"""Photos of one pair: nothing confirms what they show."""
-_WINDOW_CELLS = 1000  # worked on at a time ...
-_MARGIN_CELLS = 48  # ... with so many around
+
+@dataclass(frozen=True)
+class IslandSettings:
+    """What counts as a match by chance (peaks of Hirschmueller 2008)."""
+
+    step_cells: float = (
+        4.0  # a height this much beside its neighbour's, in cells, is another piece of ground
+    )
+    most_cells: int = 340  # of an island: one and a half of the larger patch that is compared
+    photos: int = 2  # one pair of photos: nothing confirms what it shows
+    window_cells: int = 1000  # worked on at a time ...
+    margin_cells: int = 48  # ... with so many around
 
 
-def islands(up_m: Floats32, shown_by: ImageGray, cell_m: float) -> Mask:
+def islands(
+    up_m: Floats32, shown_by: ImageGray, cell_m: float, settings: IslandSettings = IslandSettings()
+) -> Mask:
     """(H, W) the cells of a height model, NaN in holes, that stand alone where `shown_by` (H, W) photos are too few."""
     found = np.zeros(up_m.shape, bool)
-    margin = _MARGIN_CELLS
-    for x0, y0, x1, y1 in _windows(up_m.shape, _WINDOW_CELLS):
+    margin = settings.margin_cells
+    for x0, y0, x1, y1 in _windows(up_m.shape, settings.window_cells):
         left, top = max(0, x0 - margin), max(0, y0 - margin)
         here = slice(top, y1 + margin), slice(left, x1 + margin)
-        alone = _alone(up_m[here], _STEP_CELLS * cell_m, _MOST_CELLS)
+        alone = _alone(up_m[here], settings.step_cells * cell_m, settings.most_cells)
         found[y0:y1, x0:x1] = alone[y0 - top : y1 - top, x0 - left : x1 - left]
-    return found & (shown_by <= PAIR)
+    return found & (shown_by <= settings.photos)
 
 
 def _windows(shape: tuple[int, ...], side: int) -> Iterator[tuple[int, int, int, int]]:
@@ -108,15 +115,7 @@ def seen_through(
             up_m[here],
             rest,
         ):  # a plate beside a wall is apart from it once its own cells are gone
-            # (H, W) the cells of pieces that are seen through often, of the times that they are
-            # seen.
-            piece = pieces(model, _SEEN_STEP_CELLS * lattice.cell_m)
-            often, seen = (
-                np.bincount(piece.ravel(), each.ravel()) for each in (through[here], shown[here])
-            )
-            found[here] |= known[here] & np.asarray(
-                ((often > 0) & (often >= _SEEN_SHARE * seen))[piece]
-            )
+            found[here] |= known[here] & _mostly(model, through[here], shown[here], lattice.cell_m)
     return found
 
 
@@ -188,3 +187,10 @@ def _seen_at(lattice: Lattice, ground: Floats32, view: View, places: _Places) ->
     agrees, above_m = alike[at] > _SEEN_AGREES, up_m - shows_m[at]
     margin_m = _SEEN_MARGIN_CELLS * lattice.cell_m
     return agrees & (above_m > margin_m), agrees & (np.abs(above_m) <= margin_m)
+
+
+def _mostly(up_m: Floats32, through: ImageGray, shown: ImageGray, cell_m: float) -> Mask:
+    """(H, W) the cells of pieces that are seen through often, of the times that they are seen."""
+    piece = pieces(up_m, _SEEN_STEP_CELLS * cell_m)
+    often, seen = (np.bincount(piece.ravel(), each.ravel()) for each in (through, shown))
+    return np.asarray(((often > 0) & (often >= _SEEN_SHARE * seen))[piece])
