@@ -1,6 +1,7 @@
 """A real Chromium before a real station: what the tests of the page share. Skips by name where either is missing."""
 
 import json
+import re
 import shutil
 import threading
 import urllib.request
@@ -41,6 +42,12 @@ def chromium() -> Iterator[Any]:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS))
         yield browser
         browser.close()
+
+
+def context_of(browser: Any, *, keeps: bool = False, **options: Any) -> Any:
+    """A browser's own world; `keeps`: with the page's service worker, whose requests no route of a test sees."""
+    workers = "allow" if keeps else "block"
+    return browser.new_context(**({"service_workers": workers} | options))
 
 
 class Served:
@@ -102,7 +109,8 @@ class Watched:
         self.page.on("response", self._answered)
 
     def _heard(self, message: Any) -> None:
-        if message.type in ("error", "warning") and "GPU stall" not in message.text:
+        is_ours = not re.search("GPU stall|blocked by Playwright", message.text)
+        if message.type in ("error", "warning") and is_ours:
             self.faults.append(f"{message.type}: {message.text} {message.location.get('url', '')}")
 
     def _asked(self, request: Any) -> None:

@@ -128,6 +128,15 @@ def test_stac_leads_from_the_station_to_each_version(client: TestClient) -> None
         assert each["properties"]["datetime"] == "2023-11-14T22:13:20Z"
         assert "{z}" in each["assets"]["tiles"]["href"]
     assert "mosaic" in items[1]["assets"] and "mosaic" not in items[0]["assets"]
+    data = items[1]["assets"]["mosaic"]
+    assert data["roles"] == ["data"] and data["proj:code"].startswith("EPSG:")
+    head = client.head(data["href"])
+    assert head.status_code == 200 and not head.content
+    part = client.get(data["href"], headers={"range": "bytes=0-3"})
+    assert (part.status_code, part.content[:2]) == (206, b"II")  # GDAL reads what it needs
+    whole = [each["href"] for row in (collection, *items) for each in row["links"]]
+    whole += [each["href"] for row in items for each in row["assets"].values()]
+    assert all(each.startswith("http") for each in whole)
     assert (
         client.get("/api/stac/field/9").status_code
         == client.get("/api/stac/nowhere").status_code

@@ -74,12 +74,19 @@ def test_geopackage_mixes_polygons_and_odd_names(tmp_path: Path) -> None:
         },
         {
             "geometry": {"type": "MultiPolygon", "coordinates": [[ring]]},
-            "properties": {'a"b': 2.5, "a": "x", "yes": True},
+            "properties": {
+                'a"b': 2.5,
+                "a": "x",
+                "yes": True,
+                "seen": "2026-05-01T12:00:00.25+02:00",
+            },
         },
     ]
     write_geopackage(tmp_path / "x.gpkg", {"some": features, "none": []})
     with sqlite3.connect(tmp_path / "x.gpkg") as file:
         rows = file.execute('SELECT "a""b", list, yes FROM some').fetchall()
+        seen = file.execute("SELECT seen FROM some").fetchall()
+        types = {each[1]: each[2] for each in file.execute("PRAGMA table_info(some)")}
         kind = file.execute("SELECT geometry_type_name FROM gpkg_geometry_columns").fetchall()
         (blob,) = file.execute("SELECT geom FROM some").fetchone()
         contents = file.execute("SELECT srs_id, min_x, min_y, max_x, max_y FROM gpkg_contents")
@@ -88,6 +95,7 @@ def test_geopackage_mixes_polygons_and_odd_names(tmp_path: Path) -> None:
             "SELECT definition FROM gpkg_spatial_ref_sys WHERE srs_id = ?", place[:1]
         ).fetchone()
     assert rows == [(1.0, "[1]", None), (2.5, None, 1)]
+    assert (types["seen"], seen) == ("DATETIME", [(None,), ("2026-05-01T10:00:00.250Z",)])
     assert kind == [("MULTIPOLYGON",)]
     # the table, each geometry's header (OGC 12-128r19, 2.1.3) and the definition name one CRS
     assert place == (4326, 0.0, 0.0, 1.0, 1.0)

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 import pytest
 import uvicorn
-from browsers import Watched, chromium
+from browsers import Watched, chromium, context_of
 from PIL import Image
 from stream_flights import HeldFootage
 from test_runs import FLIGHT
@@ -219,8 +219,8 @@ def test_a_page_sees_a_flight_grow_though_its_station_is_killed(
     drone = sending(held, station, tmp_path / "spool", speed=4.0)
     flying = threading.Thread(target=drone.run, daemon=True)
     with chromium() as browser:
-        context = browser.new_context(
-            viewport={"width": 900, "height": 600}, reduced_motion="reduce"
+        context = context_of(
+            browser, viewport={"width": 900, "height": 600}, reduced_motion="reduce"
         )
         watched = Watched(context, station.url)
         page = watched.page

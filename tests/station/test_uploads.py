@@ -3,6 +3,7 @@
 import asyncio
 import base64
 import io
+import os
 import shutil
 import sys
 import threading
@@ -216,6 +217,10 @@ def test_what_is_announced_needs_its_room_too(client: TestClient, monkeypatch: A
     answers = [begin(client, f"{each}.mp4", 8 * GIGA) for each in "abc"]
     assert [each.status_code for each in answers] == [201, 201, 507]
     assert f"{24 * GIGA / 1e9:.1f} GB of uploads are to come" in answers[2].text
+    folder = client.app.state.station.settings.state_folder
+    for part in folder.rglob("*"):  # nothing came since yesterday: they were given up
+        os.utime(part, (time.time() - 86_400,) * 2)
+    assert begin(client, "d.mp4", 8 * GIGA).status_code == 201
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,13 @@
 """Watches that a station ran, made up: what they leave in their folders."""
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
 from sorvolo.station.app import Station
+from sorvolo.station.runs import Run
 from sorvolo.station.state import utc_now
 from sorvolo.store.images import jpeg_from_image
 
@@ -16,10 +18,12 @@ def watch_run(
     station: Station, run: str, site: str = "field", place: tuple[float, float] = (11.0, 46.0)
 ) -> Path:
     """A watch of a site that found a person, with a picture, and a car, without; the folder of its results."""
+    began, ended = "2026-05-01T10:00:00Z", "2026-05-01T10:01:00Z"
+    record = Run(run, "watch", site, "finished", "ada", began, ended)
     with station.state.changing() as connection:
         connection.execute(
-            "INSERT INTO runs (id, made_at, site, mission, state, record) VALUES (?, ?, ?, 'watch', 'finished', '{}')",
-            (run, utc_now(), site),
+            "INSERT INTO runs (id, made_at, site, mission, state, record) VALUES (?, ?, ?, 'watch', 'finished', ?)",
+            (run, utc_now(), site, json.dumps(asdict(record))),
         )
     results = station.settings.state_folder / "runs" / run / "results"
     (results / "objects").mkdir(parents=True)

@@ -180,7 +180,7 @@ def station_app(
         description="Maps from small drones while they fly, what changed, what was found.",
     )
     app.state.station = station
-    answer_problems(app)
+    answer_problems(app, settings.root)
     answer_raster_errors(app)
     for router in (
         _about_routes(station),
@@ -353,6 +353,10 @@ def _serve_page(app: FastAPI) -> None:
                 404, "this installation has no page; the API is described by /openapi.json"
             )
         return FileResponse(path, headers={"cache-control": "no-cache"})
+
+    @app.get("/sw.js", include_in_schema=False)
+    def service_worker() -> Response:
+        return FileResponse(PAGE_FOLDER / "sw.js", headers={"cache-control": "no-cache"})
 
     app.mount("/page", _PageFiles(directory=PAGE_FOLDER), name="page")
 

@@ -2,24 +2,26 @@
 
 import math
 import os
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO
+from typing import Annotated, Any
 from urllib.parse import quote
 
 import attr
 import rasterio
 from fastapi import APIRouter, Depends, FastAPI, Query, Request, Response
-from fastapi.responses import JSONResponse, StreamingResponse
+from fastapi.responses import FileResponse, JSONResponse
 from morecantile import tms as all_tile_matrix_sets
 from morecantile.defaults import TileMatrixSets
 from rasterio.errors import RasterioError
 from rio_tiler.errors import RioTilerError, TileOutsideBounds
 from rio_tiler.io import Reader
 from rio_tiler.models import ImageData
+from starlette.background import BackgroundTask
 from titiler.core.algorithm import Algorithms
 from titiler.core.algorithm.dem import HillShade, Slope
 from titiler.core.dependencies import BidxParams
@@ -217,7 +219,6 @@ _OF_FLIGHT: Mapping[str, str] = {
     "terrain.tif": "bare ground, GeoTIFF",
 }
 _GEOPACKAGE = "site.gpkg"
-_PIECE_BYTES = 1 << 20  # of a file that is sent
 _MOST_PROFILE_PLACES, _MOST_PROFILE_POINTS = 50, 2000
 
 
@@ -252,25 +253,25 @@ def export_routes(shelf: SiteShelf, collections: SiteCollections) -> APIRouter:
             rows.insert(min(2, len(rows)), _row(site, package, None))
         return rows
 
-    @router.get("/exports/{export_id}", response_class=StreamingResponse)
+    @router.head("/exports/{export_id}", include_in_schema=False)
+    @router.get("/exports/{export_id}", response_class=FileResponse)
     def one(site: str, export_id: str) -> Response:
-        """One of them, to be kept."""
+        """One of them, to be kept; ranges are answered, so that GDAL reads of a GeoTIFF what it needs."""
         archive = shelf.open(site)
         if export_id == _GEOPACKAGE:
             return _geopackage(site, archive, collections)
         found = next((each for each in export_files(archive) if each.id == export_id), None)
-        try:
-            if found is not None:
-                archive.require_sound(found.path)
-            file = open_below(archive.folder, found.path) if found is not None else None
-        except FileNotFoundError:
-            file = None
-        if found is None or file is None:
+        if found is None or _size(archive, found) is None:
             raise Problem(
                 404,
                 f"no file {export_id[:80]!r} of this site; its list of exports names those there are",
             )
-        return _download(file, f"{_plain_name(site)}-{found.id}")
+        archive.require_sound(found.path)
+        return FileResponse(
+            archive.folder / found.path,
+            media_type="application/octet-stream",
+            headers=_as_file(f"{_plain_name(site)}-{found.id}"),
+        )
 
     @router.get("/profile")
     def profile(
@@ -320,33 +321,30 @@ def _plain_name(site: str) -> str:
     return "".join(each if each.isalnum() or each in "-_." else "-" for each in site)
 
 
-def _download(file: BinaryIO, name: str) -> StreamingResponse:
-    headers = {
+def _as_file(name: str) -> dict[str, str]:
+    return {
         "content-disposition": f"attachment; filename*=UTF-8''{quote(name)}",
-        "content-length": str(os.fstat(file.fileno()).st_size),
         "cache-control": "no-cache",
     }
-    return StreamingResponse(_pieces(file), media_type="application/octet-stream", headers=headers)
 
 
-def _pieces(file: BinaryIO) -> Iterator[bytes]:
-    with file:
-        while piece := file.read(_PIECE_BYTES):
-            yield piece
-
-
-def _geopackage(site: str, archive: Archive, collections: SiteCollections) -> StreamingResponse:
+def _geopackage(site: str, archive: Archive, collections: SiteCollections) -> FileResponse:
     if not archive.has_site:
         raise Problem(404, "this site has no map yet, so nothing for a GeoPackage")
     layers = {name: collections.get(site, name).features for name in TITLES}
-    with tempfile.TemporaryDirectory(prefix="sorvolo-") as folder:
-        path = Path(folder) / _GEOPACKAGE
-        write_geopackage(
-            path, layers, {name: qml_of(style) for name, style in LAYER_STYLES.items()}
-        )
-        return _download(
-            path.open("rb"), f"{_plain_name(site)}.gpkg"
-        )  # open: it outlives its folder
+    folder = Path(tempfile.mkdtemp(prefix="sorvolo-"))
+    try:
+        styles = {name: qml_of(style) for name, style in LAYER_STYLES.items()}
+        write_geopackage(folder / _GEOPACKAGE, layers, styles)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    return FileResponse(
+        folder / _GEOPACKAGE,
+        media_type="application/octet-stream",
+        headers=_as_file(f"{_plain_name(site)}.gpkg"),
+        background=BackgroundTask(shutil.rmtree, folder, ignore_errors=True),
+    )
 
 
 def _profile(folder: Path, line: str, step_m: float) -> dict[str, Any]:

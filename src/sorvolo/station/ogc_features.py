@@ -298,6 +298,7 @@ def _between(values: Mapping[str, Any], after: int | None, until: int | None) ->
 
 
 _VERSION = "1.1.0"
+_PROJECTION = "https://stac-extensions.github.io/projection/v2.0.0/schema.json"
 
 
 def stac_routes(shelf: SiteShelf) -> APIRouter:
@@ -305,9 +306,9 @@ def stac_routes(shelf: SiteShelf) -> APIRouter:
     router = APIRouter(prefix="/api/stac", tags=["STAC"], dependencies=[needs(Role.VIEW)])
 
     @router.get("")
-    def catalogue() -> dict[str, Any]:
+    def catalogue(request: Request) -> dict[str, Any]:
         """The sites of this station."""
-        links = [_link_stac("self", "/api/stac"), _link_stac("root", "/api/stac")]
+        links = [_link_stac(request, "self", "/api/stac"), _link_stac(request, "root", "/api/stac")]
         return {
             "type": "Catalog",
             "stac_version": _VERSION,
@@ -316,12 +317,15 @@ def stac_routes(shelf: SiteShelf) -> APIRouter:
             "description": "Maps from small drones, each site with the versions of its map.",
             "links": [
                 *links,
-                *(_link_stac("child", f"/api/stac/{each}") for each in sorted(shelf.folders())),
+                *(
+                    _link_stac(request, "child", f"/api/stac/{each}")
+                    for each in sorted(shelf.folders())
+                ),
             ],
         }
 
     @router.get("/{site}")
-    def collection(site: str) -> dict[str, Any]:
+    def collection(request: Request, site: str) -> dict[str, Any]:
         """A site with its extent in space and time, and a link to each version."""
         archive = shelf.open(site)
         versions = archive.versions()
@@ -341,18 +345,20 @@ def stac_routes(shelf: SiteShelf) -> APIRouter:
                 },
             },
             "links": [
-                _link_stac("self", f"/api/stac/{site}"),
-                _link_stac("root", "/api/stac"),
-                _link_stac("parent", "/api/stac"),
+                _link_stac(request, "self", f"/api/stac/{site}"),
+                _link_stac(request, "root", "/api/stac"),
+                _link_stac(request, "parent", "/api/stac"),
                 *(
-                    _link_stac("item", f"/api/stac/{site}/{each.id}", "application/geo+json")
+                    _link_stac(
+                        request, "item", f"/api/stac/{site}/{each.id}", "application/geo+json"
+                    )
                     for each in versions
                 ),
             ],
         }
 
     @router.get("/{site}/{version}", response_class=GeoJsonResponse)
-    def item(site: str, version: int) -> JSONResponse:
+    def item(request: Request, site: str, version: int) -> JSONResponse:
         """A version of the map: its ground, its time, its tiles, and the rasters of the newest one."""
         archive = shelf.open(site)
         versions = archive.versions()
@@ -362,12 +368,12 @@ def stac_routes(shelf: SiteShelf) -> APIRouter:
                 404, f"the map has no version {version}; /api/stac/{site} links to those there are"
             )
         bbox = _bbox(archive, version)
-        assets = _assets(site, archive, found, is_newest=found.id == versions[-1].id)
+        assets = _assets(request, site, archive, found, is_newest=found.id == versions[-1].id)
         return GeoJsonResponse(
             {
                 "type": "Feature",
                 "stac_version": _VERSION,
-                "stac_extensions": [],
+                "stac_extensions": [_PROJECTION],
                 "id": f"{site}-{version}",
                 "collection": site,
                 "geometry": _ring(bbox),
@@ -382,10 +388,12 @@ def stac_routes(shelf: SiteShelf) -> APIRouter:
                 },
                 "assets": assets,
                 "links": [
-                    _link_stac("self", f"/api/stac/{site}/{version}", "application/geo+json"),
-                    _link_stac("root", "/api/stac"),
-                    _link_stac("parent", f"/api/stac/{site}"),
-                    _link_stac("collection", f"/api/stac/{site}"),
+                    _link_stac(
+                        request, "self", f"/api/stac/{site}/{version}", "application/geo+json"
+                    ),
+                    _link_stac(request, "root", "/api/stac"),
+                    _link_stac(request, "parent", f"/api/stac/{site}"),
+                    _link_stac(request, "collection", f"/api/stac/{site}"),
                 ],
             }
         )
@@ -394,21 +402,34 @@ def stac_routes(shelf: SiteShelf) -> APIRouter:
 
 
 def _assets(
-    site: str, archive: Archive, version: VersionEntry, *, is_newest: bool
+    request: Request, site: str, archive: Archive, version: VersionEntry, *, is_newest: bool
 ) -> dict[str, Any]:
     tiles = f"/api/sites/{site}/tiles/{version.id}/{{z}}/{{x}}/{{y}}.webp"
     assets: dict[str, Any] = {
-        "tiles": {"href": tiles, "type": "image/webp", "title": "XYZ tiles", "roles": ["visual"]}
+        "tiles": {
+            "href": _absolute(request, tiles),
+            "type": "image/webp",
+            "title": "XYZ tiles",
+            "roles": ["visual"],
+        }
     }
     for cog in cogs_of(archive).values():
         belongs = is_newest if cog.id == "mosaic" else cog.id.partition(":")[2] == version.flight_id
         if belongs:
-            href = tilejson_address(site, cog)
-            assets[cog.id] = {
-                "href": href,
+            assets[f"{cog.id}-tiles"] = {
+                "href": _absolute(request, tilejson_address(site, cog)),
                 "type": "application/json",
-                "title": cog.title,
+                "title": f"{cog.title}, TileJSON",
                 "roles": ["tiles"],
+            }
+            name = cog.file.rpartition("/")[2]
+            file = name if cog.id == "mosaic" else f"{version.flight_id}-{name}"
+            assets[cog.id] = {
+                "href": _absolute(request, f"/api/sites/{site}/exports/{file}"),
+                "type": "image/tiff; application=geotiff; profile=cloud-optimized",
+                "title": cog.title,
+                "roles": ["data"],
+                "proj:code": archive.site().crs,
             }
     return assets
 
@@ -441,5 +462,12 @@ def _time(version: VersionEntry) -> str:
     return version.flown_utc or version.created_utc
 
 
-def _link_stac(rel: str, href: str, kind: str = "application/json") -> dict[str, str]:
-    return {"rel": rel, "href": href, "type": kind}
+def _link_stac(
+    request: Request, rel: str, href: str, kind: str = "application/json"
+) -> dict[str, str]:
+    return {"rel": rel, "href": _absolute(request, href), "type": kind}
+
+
+def _absolute(request: Request, path: str) -> str:
+    """A whole address: a catalogue is walked, and its assets are opened, by programs that know no other."""
+    return f"{str(request.base_url).rstrip('/')}{quote(path, safe='/:{}')}"

@@ -1,6 +1,7 @@
 """Errors as HTTP answers: RFC 9457 problem documents that state what was found, what was needed, what to do."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -17,7 +18,7 @@ from sorvolo.errors import (
 )
 
 _TITLES = {
-    400: "Bad request",
+    400: "This does not work as it was asked",
     401: "Token needed",
     403: "Not allowed",
     404: "Not found",
@@ -96,8 +97,13 @@ def status_of(error: SorvoloError) -> int:
     return 409 if isinstance(error, StoreError) else 400
 
 
-def answer_problems(app: FastAPI) -> None:
-    """Let every error of the app's routes be answered by a problem document."""
+def below(root: Path, words: str) -> str:
+    """A message without the folder in which the station's sites lie: it is nobody's business who asks."""
+    return words.replace(f"{root.resolve()}/", "").replace(f"{root}/", "")
+
+
+def answer_problems(app: FastAPI, root: Path) -> None:
+    """Let every error of the app's routes be answered by a problem document; files are named below the root."""
 
     @app.exception_handler(Problem)
     async def _of_problem(_: Request, error: Problem) -> JSONResponse:
@@ -105,7 +111,7 @@ def answer_problems(app: FastAPI) -> None:
 
     @app.exception_handler(SorvoloError)
     async def _of_ours(_: Request, error: SorvoloError) -> JSONResponse:
-        return problem_answer(status_of(error), str(error))
+        return problem_answer(status_of(error), below(root, str(error)))
 
     @app.exception_handler(RequestValidationError)
     async def _of_request(_: Request, error: RequestValidationError) -> JSONResponse:

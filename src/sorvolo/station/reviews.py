@@ -293,6 +293,11 @@ class _Point(BaseModel):
     coordinates: Place
 
 
+class _Line(BaseModel):
+    type: Literal["LineString"]
+    coordinates: Annotated[list[Place], Field(min_length=2, max_length=_MOST_CORNERS)]
+
+
 class _Polygon(BaseModel):
     type: Literal["Polygon"]
     coordinates: Annotated[
@@ -304,9 +309,10 @@ class _Polygon(BaseModel):
 class _Properties(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
-    purpose: Literal["interest", "alert", "waypoint"]
+    purpose: Literal["interest", "alert", "waypoint", "measure"]
     name: str = Field("", max_length=80)
     planned: bool = False
+    by: str = Field("", max_length=200)  # who drew it first, as the station knows it
 
 
 class Drawing(BaseModel):
@@ -314,7 +320,7 @@ class Drawing(BaseModel):
 
     type: Literal["Feature"]
     id: str = Field(min_length=1, max_length=80)
-    geometry: Annotated[_Point | _Polygon, Field(discriminator="type")]
+    geometry: Annotated[_Point | _Line | _Polygon, Field(discriminator="type")]
     properties: _Properties
 
 
@@ -341,17 +347,23 @@ class Drawings:
             "features": kept.get("features", []),
         }
 
-    def put(self, site_id: str, wish: DrawingsWish) -> dict[str, Any]:
-        """Keep a site's drawings. Raises Problem (404; 409 where somebody drew meanwhile), StoreError."""
+    def put(self, site_id: str, wish: DrawingsWish, who: str) -> dict[str, Any]:
+        """Keep a site's drawings; new ones as drawn by `who`. Raises Problem (404; 409 where somebody drew meanwhile), StoreError."""
         with self._lock:
             made_utc = self._shelf.open(site_id).created_utc
-            now = self._kept(site_id, made_utc).get("revision", 0)
+            there = self._kept(site_id, made_utc)
+            now = there.get("revision", 0)
             if wish.revision != now:
                 raise Problem(
                     409,
                     "somebody drew meanwhile; load the drawings again and add yours",
                     revision=now,
                 )
+            authors = {
+                each["id"]: each["properties"].get("by", "") for each in there.get("features", [])
+            }
+            for each in wish.features:
+                each.properties.by = authors.get(each.id, who)
             kept = {"revision": now + 1, "features": [each.model_dump() for each in wish.features]}
             path = self._path(site_id)
             make_folder(path.parent)
@@ -382,12 +394,12 @@ def drawing_routes(drawings: Drawings) -> APIRouter:
 
     @router.get("", dependencies=[needs(Role.VIEW)])
     def get(site: str) -> dict[str, Any]:
-        """Areas of interest, alert zones and waypoints of a site."""
+        """Areas of interest, alert zones, waypoints and measures of a site."""
         return drawings.get(site)
 
-    @router.put("", dependencies=[needs(Role.REVIEW)])
-    def put(site: str, wish: DrawingsWish) -> dict[str, Any]:
+    @router.put("")
+    def put(site: str, wish: DrawingsWish, holder: Holder = needs(Role.REVIEW)) -> dict[str, Any]:
         """Put all drawings of a site; 409 where they changed since they were read."""
-        return drawings.put(site, wish)
+        return drawings.put(site, wish, holder.name)
 
     return router

@@ -40,7 +40,7 @@ from sorvolo.station.orders import (
     RunWish,
     writes,
 )
-from sorvolo.station.problems import Problem
+from sorvolo.station.problems import Problem, below
 from sorvolo.station.security import needs
 from sorvolo.station.settings import RESERVE_FILE, RUNS_FOLDER, STREAMS_FOLDER, StationSettings
 from sorvolo.station.sites import SiteShelf
@@ -408,7 +408,8 @@ class Runs(ThreadOwner):
             if line["type"] in (BOXES, MOTION):  # ten a second: shown with the video, not kept
                 self._show(line["type"], line["data"])
                 continue
-            run, event = _taken(run, line)
+            data = json.loads(below(self._settings.root, json.dumps(line["data"])))
+            run, event = _taken(run, {"type": line["type"], "data": data})
             events.append(event)
         return run, events
 

@@ -15,7 +15,7 @@ import numpy as np
 from sorvolo.errors import StoreError
 from sorvolo.geometry.arrays import PointsM
 from sorvolo.geometry.grid import SiteGrid, TileIndex
-from sorvolo.station.problems import Problem
+from sorvolo.station.problems import Problem, below
 from sorvolo.station.settings import STATE_FOLDER, STREAMS_FOLDER
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import FlightEntry, VersionEntry
@@ -228,7 +228,7 @@ def readable(shelf: SiteShelf) -> list[dict[str, Any]]:
         try:
             rows.append(site_summary(site_id, shelf.open(site_id)))
         except (StoreError, Problem) as error:
-            rows.append({"id": site_id, "name": site_id, "error": str(error)})
+            rows.append({"id": site_id, "name": site_id, "error": below(shelf.root, str(error))})
     return rows
 
 

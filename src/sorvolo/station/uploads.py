@@ -8,6 +8,7 @@ import secrets
 import shutil
 import subprocess
 import threading
+import time
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
@@ -56,6 +57,7 @@ _ARCHIVE_ENDINGS = (".zip",)
 _MOST_TEXT_BYTES = 256_000_000  # of telemetry: half of what a reader takes
 _PART, _INFO, _FILES = "part", "info.json", "files"
 _CHECK_WITHIN_S = 1800.0  # for the check of a whole upload, by the clock; by choice
+_GIVEN_UP_S = 3600.0  # nothing came for so long: the room that an upload announced is free again
 _LOOK_EVERY_BYTES = 64_000_000  # written between two looks at the free space
 _SILENT_S = (
     30.0  # a request that sends nothing for so long has lost its link: another one may go on
@@ -131,7 +133,7 @@ class Uploads:
                 f"{length} bytes: 1 to {MAX_UPLOAD_BYTES} are taken, of text {_MOST_TEXT_BYTES}",
             )
         here = self.all()
-        announced = sum(each.bytes - self.offset(each) for each in here)  # and not here yet
+        announced = sum(each.bytes - self.offset(each) for each in here if self._comes(each))
         self.demand_room(length + announced)
         most = self._settings.limits.most_uploads
         if len(here) >= most:
@@ -162,6 +164,14 @@ class Uploads:
             return (self._folder / upload.id / _PART).stat().st_size
         except OSError:
             return 0
+
+    def _comes(self, upload: Upload) -> bool:
+        """Whether more of an upload is to be expected: what was given up holds no room."""
+        try:
+            last_s = (self._folder / upload.id / _PART).stat().st_mtime
+        except OSError:
+            return False
+        return time.time() - last_s < _GIVEN_UP_S
 
     async def take(self, upload: Upload, offset: int, chunks: AsyncIterator[bytes]) -> int:
         """Append what comes to an upload; how many bytes are here then. What came before a cut is kept.

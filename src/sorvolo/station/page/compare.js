@@ -1,8 +1,8 @@
-// Before and after: two versions of the map side by side under a swipe, blinking, or along the line of flights.
+// The room Compare: two dates of the map under a swipe, blinking, as their difference, or along the line of flights.
 
 import { button, choice, el, field, fill, tick } from "./dom.js";
 import { MapView, tie } from "./map_view.js";
-import { KINDS } from "./map_style.js";
+import { badge, titleOf } from "./feature_card.js";
 import { counted, day } from "./words.js";
 
 const BLINK_MS = 700;
@@ -14,7 +14,7 @@ export function comparePanel(screen, body) {
 
 class Compare {
   constructor(screen, body) {
-    Object.assign(this, { screen, body, versions: screen.data.detail.versions ?? [], mode: "swipe", split: 50 });
+    Object.assign(this, { screen, body, versions: screen.data.detail.versions ?? [], mode: "swipe", split: 50, isBare: false, at: -1, hadGaps: screen.view?.isShown("coverage") });
     if (this.versions.length < 2) {
       this.tooFew();
       return;
@@ -23,35 +23,43 @@ class Compare {
     this.after = this.versions.at(-1).n;
     this.list = el("div", {});
     this.build();
-    if (screen.view) screen.view.ready.then(() => this.begin());
+    if (screen.view) {
+      screen.view.show("coverage", true, false);
+      screen.view.ready.then(() => this.begin());
+    }
     this.apply();
   }
 
   tooFew() {
     const only = this.versions.length;
-    this.versions = null;
-    fill(this.body, el("p", { class: "hint" }, only ? "The site has one version. Fly again and start a “compare” mission: then two dates can be compared here."
-      : "There is no map yet. Start a “map” mission under “Missions”."));
+    this.versions = this.put = null;
+    fill(this.body, el("p", { class: "hint" }, only ? "The site has one version. Fly again and start a “compare” mission in “Live”: then two dates can be compared here."
+      : "There is no map yet. Start a “map” mission in “Live”."));
   }
 
   build() {
     const pairs = this.versions.map((each) => [each.n, `${each.n}: ${day(each.flown_at ?? each.made_at)} (${each.flight})`]);
     const pick = (name) => choice(pairs, this[name], (n) => { this[name] = Number(n); this.apply(); }, { data: { which: name } });
-    const modes = [["swipe", "Swipe"], ["blink", "Blink"], ["before", "Before"], ["after", "After"]];
+    const modes = [["swipe", "Swipe"], ["blink", "Blink"], ["difference", "Difference"], ["before", "Before"], ["after", "After"]];
     fill(this.body,
       field("Before", this.pickBefore = pick("before")), field("After", this.pickAfter = pick("after")),
       el("div", { class: "segments", role: "group", "aria-label": "How to compare" }, this.buttons = modes.map(([mode, words]) =>
         el("button", { type: "button", data: { mode }, on: { click: () => this.use(mode) } }, words))),
       this.timeline(),
-      tick("Only changes between these versions", true, (on) => { this.narrow = on; this.apply(); }),
+      this.overlays = tick("Show what was found (O)", true, (on) => this.bare(!on)),
       this.list);
-    this.narrow = true;
   }
 
-  /** Flights in their order, a button each: one tap shows the site as that flight left it. */
+  /** Flights where they lie in time, a button each: one tap shows the site as that flight left it. */
   timeline() {
-    this.marks = this.versions.map((each) => el("button", { type: "button", class: "mark", title: `Version ${each.n}: ${each.flight}`, on: { click: () => this.jump(each.n) } },
-      el("span", { class: "dot", "aria-hidden": true }), el("span", {}, day(each.flown_at ?? each.made_at)), el("small", {}, each.flight)));
+    const times = this.versions.map((each) => +new Date(each.flown_at ?? each.made_at));
+    const whole = Math.max(...times) - Math.min(...times) || 1;
+    this.marks = this.versions.map((each, k) => {
+      const mark = el("button", { type: "button", class: "mark", title: `Version ${each.n}: ${each.flight}`, on: { click: () => this.jump(each.n) } },
+        el("span", { class: "dot", "aria-hidden": true }), el("span", {}, day(each.flown_at ?? each.made_at)), el("small", {}, each.flight));
+      mark.style.flexGrow = String(k ? Math.max(0.05, (times[k] - times[k - 1]) / whole) : 0);
+      return mark;
+    });
     return el("div", { class: "timeline", role: "group", "aria-label": "Flights in order of time" }, this.marks);
   }
 
@@ -103,10 +111,12 @@ class Compare {
     clearInterval(this.blinking);
     for (const each of this.buttons) each.setAttribute("aria-pressed", String(each.dataset.mode === mode));
     if (!this.cover) return;
+    this.cover.classList.toggle("difference", mode === "difference");
+    this.put();
     const swiping = mode === "swipe";
     for (const each of [this.handle, this.edge]) each.hidden = !swiping;
     if (swiping) this.cut(this.split);
-    else this.showWhole(mode === "before");
+    else this.showWhole(mode === "before" || mode === "difference");
     if (mode === "blink") {
       let on = false;
       this.blinking = setInterval(() => { on = !on; this.showWhole(on); }, BLINK_MS);
@@ -122,18 +132,18 @@ class Compare {
   named(before = this.mode === "before") {
     const name = (n) => { const found = this.versions.find((each) => each.n === n); return day(found.flown_at ?? found.made_at); };
     const one = (words, n) => el("span", {}, `${words}: ${name(n)}`, el("small", {}, ` (v${n})`));
-    fill(this.names, this.mode === "swipe" ? [one("Before", this.before), one("After", this.after)] : before ? one("Before", this.before) : one("After", this.after));
+    fill(this.names, ["swipe", "difference"].includes(this.mode) ? [one("Before", this.before), one("After", this.after)] : before ? one("Before", this.before) : one("After", this.after));
   }
 
   apply() {
     const { data, view } = this.screen;
-    data.versions = this.narrow ? [this.before, this.after] : null;
+    data.versions = [this.before, this.after];
     data.dispatchEvent(new Event("filters"));
     view?.ready.then(() => { if (!this.closed) view.showVersion(this.after); });
     if (this.other) {
       this.other.ready.then(() => {
         this.other.showVersion(this.before);
-        this.other.put("changes", data.shown("changes"));
+        this.put();
       });
       this.named();
     }
@@ -141,20 +151,49 @@ class Compare {
     this.refresh();
   }
 
+  /** Draw what was found on both sides alike, or on neither: where they blink or are subtracted, ground alone is compared. */
+  put() {
+    const { data, view } = this.screen;
+    const isBare = this.isBare || ["blink", "difference"].includes(this.mode);
+    for (const each of [view, this.other]) {
+      if (!each) continue;
+      for (const name of ["changes", "objects"]) each.put(name, isBare ? [] : data.shown(name));
+      each.put("drone", []);
+      for (const name of ["track", "drawings", "coverage"]) each.put(name, isBare ? [] : name === "drawings" ? this.screen.zones ?? [] : data.all[name]);
+    }
+  }
+
+  bare(on) {
+    this.isBare = on;
+    this.overlays.querySelector("input").checked = !on;
+    this.put();
+  }
+
   refresh() {
     if (!this.versions) return;
     const shown = this.screen.data.shown("changes");
-    const groups = Object.entries(KINDS).map(([kind, [name]]) => [name, shown.filter((each) => each.properties.kind === kind).length]).filter(([, count]) => count);
-    fill(this.list, el("h3", {}, counted(shown.length, "change")), el("ul", { class: "plain" }, groups.map(([name, count]) => el("li", {}, `${count} ${name}`))),
-      shown.length ? button("Review them", () => this.screen.open("review"), { icon: "review" }) : null);
-    this.other?.put("changes", shown);
+    fill(this.list, el("h3", {}, counted(shown.length, "change")), el("ol", { class: "changes" }, shown.map((each, k) =>
+      el("li", {}, el("button", { type: "button", class: "link", "aria-current": k === this.at ? "true" : null, on: { click: () => this.fly(k) } }, badge(each), ` ${titleOf(each)}`)))),
+    el("p", { class: "note" }, "Arrow keys fly from one to the next. Hatched ground could not be compared."),
+    shown.length ? button("Review them", () => this.screen.open("findings"), { icon: "review" }) : null);
+    if (this.other) this.put();
+  }
+
+  /** To a change by its number in the list. */
+  fly(k) {
+    const shown = this.screen.data.shown("changes");
+    if (!shown.length) return;
+    this.at = (k + shown.length) % shown.length;
+    this.screen.goTo(shown[this.at]);
+    this.refresh();
   }
 
   key(event) {
     if (!this.versions) return false;
-    if (event.key.toLowerCase() === "b") this.use(this.mode === "blink" ? "swipe" : "blink");
-    else return false;
-    return true;
+    const acts = { b: () => this.use(this.mode === "blink" ? "swipe" : "blink"), o: () => this.bare(!this.isBare), ArrowRight: () => this.fly(this.at + 1), ArrowLeft: () => this.fly(this.at - 1) };
+    const act = event.target.closest?.(".maplibregl-map, input") && event.key.startsWith("Arrow") ? null : acts[event.key] ?? acts[event.key.toLowerCase()];
+    act?.();
+    return Boolean(act);
   }
 
   close() {
@@ -164,10 +203,14 @@ class Compare {
     this.other?.close();
     for (const each of [this.cover, this.handle, this.edge, this.names]) each?.remove();
     const { data, view } = this.screen;
-    data.versions = null;
-    if (this.versions && view && !this.screen.closed) {
-      view.showVersion(data.detail.live_revision ? `live-${data.detail.live_revision}` : this.versions.at(-1).n);
-      data.dispatchEvent(new Event("filters"));
+    const newest = this.versions?.at(-1).n;
+    this.versions = this.other = data.versions = null;
+    this.put = null;
+    if (newest !== undefined && view && !this.screen.closed) {
+      view.showVersion(data.detail.live_revision ? `live-${data.detail.live_revision}` : newest);
+      view.show("coverage", this.hadGaps, false);
+      this.screen.draw(["changes", "objects", "track", "coverage"]);
+      view.put("drawings", this.screen.zones ?? []);
     }
   }
 }

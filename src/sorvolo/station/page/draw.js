@@ -2,13 +2,13 @@
 
 import { get, Problem, put, siteUrl } from "./api.js";
 import { button, el, fill, message, svg } from "./dom.js";
-import { area_m2, boundsOf, length_m, middleOf } from "./places.js";
+import { area_m2, boundsOf, length_m } from "./places.js";
 import { waypointsFor } from "./waypoints.js";
 import * as words from "./words.js";
 
 const TOOLS = {
-  distance: ["Distance", "line", "Tap points along the line."], area: ["Area", "ring", "Tap the corners."],
-  profile: ["Height profile", "line", "Tap points along the line; heights are those that “sorvolo heights” made."],
+  distance: ["Distance", "line", "Tap points along the line; a double tap ends it."], area: ["Area", "ring", "Tap the corners; a double tap ends it."],
+  profile: ["Height profile", "line", "Tap points along the line. It needs a map with heights (a flight mapped with heights, or “sorvolo heights”)."],
   interest: ["Area of interest", "ring", "Tap the corners; filters and exports can be kept to it."],
   alert: ["Alert zone", "ring", "Tap the corners; what is found in it raises an alert on every open page."],
   waypoint: ["Waypoint", "point", "Tap the place to fly to."],
@@ -53,10 +53,10 @@ class Draw {
     this.list = el("div", {});
     this.may = screen.station.status.role !== "view";
     this.buttons = Object.entries(TOOLS).map(([tool, [name]]) => el("button", { type: "button", data: { tool }, "aria-pressed": "false",
-      disabled: !this.may && ["interest", "alert", "waypoint"].includes(tool), on: { click: () => this.take(tool) } }, name));
+      hidden: !this.may && ["interest", "alert", "waypoint"].includes(tool), on: { click: () => this.take(tool) } }, name));
     fill(body, el("div", { class: "tools", role: "group", "aria-label": "Tools" }, this.buttons), this.live, this.list,
-      this.may ? el("details", {}, el("summary", {}, "Waypoints for holes"), el("p", { class: "note" }, "Where no picture was taken, a search would have found little, or a comparison could not look."),
-        button("Plan waypoints", () => this.plan())) : null);
+      this.may ? el("details", {}, el("summary", {}, "Re-fly gaps"), el("p", { class: "note" }, "A route over ground that a measured search saw badly; without one, over ground without pictures."),
+        button("Plan a route", () => this.plan())) : null);
     this.hearer = ({ detail }) => { if (detail.site === screen.data.id) loadDrawings(screen).then(() => this.showList()); };
     screen.station.events.addEventListener("drawings.changed", this.hearer);
     loadDrawings(screen).then(() => this.showList());
@@ -76,6 +76,12 @@ class Draw {
 
   click(place) {
     if (!this.tool) return false;
+    const last = this.points.at(-1);
+    const { map } = this.screen.view;
+    if (last && map.project(last).dist(map.project(place)) < 6) { // the second tap of a double one
+      this.finish();
+      return true;
+    }
     this.points.push(place);
     if (TOOLS[this.tool][1] === "point") this.finish();
     else this.sketch();
@@ -101,8 +107,8 @@ class Draw {
   showLive(points, shape) {
     const closed = shape === "ring";
     fill(this.live,
-      el("p", { class: "measure" }, closed ? words.area(area_m2(points)) : words.length(length_m(points)),
-        closed ? el("small", {}, ` around ${words.length(length_m([...points, points[0]]))}`) : null),
+      el("p", { class: "size" }, closed ? words.area(area_m2(points)) : words.length(length_m(points)),
+        closed ? el("small", {}, ` perimeter ${words.length(length_m([...points, points[0]]))}`) : null),
       el("div", { class: "row wrap" }, button("Done", () => this.finish(), { class: "main" }),
         button("Remove last point", () => { this.points.pop(); this.pointer = null; this.sketch(); }, { class: "quiet" }), button("Cancel", () => this.take(null), { class: "quiet" })));
   }
@@ -116,24 +122,23 @@ class Draw {
     }
     this.pointer = null;
     if (tool === "profile") await this.profile(points);
-    else if (["interest", "alert", "waypoint"].includes(tool)) await this.keep(tool, shape, points);
+    else if (this.may) await this.keep(tool, shape, points);
     else {
-      this.tool = null;
-      this.cursor = null;
-      for (const each of this.buttons) each.setAttribute("aria-pressed", "false");
-      this.screen.view?.map.doubleClickZoom.enable();
-      const text = shape === "ring" ? words.area(area_m2(points)) : words.length(length_m(points));
-      fill(this.live, el("p", { class: "measure" }, text), button("Clear", () => this.take(null), { class: "quiet" }));
+      this.take(null);
+      fill(this.live, el("p", { class: "size" }, sizeOf(geometryOf(shape, points))));
     }
   }
 
-  async keep(purpose, shape, points) {
+  async keep(tool, shape, points) {
+    const purpose = ["distance", "area"].includes(tool) ? "measure" : tool;
     const count = (this.screen.zones ?? []).filter((each) => each.properties.purpose === purpose).length + 1;
-    const geometry = shape === "point" ? { type: "Point", coordinates: points[0] } : { type: "Polygon", coordinates: [[...points, points[0]]] };
-    const feature = { type: "Feature", id: crypto.randomUUID?.() ?? String(Date.now()), geometry, properties: { purpose, name: `${TOOLS[purpose][0]} ${count}` } };
+    const geometry = geometryOf(shape, points);
+    const name = purpose === "measure" ? sizeOf(geometry) : `${TOOLS[purpose][0]} ${count}`;
+    const feature = { type: "Feature", id: crypto.randomUUID?.() ?? String(Date.now()), geometry, properties: { purpose, name } };
     this.take(null);
     await saveDrawings(this.screen, (list) => [...list, feature]);
     this.showList();
+    if (purpose === "measure") fill(this.live, el("p", { class: "size" }, name));
   }
 
   async profile(points) {
@@ -143,7 +148,7 @@ class Draw {
     try {
       if (!this.screen.data.detail.is_new) await this.screen.data.loadDetail(); // heights made in a terminal are announced by nobody
       if (!this.screen.data.detail.has_heights) {
-        fill(this.live, el("p", { class: "hint" }, "This site has no heights yet. Run “sorvolo heights” on it, then try again."));
+        fill(this.live, el("p", { class: "hint" }, "This site has no heights yet. Whoever runs the station can make them with “sorvolo heights”; then try again."));
         return;
       }
       const found = await get(`${siteUrl(this.screen.data.id, "profile")}?line=${line}`);
@@ -156,23 +161,26 @@ class Draw {
   async plan() {
     const made = waypointsFor(this.screen.data);
     if (!made.length) {
-      message("No hole to fly again", { todo: "No flight, measured search or comparison of this site left out ground that waypoints would help." });
+      fill(this.live, el("p", { class: "hint" }, "No gaps to re-fly: no search, flight or comparison of this site left out ground that another flight would show."));
       return;
     }
     await saveDrawings(this.screen, (list) => [...list.filter((each) => !each.properties.planned), ...made]);
     this.showList();
-    message(`${words.counted(made.length, "waypoint")} planned`, { todo: "Export them under “Export”, or move on with “sorvolo search --refly” for flight files." });
   }
 
   showList() {
     const { data } = this.screen;
     const zones = this.screen.zones ?? [];
-    fill(this.list, zones.length ? el("h3", {}, "Drawn here") : null, el("ul", { class: "plain drawn" }, zones.map((each) => el("li", {},
+    const route = zones.filter((each) => each.properties.planned);
+    fill(this.list, zones.length ? el("h3", {}, "Drawn here") : null, el("ul", { class: "plain drawn" }, zones.filter((each) => !each.properties.planned).map((each) => el("li", {},
       this.may ? el("input", { type: "text", ".value": each.properties.name ?? "", "aria-label": "Name", maxlength: 80, on: { change: (event) => this.rename(each, event.target.value) } }) : each.properties.name,
-      el("span", { class: "soft" }, each.geometry.type === "Polygon" ? words.area(area_m2(each.geometry.coordinates[0].slice(0, -1))) : words.place(middleOf(each.geometry))),
+      el("span", { class: "soft" }, sizeOf(each.geometry), each.properties.by ? ` · ${each.properties.by}` : ""),
       button("Show", () => this.screen.view?.go(each.geometry.type === "Point" ? each.geometry.coordinates : boundsOf([each.geometry])), { class: "quiet" }),
       each.properties.purpose === "interest" ? el("button", { type: "button", class: "quiet", "aria-pressed": String(data.filters.area === each.geometry.coordinates[0]), on: { click: () => this.narrow(each) } }, "Filter") : null,
-      this.may ? el("button", { type: "button", class: "quiet", "aria-label": `Delete ${each.properties.name ?? ""}`, on: { click: () => this.remove(each) } }, "×") : null))));
+      this.may ? el("button", { type: "button", class: "quiet", "aria-label": `Delete ${each.properties.name ?? ""}`, on: { click: () => this.remove([each.id]) } }, "×") : null)),
+    route.length ? el("li", { class: "route" }, el("b", {}, "Re-fly route"), el("span", { class: "soft" }, `${words.counted(route.length, "point")}, ${words.length(length_m(route.map((each) => each.geometry.coordinates)))}`),
+      button("Show", () => this.screen.view?.go(boundsOf(route.map((each) => each.geometry))), { class: "quiet" }),
+      this.may ? button("Delete", () => this.remove(route.map((each) => each.id)), { class: "quiet" }) : null) : null));
   }
 
   narrow(zone) {
@@ -185,9 +193,9 @@ class Draw {
     await saveDrawings(this.screen, (list) => list.map((each) => (each.id === zone.id ? { ...each, properties: { ...each.properties, name } } : each)));
   }
 
-  async remove(zone) {
-    if (this.screen.data.filters.area === zone.geometry.coordinates[0]) this.screen.data.filter({ area: null });
-    await saveDrawings(this.screen, (list) => list.filter((each) => each.id !== zone.id));
+  async remove(ids) {
+    if (this.screen.zones.some((each) => ids.includes(each.id) && this.screen.data.filters.area === each.geometry.coordinates[0])) this.screen.data.filter({ area: null });
+    await saveDrawings(this.screen, (list) => list.filter((each) => !ids.includes(each.id)));
     this.showList();
   }
 
@@ -203,6 +211,14 @@ class Draw {
     this.take(null);
     this.screen.station.events.removeEventListener("drawings.changed", this.hearer);
   }
+}
+
+const geometryOf = (shape, points) => ({ point: { type: "Point", coordinates: points[0] }, line: { type: "LineString", coordinates: points }, ring: { type: "Polygon", coordinates: [[...points, points[0]]] } })[shape];
+
+/** A drawing's length or area; a point's place. */
+function sizeOf({ type, coordinates }) {
+  if (type === "Point") return words.place(coordinates);
+  return type === "LineString" ? words.length(length_m(coordinates)) : words.area(area_m2(coordinates[0].slice(0, -1)));
 }
 
 /** Heights along a line as a drawing with its axis. `found`: distance_m, height_m (null: not known), and sigma_m. */

@@ -1,9 +1,10 @@
-// Exports: what is shown as GeoJSON, CSV, KMZ; the station's own files (map, GeoPackage, reports); print.
+// Share: a link, what is shown as GeoJSON, CSV, KMZ; the station's own files (map, GeoPackage, reports); print.
 
 import { get, siteUrl } from "./api.js";
 import { button, el, fill, report } from "./dom.js";
 import { titleOf } from "./feature_card.js";
 import { middleOf } from "./places.js";
+import { copy } from "./share.js";
 import { siteName } from "./sites.js";
 import { bytes, counted, length, place, time } from "./words.js";
 import { zip } from "./zip.js";
@@ -14,8 +15,14 @@ const COLUMNS = ["id", "what", "kind", "class", "score", "latitude", "longitude"
 export function exportPanel(screen, body) {
   const shown = el("div", {});
   const files = el("div", {});
-  fill(body, el("h3", {}, "What is shown"), shown, el("h3", {}, "Files of the site"), files, el("h3", {}, "Print"),
-    el("p", { class: "note" }, "The map as it is on the screen, its scale, and the list of what is shown."), button("Print", () => print(screen)));
+  const copied = el("span", { class: "soft", role: "status" });
+  const link = async () => {
+    await copy(`${location.origin}/#/site/${encodeURIComponent(screen.data.id)}/${screen.room}`);
+    fill(copied, "Link copied");
+  };
+  fill(body, el("div", { class: "row wrap" }, button("Copy link", link, { class: "main" }), copied),
+    el("p", { class: "note" }, "Who opens it needs a token of their own where the station has tokens."), el("h3", {}, "What is shown"), shown,
+    el("div", { class: "row wrap" }, button("Print or PDF", () => print(screen))), el("details", { open: true }, el("summary", {}, "All files"), files));
 
   function refresh() {
     const features = shownFeatures(screen);
@@ -111,6 +118,7 @@ export function kml(name, features) {
     const { type, coordinates: places } = feature.geometry;
     if (type === "Point") add(add(mark, "Point"), "coordinates", places.slice(0, 2).join(","));
     else if (type === "Polygon") add(add(add(add(mark, "Polygon"), "outerBoundaryIs"), "LinearRing"), "coordinates", coordinates(places[0]));
+    else if (type === "LineString") add(add(mark, "LineString"), "coordinates", coordinates(places));
     else add(add(mark, "Point"), "coordinates", middleOf(feature.geometry).join(","));
   }
   return `<?xml version="1.0" encoding="UTF-8"?>\n${new XMLSerializer().serializeToString(doc)}`;

@@ -3,11 +3,12 @@
 import { button, el, fill } from "./dom.js";
 import { CLASSES, KINDS, OTHER_CLASS } from "./map_style.js";
 import { middleOf } from "./places.js";
+import { handover } from "./share.js";
 import { verdictForm } from "./verdicts.js";
 import { cropsOf, isChange } from "./site_data.js";
 import * as words from "./words.js";
 
-const SHOWN_IN = new Set(["map", "compare", "place"]); // elsewhere the map is needed whole
+const SHOWN_IN = new Set(["live", "layers", "compare", "place"]); // elsewhere the map is needed whole
 
 /** The card over the map; `show(feature)`, null hides it. */
 export function featureCard(screen) {
@@ -19,7 +20,11 @@ export function featureCard(screen) {
       if (!isHidden && !box.hidden && isWritten(box) && box.dataset.id === String(feature.id)) return;
       box.hidden = isHidden;
       box.dataset.id = feature?.id ?? "";
-      if (!isHidden) fill(box, cardOf(screen, feature));
+      if (isHidden) return;
+      if (box.dataset.of !== String(feature.id)) box.classList.remove("whole");
+      box.dataset.of = feature.id;
+      fill(box, cardOf(screen, feature, box));
+      requestAnimationFrame(() => { if (!screen.closed) screen.view?.reveal(middleOf(feature.geometry)); });
     },
   };
 }
@@ -27,15 +32,18 @@ export function featureCard(screen) {
 /** Whether a note is being written in it: that is not to vanish under the hands when something else changes. */
 export const isWritten = (node) => node.contains(document.activeElement) && document.activeElement.matches("input");
 
-function cardOf(screen, feature) {
+function cardOf(screen, feature, box) {
+  const place = middleOf(feature.geometry);
   return [
     el("div", { class: "card-head" }, badge(feature), el("h3", {}, titleOf(feature)),
+      button("More", () => { box.classList.toggle("whole"); screen.view?.reveal(place); }, { class: "quiet only-phone" }),
       el("button", { type: "button", class: "quiet close", "aria-label": "Close", on: { click: () => screen.data.choose(null) } }, "×")),
+    screen.data.detail.is_local ? null : handover(screen.data.id, titleOf(feature), place, feature.properties.sigma_m),
     pictures(feature),
     verdictForm(screen, feature),
     facts(feature, screen.data.detail.is_local),
     el("div", { class: "row wrap" },
-      button("Memory of this place", () => { screen.open("place"); screen.opened.look(middleOf(feature.geometry)); }, { class: "quiet", icon: "place" }),
+      button("Memory of this place", () => { screen.open("place"); screen.opened.look(place); }, { class: "quiet", icon: "place" }),
       button("Zoom in", () => screen.goTo(feature), { class: "quiet", icon: "target" })),
   ];
 }
@@ -60,9 +68,10 @@ export function pictures(feature) {
     el("figure", {}, picture(src, `${titleOf(feature)}, ${names[k] ?? ""}`), el("figcaption", {}, names[k] ?? ""))));
 }
 
-/** A picture, or a note where it cannot be had. */
+/** A picture, at most four times as large as it is; a note where it cannot be had. */
 export function picture(src, alt) {
   const image = el("img", { src, alt, loading: "lazy", decoding: "async" });
+  image.addEventListener("load", () => { image.style.maxWidth = `${4 * image.naturalWidth}px`; });
   image.addEventListener("error", () => image.replaceWith(el("div", { class: "gone" }, "no picture")));
   return image;
 }

@@ -1,5 +1,6 @@
 // Which objects and changes are shown: by class and kind, score, time, area and verdict.
 
+import { button } from "./dom.js";
 import { inRing, middleOf } from "./places.js";
 
 export const ALL = { hidden: [], minScore: 0, from: "", to: "", flight: "", verdict: "all", area: null, minArea_m2: 0 };
@@ -22,4 +23,16 @@ function passes(feature, filters) {
   if (filters.from && String(values.last_seen ?? values.first_seen ?? "") < filters.from) return false;
   if (filters.to && String(values.first_seen ?? "") > `${filters.to}~`) return false;
   return !filters.area || inRing(middleOf(feature.geometry), filters.area);
+}
+
+/** A button for each filter that hides something: a tap takes it off. */
+export function chips(data) {
+  const { filters } = data;
+  const said = {
+    hidden: filters.hidden.length ? `Without ${filters.hidden.join(", ")}` : null, minScore: filters.minScore ? `Score of ${Math.round(filters.minScore * 100)} % and more` : null,
+    from: filters.from && `Seen from ${filters.from}`, to: filters.to && `Seen until ${filters.to}`, flight: filters.flight && `Flight ${filters.flight}`,
+    verdict: filters.verdict !== "all" ? `Only ${filters.verdict === "none" ? "unreviewed" : filters.verdict}` : null,
+    area: filters.area && "Only in the area of interest", minArea_m2: filters.minArea_m2 ? `Changes of ${filters.minArea_m2} m² and more` : null,
+  };
+  return Object.entries(said).filter(([, words]) => words).map(([name, words]) => button(words, () => data.filter({ [name]: ALL[name] }), { class: "chip", icon: "close", title: "Show everything again" }));
 }

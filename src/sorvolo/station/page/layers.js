@@ -4,7 +4,8 @@ import { choices } from "./choices.js";
 import { button, choice, el, field, fill, tick } from "./dom.js";
 import { ALL, sortOf } from "./filters.js";
 import { badge } from "./feature_card.js";
-import { GROUPS, KINDS, CLASSES, PLACED } from "./map_style.js";
+import { GROUPS, KINDS, CLASSES, PLACED, POD_RAMP } from "./map_style.js";
+import { lookedAt } from "./sentence.js";
 import { chooseBaseMap } from "./base_map.js";
 import { counted, day, percent } from "./words.js";
 
@@ -14,15 +15,17 @@ export function layersPanel(screen, body) {
   const legend = el("div", {});
   const layers = el("fieldset", { class: "ticks" }, el("legend", {}, "Layers"),
     Object.entries(GROUPS).map(([group, [words]]) => tick(words, choices.get("layers")[group] ?? GROUPS[group][1],
-      (shown) => { view?.show(group, shown); refresh(); })), tick("Follow the drone", screen.live.follows, (on) => { screen.live.follows = on; }));
+      (shown) => { view?.show(group, shown); refresh(); })));
   const found = el("div", {});
-  fill(body, legend, found, layers, filterForm(data), versions(screen), base(screen));
+  const coverage = el("div", {});
+  fill(body, legend, found, coverage, layers, filterForm(data), base(screen));
 
   function refresh() {
     const { detail } = data;
     fill(legend, el("p", { class: "soft" }, counted(detail.flights?.length ?? 0, "flight"), " · ",
-      detail.versions?.length ? `newest of ${day(detail.versions.at(-1).flown_at ?? detail.versions.at(-1).made_at)}` : detail.bounds_wgs84 ? "a first one is being mapped" : "nothing mapped yet"),
+      detail.versions?.length ? `latest ${day(detail.versions.at(-1).flown_at ?? detail.versions.at(-1).made_at)}` : detail.bounds_wgs84 ? "a first one is being mapped" : "nothing mapped yet"),
       whyEmpty(data));
+    fill(coverage, coverageCard(data));
     fill(found, kinds(data, "changes", "Changes"), kinds(data, "objects", "Objects"), placedLegend(data));
   }
   refresh();
@@ -31,7 +34,7 @@ export function layersPanel(screen, body) {
 
 function whyEmpty(data) {
   if (data.detail.versions?.length || data.detail.is_new || data.detail.bounds_wgs84) return null;
-  return el("p", { class: "hint" }, "This site has no map yet. Start a mission under “Missions”.");
+  return el("p", { class: "hint" }, "This site has no map yet. Start a mission in “Live”.");
 }
 
 function kinds(data, name, title) {
@@ -73,16 +76,20 @@ function filterForm(data) {
     field("Flight", choice([["", "all"], ...(data.detail.flights ?? []).map((each) => [each.id, each.id])], data.filters.flight, (flight) => data.filter({ flight }))),
     el("div", { class: "row" }, field("Seen from", date("from")), field("until", date("to"))),
     field("Changes of at least (m²)", least),
-    el("p", { class: "note" }, data.filters.area ? "Only what lies in the area of interest." : "Draw an area of interest under “Draw” to filter by it."),
+    el("p", { class: "note" }, data.filters.area ? "Only what lies in the area of interest." : "Draw an area of interest with “Measure and draw” to filter by it."),
     button("Show everything", () => { data.filter({ ...ALL }); }, { class: "quiet" }));
 }
 
-function versions(screen) {
-  const list = screen.data.detail.versions ?? [];
-  if (list.length < 2) return null;
-  const { view } = screen;
-  return field("Version of the map", choice([...list].reverse().map((each) => [each.n, `${each.n}: ${day(each.flown_at ?? each.made_at)} (${each.flight})`]),
-    view?.version, (n) => view?.showVersion(Number(n))));
+/** How well the ground was looked at, with the legend of its layer. */
+function coverageCard(data) {
+  const looked = lookedAt(data.all.pod);
+  if (!looked) return el("p", { class: "hint" }, "How well the ground was searched is not measured. A search mission in “Live” does it.");
+  return el("fieldset", { class: "ticks coverage" }, el("legend", {}, "Chance to have seen a person"),
+    el("ol", { class: "ramp", "aria-label": "Colours" }, POD_RAMP.map((colour, k) => {
+      const step = el("li", {}, `${20 * k}–${20 * k + 20} %`);
+      step.style.setProperty("--colour", colour);
+      return step;
+    })), el("p", { class: "note" }, `${percent(looked.share)} of the ground was looked at. Somebody on it would have been seen with ${percent(looked.from)} to ${percent(looked.to)}. Tap the coloured ground for its value, dashed ground for the reason.`));
 }
 
 function base(screen) {

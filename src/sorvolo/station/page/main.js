@@ -6,11 +6,15 @@ import { button, choice, dialog, el, field, fill, message, report, tick } from "
 import { Events } from "./events.js";
 import { showSites } from "./sites.js";
 import { votes } from "./votes.js";
+import { bytes } from "./words.js";
 
 const main = document.getElementById("main");
 const title = document.getElementById("title");
 const linkState = document.getElementById("link-state");
-const numbers = document.getElementById("numbers");
+const rooms = document.getElementById("rooms");
+const known = document.getElementById("sentence");
+const frame = { main, title, rooms, known };
+const OLD_NAMES = { map: "live", review: "findings", draw: "measure", missions: "live", export: "share" };
 
 /** What all screens share. */
 export const station = { status: null, events: null };
@@ -27,6 +31,7 @@ async function begin() {
   choices.addEventListener("change", (event) => { if (event.detail === "theme") applyTheme(); });
   session.addEventListener("needed", showLogin);
   addEventListener("hashchange", () => route());
+  if (isSecureContext) navigator.serviceWorker?.register("/sw.js").catch(() => {}); // without it the page needs the station
   await enter();
 }
 
@@ -47,7 +52,7 @@ async function enter() {
 
 function listen() {
   station.events = new Events(station.status.last_event ?? 0);
-  const words = { live: "live", waiting: "connecting", lost: "no connection" };
+  const words = { live: "Connected", waiting: "Connecting", lost: "No connection" };
   const show = () => {
     const state = station.events.state;
     linkState.className = state;
@@ -79,18 +84,18 @@ async function route() {
   screen?.close?.();
   screen = null;
   for (const each of document.querySelectorAll("dialog")) if (each !== loginBox) each.close();
-  fill(numbers);
-  fill(title);
+  for (const each of [rooms, title, known]) fill(each);
+  delete known.dataset.loaded;
   document.body.dataset.screen = kind === "site" && id ? "site" : "sites";
   try {
     let made;
     if (kind === "site" && id) {
       const { showSite } = await siteScreen();
-      made = await showSite(main, title, numbers, station, id, view || "map", at.length === 2 && at.every(Number.isFinite) ? at : null);
+      made = await showSite(frame, station, id, OLD_NAMES[view] ?? (view || "live"), at.length === 2 && at.every(Number.isFinite) ? at : null);
     } else if (kind === "api") {
       made = await (await import("./api_page.js")).showApi(main, title);
     } else {
-      made = await showSites(main, title, station);
+      made = await showSites(frame, station);
     }
     if (mine === turn) screen = made;
     else made?.close?.();
@@ -127,6 +132,7 @@ function showLogin() {
     event.preventDefault();
     try {
       await post("/api/session", { token: input.value.trim() });
+      isLoggedIn = true;
       loginBox.close();
       await enter();
     } catch (problem) {
@@ -134,7 +140,11 @@ function showLogin() {
       input.select();
     }
   });
+  let isLoggedIn = false;
   loginBox = dialog("Log in", form);
+  loginBox.addEventListener("close", () => { // by Escape: the way in stays
+    if (!isLoggedIn) fill(main, el("div", { class: "starting" }, el("h1", {}, "You are not logged in"), el("p", {}, "This station shows its sites to those who have a token."), button("Log in", showLogin, { class: "main" })));
+  });
   input.focus();
 }
 
@@ -151,9 +161,10 @@ function showSettings() {
       tick("Sound when something appears in an alert zone", choices.get("sound"), set("sound")),
       el("h3", {}, "Keys"),
       el("dl", { class: "keys" }, [
-        ["1 … 7", "panels"], ["J / K", "next and previous in the review"], ["C / R / U", "confirm, reject, withdraw"],
-        ["N", "note"], ["M", "show on the map"], ["B", "blink before and after"], ["Esc", "end drawing, close"],
+        ["1 2 3", "Live, Findings, Compare"], ["J / K", "next and previous finding"], ["C or Y / R / ? / U", "confirm, reject, not sure, withdraw"],
+        ["N", "note"], ["M", "show on the map"], ["B", "blink before and after"], ["O", "hide what was found, in Compare"], ["← →", "from change to change, in Compare"], ["Esc", "end drawing, close"],
       ].map(([key, words]) => [el("dt", {}, key), el("dd", {}, words)])),
+      who ? el("details", {}, el("summary", {}, "Diagnostics"), el("p", { class: "note diagnostics" }, `memory ${bytes((who.memory_mb ?? NaN) * 1e6)}, disk left ${bytes(who.disk_free_gb * 1e9)}, connection ${station.events?.state}`)) : null,
       el("p", { class: "note" }, el("a", { href: "#/api" }, "Addresses for programs (API)")),
       who ? el("p", { class: "note" }, `Sorvolo ${who.version}. Logged in as ${who.name || "this machine"} (${who.role}). `,
         who.name && who.name !== "this machine" ? button("Log out", logOut, { class: "quiet" }) : null) : null));
@@ -162,6 +173,7 @@ function showSettings() {
 async function logOut() {
   try {
     await remove("/api/session");
+    navigator.serviceWorker?.controller?.postMessage("forget");
     location.reload();
   } catch (problem) {
     report(problem);

@@ -10,6 +10,9 @@ export const CLASSES = {
 export const OTHER_CLASS = ["others", "#e9ecef", "?"];
 export const PLACED = { vision: ["placed by vision", "#35b98a"], "gps-only": ["placed by GPS alone", "#f0a835"] };
 
+/** Chances of 0 to 20 % and so on that somebody would have been seen: cividis, told apart by every eye. */
+export const POD_RAMP = ["#00224e", "#444d6b", "#7d7c78", "#bcae6c", "#fee838"];
+
 const EMPTY = { type: "FeatureCollection", features: [] };
 export const DATA = ["coverage", "pod", "frames", "track", "drawings", "sketch", "changes", "objects", "drone", "chosen"];
 
@@ -17,9 +20,9 @@ const matched = (property, table, other) => ["match", ["get", property], ...Obje
 
 /** Layers by group: what a tick in the panel shows and hides. */
 export const GROUPS = {
-  mosaic: ["Mosaic", true], frames: ["Footprints of the frames", false], track: ["Track", true],
-  objects: ["Objects", true], changes: ["Changes", true], coverage: ["Holes, and what could not be compared", false],
-  pod: ["Probability of detection", false], drone: ["Drone and field of view", true], drawings: ["Drawings and zones", true],
+  mosaic: ["Map", true], frames: ["Footprints of the frames", false], track: ["Track", true],
+  objects: ["Objects", true], changes: ["Changes", true], coverage: ["Coverage gaps", false],
+  pod: ["Chance to have seen a person", false], drone: ["Drone and field of view", true], drawings: ["Drawings and zones", true],
 };
 
 /** The style with empty data; `dark` chooses the ground's colour. */
@@ -41,8 +44,8 @@ function groundLayers() {
     { id: "coverage-edge", group: "coverage", type: "line", source: "coverage", filter: ["in", ["get", "status"], ["literal", ["not-compared", "hole"]]],
       paint: { "line-color": "#fff", "line-width": 1.2, "line-dasharray": [3, 2] } },
     { id: "pod", group: "pod", type: "fill", source: "pod", filter: ["==", ["get", "kind"], "pod"],
-      paint: { "fill-opacity": 0.5, "fill-color": ["interpolate", ["linear"], ["get", "pod_from"],
-        0, "#b2182b", 0.4, "#f4a582", 0.6, "#d1e5a0", 0.8, "#1a9850"] } },
+      paint: { "fill-opacity": 0.6, "fill-color": ["step", ["get", "pod_from"], POD_RAMP[0], ...POD_RAMP.slice(1).flatMap((colour, k) => [(k + 1) / 5 - 0.01, colour])] } },
+    { id: "pod-hole-fill", group: "pod", type: "fill", source: "pod", filter: ["==", ["get", "kind"], "hole"], paint: { "fill-opacity": 0 } },
     { id: "pod-hole", group: "pod", type: "line", source: "pod", filter: ["==", ["get", "kind"], "hole"],
       paint: { "line-color": "#fff", "line-width": 1.6, "line-dasharray": [2, 2] } },
   ];
@@ -60,7 +63,7 @@ function flightLayers() {
 }
 
 function drawnLayers() {
-  const colour = ["match", ["get", "purpose"], "alert", "#ff6b6b", "interest", "#4dabf7", "waypoint", "#ffe066", "#ffffff"];
+  const colour = ["match", ["get", "purpose"], "alert", "#ff6b6b", "measure", "#ffffff", "interest", "#4dabf7", "waypoint", "#ffe066", "#ffffff"];
   const isArea = ["==", ["geometry-type"], "Polygon"];
   const isPoint = ["==", ["geometry-type"], "Point"];
   return ["drawings", "sketch"].flatMap((source) => [

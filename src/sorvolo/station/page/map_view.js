@@ -20,7 +20,7 @@ export function canDraw() {
  * [lon, lat] and the features below.
  */
 export class MapView {
-  constructor(container, site, { onClick = () => {}, onMove = () => {}, bare = false } = {}) {
+  constructor(container, site, { onClick = () => {}, onMove = () => {}, onDrag = () => {}, bare = false } = {}) {
     this.site = site;
     this.version = null;
     this.data = {};
@@ -40,10 +40,12 @@ export class MapView {
     this.map.on("error", (event) => { if (event.error && event.error.status !== 404) console.warn(event.error.message); });
     if (!bare) {
       this.map.addControl(new maplibre.NavigationControl({ visualizePitch: false }), "top-right");
+      if (isSecureContext) this.map.addControl(new maplibre.GeolocateControl({ positionOptions: { enableHighAccuracy: true }, trackUserLocation: true }), "top-right");
       this.scale = new maplibre.ScaleControl({ unit: choices.get("units") });
       this.map.addControl(this.scale, "bottom-right");
     }
     this.map.on("click", (event) => onClick([event.lngLat.lng, event.lngLat.lat], this.hits(event.point), event));
+    this.map.on("dragstart", onDrag);
     this.map.on("mousemove", (event) => onMove([event.lngLat.lng, event.lngLat.lat], this.hits(event.point)));
     this.ready = new Promise((done) => this.map.once("style.load", () => {
       for (const [name, picture] of Object.entries(pictures())) this.map.addImage(name, picture);
@@ -56,9 +58,9 @@ export class MapView {
     return choices.get("layers")[group] ?? GROUPS[group][1];
   }
 
-  /** Show or hide a group of layers. */
-  show(group, visible) {
-    choices.set("layers", { ...choices.get("layers"), [group]: visible });
+  /** Show or hide a group of layers; `isKept` for the next time, too. */
+  show(group, visible, isKept = true) {
+    if (isKept) choices.set("layers", { ...choices.get("layers"), [group]: visible });
     for (const id of this.groups[group] ?? []) if (this.map.getLayer(id)) this.map.setLayoutProperty(id, "visibility", visible ? "visible" : "none");
   }
 
@@ -131,7 +133,7 @@ export class MapView {
 
   /** The features below a point, the uppermost first. */
   hits(point) {
-    const layers = ["objects", "changes-fill", "changes-line", "drawings-fill", "drawings-point"].filter((id) => this.map.getLayer(id));
+    const layers = ["objects", "changes-fill", "changes-line", "pod-hole-fill", "pod", "drawings-fill", "drawings-point"].filter((id) => this.map.getLayer(id));
     const box = [[point.x - 6, point.y - 6], [point.x + 6, point.y + 6]];
     return this.map.queryRenderedFeatures(box, { layers });
   }
@@ -152,19 +154,41 @@ export class MapView {
     return { middle: [lng, lat], width_m: distance_m(west, east), bearing_deg: this.map.getBearing() };
   }
 
-  /** Move to a [lon, lat] or to bounds. */
-  go(place, zoom = 20.5, atOnce = false) {
-    const still = atOnce || matchMedia("(prefers-reduced-motion: reduce)").matches;
-    if (place.length === 4) this.map.fitBounds(place, { padding: 40, maxZoom: 21.5, animate: !still });
-    else this.map.easeTo({ center: place, zoom: Math.max(this.map.getZoom(), zoom), animate: !still, duration: 500 });
+  /** How much of the map's lower part a sheet or a card of a phone lies over, px. */
+  covered() {
+    const whole = this.map.getContainer().getBoundingClientRect();
+    const over = [...document.querySelectorAll(".card-over, .panel")].map((each) => each.getBoundingClientRect()).filter((box) => box.height && box.width > whole.width * 0.8 && box.bottom > whole.bottom - 80);
+    return Math.max(0, ...over.map((box) => whole.bottom - box.top));
   }
 
-  /** Bring a place back into view where a panel that grew hides it. */
+  /** Move to a [lon, lat] or to bounds, where nothing lies over the map. */
+  go(place, zoom = 20.5, atOnce = false) {
+    const still = atOnce || matchMedia("(prefers-reduced-motion: reduce)").matches;
+    const covered = Math.min(this.covered(), this.map.getContainer().clientHeight * 0.7);
+    if (place.length === 4) this.map.fitBounds(place, { padding: { top: 40, left: 40, right: 40, bottom: 40 + covered }, maxZoom: 21.5, animate: !still });
+    else this.map.easeTo({ center: place, zoom: Math.max(this.map.getZoom(), zoom), offset: [0, -covered / 2], animate: !still, duration: 500 });
+  }
+
+  /** Whether a place lies in the middle half of what is seen of the map. */
+  isCentral(place) {
+    const { x, y } = this.map.project(place);
+    const { clientWidth: width, clientHeight: height } = this.map.getContainer();
+    const seen = height - Math.min(this.covered(), height * 0.7);
+    return Math.abs(x - width / 2) < width / 4 && Math.abs(y - seen / 2) < seen / 4;
+  }
+
+  /** Whether some of these bounds is in view. */
+  shows([west, south, east, north]) {
+    const view = this.map.getBounds();
+    return west < view.getEast() && east > view.getWest() && south < view.getNorth() && north > view.getSouth();
+  }
+
+  /** Bring a place into the part of the map that nothing lies over. */
   reveal(place) {
     this.map.resize();
     const { x, y } = this.map.project(place);
     const { clientWidth: width, clientHeight: height } = this.map.getContainer();
-    if (x < 20 || y < 20 || x > width - 20 || y > height - 20) this.map.jumpTo({ center: place });
+    if (x < 20 || y < 20 || x > width - 20 || y > height - this.covered() - 20) this.go(place, 0, true);
   }
 
   close() {

@@ -1,60 +1,79 @@
-// Missions: started on an upload or a stream, watched, stopped; and what became of earlier ones.
+// The room Live: what was found while it is found, what runs, and what a person can start.
 
 import { get, post, Problem, remove } from "./api.js";
 import { button, choice, dialog, el, field, fill, message, report } from "./dom.js";
+import { badge, picture, titleOf } from "./feature_card.js";
+import { cropsOf } from "./site_data.js";
 import { Upload } from "./upload.js";
-import { bytes, counted, duration, time } from "./words.js";
+import { bytes, clock, counted, duration, time } from "./words.js";
 import { zipOfFiles } from "./zip.js";
 
 const KINDS = {
-  map: ["Map", "A first map, or more of it, from a flight."], compare: ["Compare", "A later flight over the same ground: what changed."],
-  watch: ["Watch", "People and cars in a video, counted and placed."], search: ["Search", "How probable it is that somebody would have been found: on this site's flights, or on one that is mapped now, measured while it flies."],
+  map: ["Map", "Build or extend the map."], compare: ["Compare", "Find what changed since the last flight."],
+  watch: ["Watch", "Detect people and vehicles."], search: ["Search", "Measure with which chance somebody would have been seen: on this site's flights, or on one that is mapped now."],
 };
 const MOST_ZIP_BYTES = 4e9;
+const MOST_FINDS = 24;
 
-/** The panel's life. */
+/** Map what a drone sends, and look for people in it: two missions. A site that is written already is watched alone. */
+export async function mapAndFind(stream, site, hasMap) {
+  const start = (mission) => post("/api/runs", { mission, site, input: { stream }, options: {} });
+  const mapped = await start(hasMap ? "compare" : "map").catch((problem) => problem);
+  await start("watch");
+  if (mapped instanceof Problem) report(new Problem(mapped.status, "People are looked for, but no map is made", mapped.detail));
+}
+
+/** The room's life. */
 export function missionsPanel(screen, body) {
   return new Missions(screen, body);
 }
 
 class Missions {
   constructor(screen, body) {
-    Object.assign(this, { screen, runs: [], uploads: [] });
+    Object.assign(this, { screen });
     this.list = el("div", { class: "runs" });
+    this.finds = el("ul", { class: "strip finds", "aria-label": "Found, people first" });
+    this.drones = el("div", { class: "stack" });
     this.may = screen.station.status.role === "operate";
-    fill(body, this.may ? this.form() : el("p", { class: "note" }, "Your token may look and review, not start missions."), this.uploadList = el("div", {}), el("h3", {}, "Missions here"), this.list, this.kept = el("div", {}));
-    const types = ["run.started", "run.finished", "run.failed", "run.stopped", "run.deleted", "station.disk"]; // the last: rows state what it means
+    this.starting = this.may ? el("details", { class: "starting-form" }, el("summary", {}, "Start a mission"), this.form()) : null;
+    fill(body, this.finds, this.drones, el("h3", {}, "Activity"), this.list, this.uploadList = el("div", {}),
+      this.starting ?? el("p", { class: "note" }, "View only. Ask the team lead for operator access to start missions."), this.kept = el("div", {}));
+    if (this.starting && !screen.data.detail.versions.length && !screen.runs.length) this.starting.open = true;
     const again = () => this.load();
-    const progress = ({ detail }) => {
-      const run = this.runs.find((each) => each.id === detail.run);
-      if (run) { run.progress = detail.data; this.show(); }
-    };
+    const types = ["stream.state", "station.disk"]; // the last: rows state what it means
     for (const type of types) screen.station.events.addEventListener(type, again);
-    screen.station.events.addEventListener("run.progress", progress);
-    this.end = () => {
-      for (const type of types) screen.station.events.removeEventListener(type, again);
-      screen.station.events.removeEventListener("run.progress", progress);
-    };
+    this.end = () => types.forEach((type) => screen.station.events.removeEventListener(type, again));
+    this.refresh();
     this.load();
+  }
+
+  /** What was found, people first, the newest first. */
+  refresh() {
+    const isPerson = (each) => each.properties.class === "person";
+    const found = this.screen.data.all.objects.filter(({ properties: { gone, review } }) => !gone && review !== "rejected")
+      .sort((one, other) => isPerson(other) - isPerson(one) || String(other.properties.first_seen ?? "").localeCompare(String(one.properties.first_seen ?? ""))).slice(0, MOST_FINDS);
+    fill(this.finds, found.map((each) => el("li", {}, el("button", { type: "button", data: { id: each.id }, on: { click: () => this.screen.live.showFound(each) } },
+      cropsOf(each).length ? picture(cropsOf(each).at(-1), "") : null,
+      el("span", { class: "name" }, badge(each), titleOf(each), el("span", { class: "soft" }, each.properties.first_seen ? ` ${clock(each.properties.first_seen)}` : ""))))));
   }
 
   form() {
     this.mission = this.screen.data.detail.versions?.length ? "compare" : "map";
     this.from = this.flown = "upload";
     const note = el("p", { class: "note" }, KINDS[this.mission][1]);
-    const files = el("input", { type: "file", multiple: true, "aria-label": "Files of the flight" });
+    const files = this.files = el("input", { type: "file", multiple: true, "aria-label": "Files of the flight" });
     const url = el("input", { type: "text", inputmode: "url", placeholder: "rtsp://…, udp://…", autocomplete: "off" });
     const camera = el("input", { type: "text", maxlength: 80, placeholder: "found by itself", pattern: "(aov=[0-9.]+|focal_px=[0-9.]+|[A-Za-z0-9 .+\\-]+)" });
     const ready = el("div", {});
     const input = el("div", {});
     const from = el("div", {});
-    const origins = [["upload", "Files of this device"], ["stream", "A stream's address"], ["ready", "What the station has"]];
+    const origins = [["ready", "Drone streams and files"], ["upload", "Upload"], ["stream", "Camera URL"]];
     const show = () => {
       this.from = this.mission === "search" ? this.searched ?? "site" : this.flown;
       const take = (value) => { this[this.mission === "search" ? "searched" : "flown"] = value; show(); };
       fill(from, field("From", choice(this.mission === "search" ? [["site", "The flights of this site"], ...origins] : origins, this.from, take)));
       fill(input, { upload: field("Files of the flight", files, "The video, and its telemetry (SRT, CSV, GPX …) if it is not inside; or all photos."),
-        stream: field("Stream's address", url, "RTSP, RTMP or MPEG-TS over UDP, from networks that the station allows. The station opens the camera once; its video appears over the map."), ready, site: null }[this.from]);
+        stream: field("Camera URL", url, "RTSP, RTMP or MPEG-TS over UDP, from networks that the station allows. The station opens the camera once; its video appears beside the map."), ready, site: null }[this.from]);
     };
     const start = el("button", { class: "main" }, "Start");
     const form = el("form", { class: "stack start", on: { submit: async (event) => {
@@ -63,14 +82,30 @@ class Missions {
       try {
         await this.start({ files: [...files.files], url: url.value.trim(), camera: camera.value.trim(), ...chosen(ready) });
         files.value = "";
-      } catch (problem) { report(problem); } finally { start.disabled = false; }
+      } catch (problem) {
+        if (problem.name !== "AbortError") this.say(`${problem.title ?? "This did not work"}. ${problem.detail ?? problem.message}`);
+      } finally { start.disabled = false; }
     } } },
-    el("h3", {}, "Start a mission"),
     field("Mission", choice(Object.entries(KINDS).map(([key, [words]]) => [key, words]), this.mission, (mission) => { this.mission = mission; fill(note, KINDS[mission][1]); show(); })), note,
-    from, input, el("details", {}, el("summary", {}, "Camera"), field("Camera", camera, "A model such as “DJI Mavic 2 Pro”, or aov=78; only where the flight's files do not name it.")), start);
+    from, input, el("details", {}, el("summary", {}, "Camera"), field("Camera", camera, "A model such as “DJI Mavic 2 Pro”, or aov=78; only where the flight's files do not name it.")), this.fault = el("p", { class: "error", role: "alert" }), start);
+    this.showInput = show;
     show();
     this.loadReady(ready);
     return form;
+  }
+
+  /** Files that were dropped on the page: they are what is flown. */
+  take(files) {
+    if (!this.starting) return;
+    this.starting.open = true;
+    this.flown = "upload";
+    this.showInput();
+    this.files.files = files;
+  }
+
+  /** Why a mission does not start, beside its button. */
+  say(words) {
+    fill(this.fault, words);
   }
 
   /** Streams of drones, and flights that lie beside the sites. */
@@ -80,11 +115,12 @@ class Missions {
     const texts = inputs.filter((each) => each.kind.startsWith("telemetry"));
     rows.push(...inputs.filter((each) => !texts.includes(each)).map((each) => [JSON.stringify({ input: each.id }), `${each.name} (${bytes(each.megabytes * 1e6)})`]));
     if (!rows.length) return fill(box, el("p", { class: "hint" }, "No drone sent a stream yet, and no flight lies in the station's folder."));
-    return fill(box, field("What the station has", choice(rows, rows[0][0], () => {}, { name: "input" })),
+    return fill(box, field("Stream or file", choice(rows, rows[0][0], () => {}, { name: "input" })),
       texts.length ? field("Telemetry", choice([["", "found by itself"], ...texts.map((each) => [each.id, each.name])], "", () => {}, { name: "telemetry" })) : null);
   }
 
   async start(wish) {
+    this.say("");
     const options = wish.camera ? { camera: wish.camera } : {};
     const input = this.from === "site" ? null : await this.input(wish, options);
     if (input === undefined) return undefined;
@@ -95,16 +131,16 @@ class Missions {
 
   /** What the mission flies; undefined where a person has to choose first. Puts telemetry into the options. */
   async input(wish, options) {
-    if (this.from === "stream") return wish.url ? { stream_url: wish.url } : void message("Give the stream's address first");
+    if (this.from === "stream") return wish.url ? { stream_url: wish.url } : void this.say("Give the stream's address first");
     if (this.from === "ready") {
       if (wish.telemetry) options.telemetry = { input: wish.telemetry };
-      return wish.input ? JSON.parse(wish.input) : void message("The station has no flight or stream; choose files of this device");
+      return wish.input ? JSON.parse(wish.input) : void this.say("The station has no flight or stream; choose files of this device");
     }
     const kinds = grouped(wish.files);
     const [videos, photos, archives, texts] = ["video", "photo", "archive", "text"].map((kind) => kinds.get(kind) ?? []);
     const flights = [...videos, ...archives, ...(photos.length ? [photos] : [])];
-    if (flights.length !== 1) return void message(flights.length ? "Choose one flight: one video, or photos" : "Choose the files of the flight first");
-    if (texts.length > 1) return void message("Choose one telemetry file");
+    if (flights.length !== 1) return void this.say(flights.length ? "Choose one flight: one video, or photos" : "Choose the files of the flight first");
+    if (texts.length > 1) return void this.say("Choose one telemetry file");
     if (texts.length) options.telemetry = { upload: await this.upload(texts[0]) };
     return { upload: await this.upload(Array.isArray(flights[0]) ? await photosAsOne(photos) : flights[0]) };
   }
@@ -123,27 +159,40 @@ class Missions {
 
   async load() {
     try {
-      this.runs = await get(`/api/runs?site=${encodeURIComponent(this.screen.data.id)}`);
-      this.show();
-      await this.showKept();
+      await this.screen.loadRuns();
+      const streams = await get("/api/streams");
+      this.showDrones(streams.filter((each) => each.is_connected));
+      await this.showKept(streams);
     } catch (problem) {
       fill(this.list, el("p", { class: "hint" }, problem.detail));
     }
   }
 
-  show() {
-    fill(this.list, this.runs.length ? this.runs.map((run) => this.row(run)) : el("p", { class: "hint" }, "None yet."));
+  /** A button for each drone that sends and that no mission here follows. */
+  showDrones(streams) {
+    const { data, runs } = this.screen;
+    const isFollowed = ({ stream }) => runs.some((each) => each.state === "running" && each.input?.stream === stream);
+    fill(this.drones, this.may ? streams.filter((each) => !isFollowed(each)).map(({ stream }) => button(`Map and find people: ${stream}`, async (event) => {
+      event.currentTarget.disabled = true;
+      try { await mapAndFind(stream, data.id, data.detail.versions.length > 0); } catch (problem) { report(problem); }
+      await this.load();
+    }, { class: "main" })) : null);
+  }
+
+  running() {
+    const { runs } = this.screen;
+    fill(this.list, runs.length ? [...runs.filter(({ state }) => state === "running"), ...runs.filter(({ state }) => state !== "running")].map((run) => this.row(run)) : el("p", { class: "hint" }, "No mission yet."));
   }
 
   /** What the station keeps of streams and uploads, with its size; taken away by whoever may start missions. */
-  async showKept() {
-    const [streams, uploads] = await Promise.all([get("/api/streams"), this.may ? get("/api/uploads") : []]);
+  async showKept(streams) {
+    const uploads = this.may ? await get("/api/uploads") : [];
     const rows = [
       ...streams.filter((each) => each.flight_count).map((each) => [`Stream ${each.stream}`, `${counted(each.flight_count, "flight")}, ${bytes(each.bytes)}`, `/api/streams/${encodeURIComponent(each.stream)}`]),
       ...uploads.map((each) => [each.name, `upload, ${bytes(each.offset)}`, `/api/uploads/${encodeURIComponent(each.id)}`]),
     ];
-    fill(this.kept, rows.length ? [el("h3", {}, "Recordings and uploads of the station"), el("ul", { class: "files" }, rows.map(([name, size, path]) => el("li", {}, el("b", {}, name), " ", el("span", { class: "soft" }, size),
-      this.may ? button("Delete", () => this.remove(path, `${name} (${size})`), { class: "quiet", "aria-label": `Delete ${name}` }) : null)))] : null);
+    fill(this.kept, rows.length ? el("details", {}, el("summary", {}, "Recordings and uploads of the station"), el("ul", { class: "files" }, rows.map(([name, size, path]) => el("li", {}, el("b", {}, name), " ", el("span", { class: "soft" }, size),
+      this.may ? button("Delete", () => this.remove(path, `${name} (${size})`), { class: "quiet", "aria-label": `Delete ${name}` }) : null)))) : null);
   }
 
   /** Take away for good what a person confirms. */
@@ -165,6 +214,7 @@ class Missions {
       running ? el("progress", { ...(expected ? { value: Math.min(frames, expected), max: expected } : {}), "aria-label": "Progress" }) : null,
       running && wanted ? el("p", {}, `${landed ? "landed, searching the rest: " : ""}${searched} of ${wanted} pictures searched`) : null,
       running && frames ? el("p", {}, expected ? `frame ${frames} of ${expected}` : counted(frames, "frame")) : null,
+      running ? el("p", { class: "soft figures" }, this.screen.live.figures(run.id)) : null,
       run.notice ? el("p", { class: "error", role: "status" }, run.notice) : null,
       run.headline ? el("p", {}, run.headline) : null,
       run.error ? el("p", { class: "error" }, run.error) : null,

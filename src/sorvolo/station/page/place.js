@@ -3,18 +3,21 @@
 import { get, siteUrl } from "./api.js";
 import { button, el, fill } from "./dom.js";
 import { picture } from "./feature_card.js";
+import { handover } from "./share.js";
 import * as words from "./words.js";
 
 /** The panel's life; `look(place)` asks for a [lon, lat]. */
 export function placePanel(screen, body) {
   let turn = 0;
   let shown = null;
+  let ground = null; // how well it was looked at, where that layer is shown
   let drawn = ""; // what of the page's state the list was last drawn with
   let last = screen.lastPlace ?? null;
   const hint = el("p", { class: "hint" }, "Tap the ground on the map: every flight that saw it, in order, what changed there, and people's verdicts.");
 
-  async function look(place) {
+  async function look(place, hits = []) {
     turn += 1;
+    ground = chanceAt(hits);
     const mine = turn;
     shown = null;
     last = screen.lastPlace = place;
@@ -40,7 +43,7 @@ export function placePanel(screen, body) {
     const found = unique(views.flatMap((each) => [...each.changes, ...each.objects]));
     const reviews = unique(views.flatMap((each) => each.reviews), (each) => `${each.id} ${each.at}`);
     fill(body,
-      el("div", { class: "row" }, el("p", { class: "place-name" }, words.place(place, { local: screen.data.detail.is_local })), copyButton(place)),
+      el("div", { class: "row" }, el("p", { class: "place-name" }, words.place(place, { local: screen.data.detail.is_local }))), ground, screen.data.detail.is_local ? null : handover(screen.data.id, `Place on ${screen.data.detail.name}`, place),
       views.length ? el("p", { class: "soft" }, `${words.counted(views.length, "view")} in ${words.counted(flights.size, "flight")}, first ${words.time(views[0].time)}`)
         : el("p", { class: "hint" }, "No flight saw this place."),
       found.length ? el("section", {}, el("h3", {}, "What was found here"), el("ul", { class: "plain" }, found.map((each) => change(screen, each)))) : null,
@@ -59,7 +62,7 @@ export function placePanel(screen, body) {
     }, cursor: "crosshair", click(place, hits) {
       if (hits.some((each) => each.source === "objects")) return false;
       screen.data.choose(null);
-      look(place);
+      look(place, hits);
       return true;
     },
     close() { mark(screen, null); } };
@@ -87,10 +90,15 @@ function review(each) {
 
 function view(screen, each) {
   const jump = each.video_s === null || !each.video_url ? null
-    : button(`▶ ${words.duration(each.video_s)}`, () => screen.video.jump(each), { class: "quiet", title: "Show the video at this second" });
+    : button(`▶ ${words.duration(each.video_s)}`, () => screen.video.play(each), { class: "quiet", title: "Show the video at this second" });
   return el("li", {}, each.crop_url ? picture(each.crop_url, `Seen ${words.time(each.time)}`) : el("div", { class: "gone" }, "no picture kept"), el("span", {}, words.clock(each.time)), jump);
 }
 
-function copyButton(place) {
-  return button("Copy", () => navigator.clipboard?.writeText(words.place(place)), { class: "quiet", title: "Copy the coordinates" });
+/** With which chance somebody at a place would have been seen, and why so little; null where the map shows no such layer. */
+function chanceAt(hits) {
+  const at = (kind) => hits.find(({ source, properties }) => source === "pod" && properties.kind === kind)?.properties;
+  const [pod, hole] = [at("pod"), at("hole")];
+  if (!pod && !hole) return null;
+  const chance = pod ? `A ${pod.class ?? "person"} here would have been seen with ${words.percent(pod.pod_from)} to ${words.percent(pod.pod_to)}` : "Nobody here would have been seen";
+  return el("p", { class: "hint chance" }, hole ? `${chance}: ${hole.reason}.` : `${chance}.`);
 }

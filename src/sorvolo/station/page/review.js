@@ -1,16 +1,19 @@
-// The gallery: changes and objects one after another, large pictures, judged with the keyboard.
+// The room Findings: objects and changes one after another, large pictures, judged with the keyboard.
 
-import { button, choice, el, fill, icon, tick } from "./dom.js";
+import { get, siteUrl } from "./api.js";
+import { button, choice, el, fill, icon, svg, tick } from "./dom.js";
 import { badge, facts, isWritten, picture, pictures, titleOf } from "./feature_card.js";
-import { counted } from "./words.js";
+import { middleOf } from "./places.js";
+import { handover } from "./share.js";
+import { duration, time } from "./words.js";
 import { cropsOf, isChange } from "./site_data.js";
 import { judge, verdictForm } from "./verdicts.js";
 
 const ORDERS = {
-  score: ["surest first", (one, other) => (other.properties.score ?? 0) - (one.properties.score ?? 0)],
-  doubt: ["least sure first", (one, other) => (one.properties.score ?? 0) - (other.properties.score ?? 0)],
-  size: ["largest first", (one, other) => (other.properties.area_m2 ?? other.properties.length_m ?? 0) - (one.properties.area_m2 ?? one.properties.length_m ?? 0)],
-  time: ["newest first", (one, other) => String(other.properties.first_seen ?? "").localeCompare(String(one.properties.first_seen ?? ""))],
+  score: ["Highest confidence", (one, other) => (other.properties.score ?? 0) - (one.properties.score ?? 0)],
+  doubt: ["Lowest confidence", (one, other) => (one.properties.score ?? 0) - (other.properties.score ?? 0)],
+  size: ["Largest first", (one, other) => (other.properties.area_m2 ?? other.properties.length_m ?? 0) - (one.properties.area_m2 ?? one.properties.length_m ?? 0)],
+  time: ["Newest first", (one, other) => String(other.properties.first_seen ?? "").localeCompare(String(one.properties.first_seen ?? ""))],
 };
 
 /** The panel's life: a strip of all, and the stage's large card. */
@@ -20,8 +23,8 @@ export function reviewPanel(screen, body) {
 
 class Review {
   constructor(screen, body) {
-    Object.assign(this, { screen, what: "changes", order: "score", open: false, at: null });
-    if (!screen.data.all.changes.length && screen.data.all.objects.length) this.what = "objects";
+    Object.assign(this, { screen, what: "objects", order: "score", open: false, at: null });
+    if (screen.data.chosen ? isChange(screen.data.chosen) : !screen.data.all.objects.length) this.what = "changes";
     this.head = el("div", {});
     this.strip = el("ul", { class: "strip", "aria-label": "To review" });
     this.big = el("div", { class: "gallery" });
@@ -29,7 +32,6 @@ class Review {
     fill(body, this.head, this.strip);
     screen.card.show(null);
     this.at = screen.data.chosen?.id ?? null;
-    if (screen.data.chosen && !isChange(screen.data.chosen)) this.what = "objects";
     this.refresh();
   }
 
@@ -39,10 +41,12 @@ class Review {
 
   list() {
     const shown = this.shown().filter((each) => !this.open || !each.properties.review || each.id === this.at);
-    return [...shown].sort(ORDERS[this.order][1]);
+    const isPerson = (each) => each.properties.class === "person";
+    return [...shown].sort((one, other) => isPerson(other) - isPerson(one) || ORDERS[this.order][1](one, other));
   }
 
   refresh() {
+    if (!this.isChosen && !this.screen.data.chosen) this.what = this.shown("objects").length || !this.shown("changes").length ? "objects" : "changes"; // while it loads
     const list = this.list();
     if (!list.some((each) => each.id === this.at)) this.at = list[0]?.id ?? null;
     this.showHead(list);
@@ -54,14 +58,14 @@ class Review {
     const all = this.shown();
     const done = all.filter((each) => each.properties.review).length;
     fill(this.head,
-      el("div", { class: "segments", role: "group", "aria-label": "What to review" }, ["changes", "objects"].map((what) =>
-        el("button", { type: "button", "aria-pressed": String(what === this.what), on: { click: () => { this.what = what; this.at = null; this.refresh(); } } },
+      el("div", { class: "segments", role: "group", "aria-label": "What to review" }, ["objects", "changes"].map((what) =>
+        el("button", { type: "button", "aria-pressed": String(what === this.what), on: { click: () => { this.isChosen = true; this.what = what; this.at = null; this.refresh(); } } },
           `${what === "changes" ? "Changes" : "Objects"} (${this.shown(what).length})`))),
       el("div", { class: "review-order" }, choice(Object.entries(ORDERS).map(([key, [words]]) => [key, words]), this.order,
         (order) => { this.order = order; this.refresh(); }, { "aria-label": "Order" }),
-        tick("only open ones", this.open, (open) => { this.open = open; this.refresh(); })),
+        tick("Unreviewed only", this.open, (open) => { this.open = open; this.refresh(); })),
       all.length ? el("div", { class: "progress" }, el("progress", { max: all.length, value: done, "aria-label": "Reviewed" }), el("span", {}, `${done} of ${all.length} reviewed`)) : null,
-      list.length ? null : el("p", { class: "hint" }, all.length ? "All reviewed. Untick “only open ones” to see them again." : `No ${this.what} to review${this.screen.data.all[this.what].length ? ": the filter hides them all" : ""}.`));
+      list.length ? null : el("p", { class: "hint" }, all.length ? "All reviewed. Untick “Unreviewed only” to see them again." : `No ${this.what} to review${this.screen.data.all[this.what].length ? ": the filter hides them all" : ""}.`));
   }
 
   item(feature) {
@@ -81,15 +85,49 @@ class Review {
     this.drawn = this.at;
     const feature = list[at];
     this.pictures = pictures(feature);
+    this.film = el("ol", { class: "film", tabindex: 0, "aria-label": "Seen here, in order of time" });
+    const { data } = this.screen;
+    const [role, place] = [this.screen.station.status.role, middleOf(feature.geometry)];
     fill(this.big,
       el("div", { class: "gallery-head" }, badge(feature), el("h3", {}, titleOf(feature)), el("span", { class: "soft" }, `${at + 1} of ${list.length}`),
+        isChange(feature) ? null : el("button", { type: "button", class: "quiet", "aria-pressed": "false", on: { click: (event) => this.around(feature, event.currentTarget) } }, "10 m around"),
         button("Previous", () => this.step(-1), { class: "quiet", "aria-keyshortcuts": "K" }), button("Next", () => this.step(1), { class: "quiet", "aria-keyshortcuts": "J" })),
-      this.pictures,
-      el("div", { class: "gallery-foot" }, facts(feature, this.screen.data.detail.is_local),
-        el("div", {}, verdictForm(this.screen, feature, { keys: true, given: (verdict, note) => this.give(verdict, note) }),
+      this.pictures, this.film,
+      el("div", { class: "gallery-foot" }, facts(feature, data.detail.is_local),
+        el("div", {}, verdictForm(this.screen, feature, { keys: role !== "view", given: (verdict, note) => this.give(verdict, note) }),
           el("div", { class: "row" }, button("Show on the map", () => this.map(), { icon: "target", "aria-keyshortcuts": "M" }),
-            isChange(feature) ? button("Blink", () => this.blink(), { class: "quiet", "aria-keyshortcuts": "B" }) : null))));
+            isChange(feature) ? button("Blink", () => this.blink(), { class: "quiet", "aria-keyshortcuts": "B" }) : null),
+          data.detail.is_local ? null : handover(data.id, titleOf(feature), place, feature.properties.sigma_m))));
+    this.showFilm(feature, place);
     this.strip.querySelector("[aria-current]")?.scrollIntoView({ block: "nearest" });
+  }
+
+  /** Every picture of the place, 10 m of ground each, north up; a tap makes one large. */
+  async showFilm(feature, [lon, lat]) {
+    const film = this.film;
+    const views = await get(`${siteUrl(this.screen.data.id, "place")}?lon=${lon}&lat=${lat}`).catch(() => []);
+    if (film !== this.film) return;
+    this.views = views.filter((each) => each.crop_url);
+    fill(film, this.views.map((each) => el("li", {}, el("button", { type: "button", class: "frame", "aria-label": `Seen ${time(each.time)}`, on: { click: () => this.large(feature, each) } }, picture(each.crop_url, "")),
+      each.video_url && each.video_s !== null ? button(`▶ ${duration(each.video_s)}`, () => this.screen.video.play(each), { class: "quiet", title: "Show the video at this second" }) : null)));
+  }
+
+  /** The surroundings in place of the crop, or back. */
+  around(feature, pressed) {
+    const on = pressed.getAttribute("aria-pressed") !== "true";
+    pressed.setAttribute("aria-pressed", String(on));
+    if (on && this.views?.length) this.large(feature, this.views.find((each) => each.flight === feature.properties.flight) ?? this.views[0]);
+    else if (!on) this.pictures.replaceWith(this.pictures = pictures(feature));
+  }
+
+  /** A picture of 10 m of ground with the thing's outline, a scale bar and north. */
+  large(feature, view) {
+    const length_m = Math.max(1, Math.min(8, feature.properties.length_m || 2));
+    const ring = svg("svg", { viewBox: "0 0 10 10", class: "scale", "aria-hidden": "true" }, svg("circle", { cx: 5, cy: 5, r: 0.65 * length_m }), svg("path", { d: "M.5 9.5h2M9.5 2V.6m-.3.5.3-.5.3.5" }),
+      svg("text", { x: 0.5, y: 9.2 }, "2 m"), svg("text", { x: 9.35, y: 2.6 }, "N"));
+    const shown = el("div", { class: "pictures n1" }, el("figure", { class: "ground" }, picture(view.crop_url, `10 m around, ${time(view.time)}`), ring, el("figcaption", {}, time(view.time))));
+    this.pictures.replaceWith(shown);
+    this.pictures = shown;
   }
 
   blink() {
@@ -98,9 +136,7 @@ class Review {
 
   map() {
     const feature = this.screen.data.find(this.at);
-    this.screen.open("map");
-    this.screen.data.choose(feature);
-    this.screen.goTo(feature);
+    this.screen.live.showFound(feature);
   }
 
   choose(id) {
@@ -117,6 +153,7 @@ class Review {
 
   /** Show a feature, whatever was shown. */
   see(feature) {
+    this.isChosen = true;
     this.what = isChange(feature) ? "changes" : "objects";
     this.choose(feature.id);
   }
@@ -134,7 +171,7 @@ class Review {
   key(event) {
     const acts = {
       j: () => this.step(1), ArrowDown: () => this.step(1), ArrowRight: () => this.step(1), k: () => this.step(-1), ArrowUp: () => this.step(-1), ArrowLeft: () => this.step(-1),
-      c: () => this.give("confirmed"), r: () => this.give("rejected"), u: () => this.give("none"), n: () => this.big.querySelector("input")?.focus(), m: () => this.map(), b: () => this.blink(),
+      c: () => this.give("confirmed"), y: () => this.give("confirmed"), "?": () => this.give("unsure"), r: () => this.give("rejected"), u: () => this.give("none"), n: () => this.big.querySelector("input")?.focus(), m: () => this.map(), b: () => this.blink(),
     };
     const act = acts[event.key] ?? acts[event.key.toLowerCase()];
     act?.();

@@ -1,12 +1,14 @@
-// The screen of one site: the map in the middle, panels beside it, live events into both.
+// The screen of one site: three rooms, Live, Findings and Compare; the map with its tools; the sentence of what is known.
 
 import { get, siteUrl } from "./api.js";
 import { showStationMap } from "./base_map.js";
 import { choices } from "./choices.js";
-import { button, el, fill, icon, message } from "./dom.js";
 import { comparePanel } from "./compare.js";
+import { button, el, fill, icon, message } from "./dom.js";
 import { drawPanel, loadDrawings } from "./draw.js";
 import { exportPanel } from "./exports.js";
+import { featureCard } from "./feature_card.js";
+import { ALL, chips } from "./filters.js";
 import { layersPanel } from "./layers.js";
 import { followLive } from "./live.js";
 import { canDraw, MapView } from "./map_view.js";
@@ -14,24 +16,25 @@ import { missionsPanel } from "./missions.js";
 import { placePanel } from "./place.js";
 import { boundsOf, middleOf } from "./places.js";
 import { reviewPanel } from "./review.js";
+import { sentence } from "./sentence.js";
 import { SiteData } from "./site_data.js";
-import { featureCard } from "./feature_card.js";
-import { videoPane } from "./video.js";
 import { siteName } from "./sites.js";
+import { videoWall } from "./video.js";
 import { votes } from "./votes.js";
 import * as words from "./words.js";
 
-const PANELS = [
-  ["map", "Map", "layers", layersPanel], ["review", "Review", "review", reviewPanel], ["compare", "Compare", "compare", comparePanel],
-  ["place", "Place", "place", placePanel], ["draw", "Draw", "draw", drawPanel], ["missions", "Missions", "missions", missionsPanel],
-  ["export", "Export", "export", exportPanel],
-];
+const ROOMS = { live: ["Live", missionsPanel], findings: ["Findings", reviewPanel], compare: ["Compare", comparePanel] };
+const TOOLS = { layers: ["Layers", layersPanel, "layers"], measure: ["Measure and draw", drawPanel, "draw"], place: ["Memory of a place", placePanel, "place"], share: ["Share", exportPanel, "export"] };
+const ALL_PANELS = { ...ROOMS, ...TOOLS };
+const STOPS = ["half", "full", "peek"]; // of the sheet that a panel is on a phone
+const RUNS_CHANGE = ["run.started", "run.finished", "run.stopped", "run.failed", "run.deleted"];
+const STATUS_MS = 10000;
 
 /** Show a site; gives what closes it. */
-export async function showSite(main, title, numbers, station, id, view, at = null) {
-  const isNew = view === "missions" && !(await isMade(id));
+export async function showSite(frame, station, id, view, at = null) {
+  const isNew = view === "live" && !(await isMade(id));
   const detail = isNew ? notMadeYet(id) : await get(siteUrl(id));
-  return new SiteScreen(main, title, numbers, station, new SiteData(detail), view, at);
+  return new SiteScreen(frame, station, new SiteData(detail), view, at);
 }
 
 const isMade = async (id) => (await get("/api/sites")).some((each) => each.id === id);
@@ -41,52 +44,84 @@ function notMadeYet(id) {
 }
 
 class SiteScreen {
-  constructor(main, title, numbers, station, data, view, at) {
-    Object.assign(this, { station, data, numbers, ends: [], lastPlace: at });
+  constructor({ main, title, rooms, known }, station, data, view, at) {
+    Object.assign(this, { station, data, known, ends: [], lastPlace: at, room: "live", loaded: "no", runs: [] });
     this.stage = el("section", { class: "stage", "aria-label": "Map" });
-    this.panel = el("section", { class: "panel", id: "panel", tabindex: -1 });
+    this.panel = el("section", { class: "panel", id: "panel", tabindex: -1, data: { stop: "half" } });
     this.canvas = el("div", { class: "map-canvas" });
     this.readout = el("output", { class: "readout", "aria-label": "Place under the pointer" });
-    this.stage.append(this.canvas, this.readout);
-    this.tabs = el("nav", { class: "rail", "aria-label": "Panels" }, PANELS.map(([name, words_, drawn], k) =>
-      el("button", { type: "button", data: { panel: name }, "aria-controls": "panel", title: `${words_} (${k + 1})`, on: { click: () => this.open(name, true) } },
-        icon(drawn), el("span", {}, words_))));
-    fill(main, el("div", { class: "site" }, this.tabs, this.panel, this.stage));
+    this.chips = el("div", { class: "chips" });
+    this.stage.append(this.canvas, this.chips, this.readout);
+    this.wall = el("section", { class: "wall", "aria-label": "Videos", hidden: true });
+    this.tabs = Object.entries(ROOMS).map(([name, [words_]]) => el("button", { type: "button", data: { panel: name }, "aria-controls": "panel", on: { click: () => this.open(name, true) } }, words_));
+    fill(rooms, this.tabs, el("button", { type: "button", class: "share", data: { panel: "share" }, "aria-controls": "panel", on: { click: () => this.open("share", true) } }, icon("export"), el("span", {}, "Share")));
+    this.tabs.push(rooms.lastElementChild);
+    fill(main, el("div", { class: "site" }, this.panel, this.stage, this.wall));
     fill(title, el("h1", {}, siteName(data.detail)));
     document.title = `${siteName(data.detail)} – Sorvolo`;
+    this.tell(); // before the map is made: it lies over the map's ground
     this.begin(view);
   }
 
   begin(view) {
     if (!canDraw()) {
       fill(this.canvas, el("div", { class: "starting" }, el("h2", {}, "This browser cannot draw the map"),
-        el("p", {}, "It has no WebGL 2. Use a newer Firefox, Chrome, Edge or Safari, or switch on hardware acceleration in its settings. Review, missions and export work without the map.")));
+        el("p", {}, "It has no WebGL 2. Use a newer Firefox, Chrome, Edge or Safari, or switch on hardware acceleration in its settings. Findings, missions and exports work without the map.")));
       this.view = null;
     } else {
       this.view = new MapView(this.canvas, this.data.detail, {
-        onClick: (place, hits) => this.clicked(place, hits), onMove: (place, hits) => this.moved(place, hits),
+        onClick: (place, hits) => this.clicked(place, hits), onMove: (place, hits) => this.moved(place, hits), onDrag: () => this.follow(false),
       });
+      this.stage.append(this.tools());
     }
     this.card = featureCard(this);
     this.live = followLive(this);
-    this.video = videoPane(this);
-    loadDrawings(this); // alert zones count on every panel
+    this.video = videoWall(this);
+    loadDrawings(this); // alert zones count in every room
     this.onKey = (event) => this.key(event);
     addEventListener("keydown", this.onKey);
+    const { events } = this.station;
+    const here = (listener) => ({ detail }) => { if (detail.site === this.data.id) listener(detail); };
     this.hear(this.data, "data", (event) => this.draw(event.detail));
-    this.hear(this.data, "filters", () => this.draw(["objects", "changes"]));
+    this.hear(this.data, "filters", () => { fill(this.chips, chips(this.data)); this.draw(["objects", "changes"]); });
     this.hear(this.data, "chosen", () => this.drawChosen());
     this.hear(choices, "change", (event) => { this.view?.follow(); if (event.detail !== "layers") this.redraw(); });
     this.hear(matchMedia("(prefers-color-scheme: dark)"), "change", () => this.view?.follow());
-    for (const type of ["site.changed", "run.finished", "run.stopped", "run.failed", "run.deleted"]) this.hear(this.station.events, type, (event) => this.reload(event.detail));
-    this.hear(this.station.events, "site.gone", ({ detail }) => { if (detail.site === this.data.id) this.gone(); });
-    this.hear(this.station.events, "state", ({ detail }) => { if (detail === "live") this.check(); });
-    this.hear(this.station.events, "review.changed", ({ detail }) => { if (detail.site === this.data.id) this.data.judge(detail.data); });
+    for (const type of ["site.changed", ...RUNS_CHANGE.slice(1)]) this.hear(events, type, (event) => this.reload(event.detail));
+    for (const type of RUNS_CHANGE) this.hear(events, type, here(() => this.loadRuns()));
+    this.hear(events, "run.progress", here(({ run, data }) => { const found = this.runs.find(({ id }) => id === run); if (found) { found.progress = data; this.opened?.running?.(); this.tell(); } }));
+    this.hear(events, "site.gone", here(() => this.gone()));
+    this.hear(events, "state", ({ detail }) => { if (detail === "live") this.check(); this.tell(); });
+    this.hear(events, "review.changed", here(({ data }) => this.data.judge(data)));
     this.hear(votes, "change", () => { this.data.expect(); this.data.changed(["changes", "objects"]); });
     this.hear(votes, "taken", ({ detail: { vote, answer } }) => { if (vote.site === this.data.id) this.data.judge(answer); });
     this.hear(votes, "refused", ({ detail }) => this.refused(detail));
+    this.hear(window, "dragover", (event) => event.preventDefault());
+    this.hear(window, "drop", (event) => {
+      event.preventDefault();
+      if (event.dataTransfer.files.length) { this.open("live", true); this.opened.take(event.dataTransfer.files); }
+    });
+    const timers = [setInterval(() => this.tell(), 1000), setInterval(() => this.look(), STATUS_MS)];
+    this.ends.push(() => timers.forEach(clearInterval));
     this.open(view);
     this.load();
+  }
+
+  /** What is done on the map itself. */
+  tools() {
+    const tool = (words_, drawn, act, props = {}) => el("button", { type: "button", title: words_, "aria-label": words_, on: { click: act }, ...props }, icon(drawn));
+    this.follower = tool("Follow the drone", "video", () => this.follow(!this.live.follows), { "aria-pressed": "true" });
+    return el("div", { class: "map-tools", role: "toolbar", "aria-label": "Map tools" },
+      tool("Whole site", "fit", () => { if (this.data.detail.bounds_wgs84) this.view.go(this.data.detail.bounds_wgs84); this.follow(false); }), this.follower,
+      Object.entries(TOOLS).filter(([name]) => name !== "share").map(([name, [words_, , drawn]]) => tool(words_, drawn, () => (this.shown === name ? this.open(this.room) : this.open(name, true)), { data: { panel: name } })));
+  }
+
+  /** Keep the drone in the middle of the map, until somebody moves it. */
+  follow(on) {
+    if (!this.live || this.live.follows === on) return;
+    this.live.follows = on;
+    this.follower.setAttribute("aria-pressed", String(on));
+    if (on) this.live.drawSoon();
   }
 
   hear(target, type, listener) {
@@ -109,12 +144,53 @@ class SiteScreen {
       if (this.closed) return;
       this.view.showVersion(live ? `live-${live}` : versions.at(-1)?.n);
       showStationMap(this);
-      if (this.lastPlace) this.view.go(this.lastPlace, 20.5, true);
+      if (!this.lastPlace) return;
+      this.follow(false);
+      this.view.go(this.lastPlace, 20.5, true);
     });
-    if (!isNew) await this.data.load(["changes", "objects", "track"]);
-    await drawn;
-    if (!isNew) await this.data.load(["coverage", "frames", "pod"]); // mostly not shown at first
+    try {
+      await this.loadRuns();
+      if (!isNew) {
+        await this.data.load(["changes", "objects", "track", "pod"]);
+        this.loaded = "yes";
+        this.tell();
+        await drawn;
+        await this.data.load(["coverage", "frames"]); // mostly not shown at first
+      } else this.loaded = "yes";
+    } catch (problem) {
+      if (this.loaded !== "yes") this.loaded = "failed";
+      if (problem.status !== 401) throw problem;
+    } finally { this.tell(); }
     if (!this.closed) this.opened?.refresh?.();
+  }
+
+  async loadRuns() {
+    this.runs = await get(`/api/runs?site=${encodeURIComponent(this.data.id)}`);
+    this.opened?.running?.();
+    this.video?.look();
+    this.tell();
+  }
+
+  /** The station's own state: its disk. */
+  async look() {
+    try {
+      this.station.status = { ...this.station.status, ...await get("/api/status") };
+    } catch { /* the sentence states that there is no connection */ }
+  }
+
+  /** State what is known, in a sentence whose parts lead to it. */
+  tell() {
+    if (this.closed) return;
+    const { status, events } = this.station;
+    const { objects, changes, pod } = this.data.all;
+    const parts = sentence({ link: events.state, loaded: this.loaded, runs: this.runs, objects, changes, pod, versions: this.data.detail.versions, votes: votes.mine.length,
+      isLow: status.disk_floor_gb !== undefined && status.disk_free_gb < 2 * status.disk_floor_gb });
+    const text = JSON.stringify(parts);
+    if (text === this.told) return;
+    this.told = text;
+    this.known.dataset.loaded = this.loaded;
+    const acts = { live: () => this.open("live", true), review: () => this.open("findings", true), compare: () => this.open("compare", true), coverage: () => { this.view?.show("pod", true); this.open("layers", true); } };
+    fill(this.known, parts.map(({ words: said, act, kind }, k) => [k ? " · " : null, act ? el("button", { type: "button", class: `link ${kind}`, on: { click: acts[act] } }, said) : el("span", { class: kind }, said)]));
   }
 
   async reload({ site, type }) {
@@ -125,6 +201,8 @@ class SiteScreen {
       const wasNew = this.data.detail.is_new || !this.data.detail.bounds_wgs84;
       await this.data.loadDetail();
       await this.data.load();
+      this.loaded = "yes";
+      this.tell();
       if (this.view) {
         this.view.site = this.data.detail;
         if (wasNew && this.data.detail.bounds_wgs84) this.view.go(this.data.detail.bounds_wgs84);
@@ -140,6 +218,7 @@ class SiteScreen {
     if (this.data.detail.is_new) return;
     try {
       await get(siteUrl(this.data.id));
+      if (this.loaded === "failed") this.load();
     } catch (problem) { this.lost(problem); }
   }
 
@@ -155,25 +234,29 @@ class SiteScreen {
     location.hash = "#/";
   }
 
-  /** Open a panel by its name. */
+  /** Open a room, or a tool beside the map, by its name. */
   open(name, byHand = false) {
-    const found = PANELS.find(([each]) => each === name) ?? PANELS[0];
-    if (byHand && this.shown === found[0]) {
-      document.body.classList.toggle("folded");
-      return;
-    }
-    document.body.classList.remove("folded");
+    const shown = name in ALL_PANELS ? name : "live";
     this.opened?.close?.();
-    this.shown = found[0];
-    for (const each of this.tabs.children) each.setAttribute("aria-pressed", String(each.dataset.panel === found[0]));
-    this.stage.dataset.panel = found[0];
-    const body = el("div", { class: `body ${found[0]}` });
-    fill(this.panel, el("h2", {}, { draw: "Draw and measure", place: "Memory of a place" }[found[0]] ?? found[1]), body);
-    this.panel.setAttribute("aria-label", found[1]);
-    this.opened = found[3](this, body) ?? {};
+    this.shown = shown;
+    if (shown in ROOMS) this.room = shown;
+    for (const each of [...this.tabs, ...this.stage.querySelectorAll(".map-tools [data-panel]")]) each.setAttribute("aria-pressed", String(each.dataset.panel === shown));
+    this.stage.dataset.panel = document.body.dataset.panel = shown;
+    const [words_, made] = ALL_PANELS[shown];
+    const body = el("div", { class: `body ${shown}` });
+    fill(this.panel, el("div", { class: "panel-head" }, button("", () => this.resize(), { class: "quiet handle", "aria-label": "More or less of this sheet" }), el("h2", {}, words_),
+      shown in TOOLS ? button("Close", () => this.open(this.room), { class: "quiet", icon: "close" }) : null), body);
+    this.panel.setAttribute("aria-label", words_);
+    if (byHand && this.panel.dataset.stop === "peek") this.resize("half");
+    this.opened = made(this, body) ?? {};
     this.card.show(this.data.chosen);
-    history.replaceState(null, "", `#/site/${encodeURIComponent(this.data.id)}/${found[0]}`);
+    history.replaceState(null, "", `#/site/${encodeURIComponent(this.data.id)}/${shown}`);
     if (byHand) this.panel.focus({ preventScroll: true });
+  }
+
+  /** The sheet of a phone at its next stop, or at one that is named. */
+  resize(stop = STOPS[(STOPS.indexOf(this.panel.dataset.stop) + 1) % STOPS.length]) {
+    this.panel.dataset.stop = stop;
   }
 
   clicked(place, hits) {
@@ -185,13 +268,12 @@ class SiteScreen {
       this.data.choose(null);
       if (!this.data.detail.is_new) {
         if (this.shown !== "place") this.open("place");
-        this.opened.look?.(place);
+        this.opened.look?.(place, hits);
       }
     }
   }
 
   moved(place, hits) {
-    this.pointer = place;
     fill(this.readout, words.place(place, { local: this.data.detail.is_local }));
     this.view.map.getCanvas().style.cursor = this.opened?.cursor ?? (hits.length ? "pointer" : "");
     this.opened?.move?.(place);
@@ -201,11 +283,13 @@ class SiteScreen {
     if (this.view) {
       this.view.ready.then(() => {
         if (this.closed) return;
-        for (const name of names) if (name in this.data.all) this.view.put(name, this.data.shown(name));
+        if (this.opened?.put) this.opened.put(); // Compare draws both sides alike
+        else for (const name of names) if (name in this.data.all) this.view.put(name, this.data.shown(name));
         this.drawChosen();
       });
     }
     this.opened?.refresh?.();
+    this.tell();
   }
 
   drawChosen() {
@@ -218,21 +302,25 @@ class SiteScreen {
   redraw() {
     this.card.show(this.data.chosen);
     this.opened?.refresh?.();
-    this.live.show();
   }
 
   /** Move the map to a feature. */
   goTo(feature) {
     const box = boundsOf([feature.geometry]);
+    this.follow(false);
     if (box) this.view?.go([(box[0] + box[2]) / 2, (box[1] + box[3]) / 2]);
   }
 
   key(event) {
-    if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest?.("input, select, textarea, dialog")) return;
+    if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest?.("input:not([type=range], [type=checkbox]), select, textarea, dialog")) return;
     if (this.opened?.key?.(event)) return event.preventDefault();
-    const number = Number(event.key);
-    if (number >= 1 && number <= PANELS.length) this.open(PANELS[number - 1][0], true);
-    else if (event.key === "Escape") this.data.choose(null);
+    const name = Object.keys(ROOMS)[Number(event.key) - 1];
+    if (name) this.open(name, true);
+    else if (event.key === "Escape") {
+      if (this.data.chosen) this.data.choose(null);
+      else if (this.shown in TOOLS) this.open(this.room);
+      else if (this.data.filters !== ALL) this.data.filter(ALL);
+    }
   }
 
   close() {
@@ -242,7 +330,7 @@ class SiteScreen {
     this.video.close();
     for (const end of this.ends) end();
     removeEventListener("keydown", this.onKey);
-    document.body.classList.remove("folded");
+    delete document.body.dataset.panel;
     this.view?.close();
   }
 }

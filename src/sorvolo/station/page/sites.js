@@ -1,38 +1,87 @@
-// The list of sites, and the first-run page where there is none.
+// The start page: drones that send, with one button each; the sites; flights dropped on the page.
 
 import { ask, get, siteUrl } from "./api.js";
 import { button, dialog, el, field, fill, report } from "./dom.js";
+import { DroneVideo } from "./video.js";
 import * as words from "./words.js";
 import { choices } from "./choices.js";
 
 const PREVIEW_SHAPE = 1.6; // width over height
+const LOOK_MS = 5000;
+const HEARD = ["run.started", "run.finished", "run.failed", "site.changed", "site.gone", "stream.state"];
 
-/** Show the sites; keeps the list fresh while missions run. */
-export async function showSites(main, title, station) {
+/** Show drones and sites; keeps both fresh. */
+export async function showSites({ main, title }, station) {
   fill(title, el("h1", { class: "sr" }, "Sites"));
   document.title = "Sorvolo station";
+  const videos = new Map();
+  let shown = "";
+  const drones = el("section", { class: "drones", "aria-label": "Drones" });
+  const below = el("div", {});
   const load = async () => {
-    const sites = await get("/api/sites");
-    fill(main, sites.length ? list(sites, station) : firstRun(station));
+    const [sites, streams] = await Promise.all([get("/api/sites"), get("/api/streams")]);
+    const on = streams.filter((each) => each.is_connected);
+    for (const [name, video] of videos) {
+      if (on.some((each) => each.stream === name)) continue;
+      video.close();
+      videos.delete(name);
+    }
+    for (const { stream } of on) if (!videos.has(stream)) videos.set(stream, new DroneVideo(stream));
+    const state = JSON.stringify([sites, on.map(({ stream, telemetry }) => [stream, siteAt(sites, telemetry)?.id, Boolean(telemetry)]), choices.all]);
+    if (state === shown) return; // what a person is about to press stays under the finger
+    shown = state;
+    fill(drones, on.map((each) => droneCard(each, videos.get(each.stream), sites, station)));
+    fill(below, sites.length ? list(sites, station) : on.length ? null : firstRun(station));
   };
+  fill(main, el("div", { class: "sites" }, drones, below));
   await load();
   const again = () => load().catch(() => {});
-  const types = ["run.started", "run.finished", "run.failed", "site.changed", "site.gone"];
-  for (const type of types) station.events.addEventListener(type, again);
+  for (const type of HEARD) station.events.addEventListener(type, again);
   choices.addEventListener("change", again);
+  const timer = setInterval(again, LOOK_MS); // where a drone is becomes known as it flies
   return {
     close() {
-      for (const type of types) station.events.removeEventListener(type, again);
+      clearInterval(timer);
+      for (const type of HEARD) station.events.removeEventListener(type, again);
       choices.removeEventListener("change", again);
+      for (const each of videos.values()) each.close();
     },
   };
 }
 
+/** The site over whose ground a drone flies. */
+function siteAt(sites, telemetry) {
+  const { latitude_deg: lat, longitude_deg: lon } = telemetry ?? {};
+  return sites.find(({ bounds_wgs84: box }) => box && lon >= box[0] && lon <= box[2] && lat >= box[1] && lat <= box[3]);
+}
+
+/** A drone with its moving picture, and the next act: to map what it flies over and look for people. */
+function droneCard({ stream, telemetry }, video, sites, station) {
+  const { latitude_deg: lat, longitude_deg: lon } = telemetry ?? {};
+  const here = siteAt(sites, telemetry);
+  const site = here?.id ?? `${stream} ${new Date().toISOString().slice(0, 10)}`;
+  const fault = el("p", { class: "error", role: "alert" });
+  const start = async (event) => {
+    const pressed = event.currentTarget;
+    pressed.disabled = true;
+    try {
+      await (await import("./missions.js")).mapAndFind(stream, site, Boolean(here?.versions));
+      location.hash = `#/site/${encodeURIComponent(site)}/live`;
+    } catch (problem) {
+      fill(fault, `${problem.title}. ${problem.detail}`);
+      pressed.disabled = false;
+    }
+  };
+  const may = station.status.role === "operate";
+  return el("article", { class: "card drone" }, video.pane, el("p", {}, "Sends now", lat === undefined || lat === null ? "" : ` at ${words.place([lon, lat])}`, here ? `, over ${siteName(here)}` : ""),
+    may ? button("Map and find people", start, { class: "main" }) : el("p", { class: "note" }, "View only. Ask the team lead for operator access."),
+    here ? el("p", {}, el("a", { href: `#/site/${encodeURIComponent(here.id)}` }, `Look at ${siteName(here)}`)) : null, fault);
+}
+
 function list(sites, station) {
-  return el("div", { class: "sites" },
-    el("h2", {}, "Sites"),
+  return [el("h2", {}, "Sites"),
     el("ul", { class: "cards" }, sites.map((site) => card(site, station.status.role === "operate"))),
-    station.status.role === "operate" ? newSite() : null);
+    station.status.role === "operate" ? newSite() : null];
 }
 
 function card(site, may) {
@@ -48,7 +97,7 @@ function card(site, may) {
       el("h3", {}, siteName(site))),
     el("p", {}, words.counted(site.flights, "flight"), " · ", words.counted(site.versions, "version")),
     el("p", { class: "soft" }, where, site.updated_at ? ` · ${words.time(site.updated_at)}` : ""),
-    remove);
+    remove ? el("details", { class: "more" }, el("summary", { "aria-label": `More of ${site.id}` }, "⋯"), remove) : null);
 }
 
 /** State what would be lost with a site, and delete it when its id is typed (two may have one name); or why it cannot be deleted now. */
@@ -98,11 +147,12 @@ function preview(site) {
 }
 
 function newSite() {
-  const name = el("input", { required: true, maxlength: 80, pattern: "[A-Za-z0-9][A-Za-z0-9 ._\\-]*", placeholder: "my-field" });
+  const name = el("input", { required: true, maxlength: 80, placeholder: "My field" });
   name.setAttribute("aria-label", "Name of a new site");
   return el("form", { class: "row new-site", on: { submit: (event) => {
     event.preventDefault();
-    location.hash = `#/site/${encodeURIComponent(name.value.trim())}/missions`;
+    const id = name.value.trim().replaceAll(/[/\\:]+/g, "-"); // a site is a folder
+    location.hash = `#/site/${encodeURIComponent(id)}/live`;
   } } }, name, el("button", {}, "New site"));
 }
 
@@ -117,7 +167,7 @@ function firstRun(station) {
         el("p", { class: "soft" }, "The site appears here when it is done.")),
       el("li", {}, el("h3", {}, "Map a flight of yours"),
         el("p", {}, "Name the site, then upload a video with its telemetry, or a folder of photos."),
-        station.status.role === "operate" ? newSite() : el("p", { class: "soft" }, "Your token may look, not start missions.")),
+        station.status.role === "operate" ? newSite() : el("p", { class: "soft" }, "View only. Ask the team lead for operator access.")),
       el("li", {}, el("h3", {}, "Let the drone stream"),
         el("p", {}, "On its companion computer, or to replay a recorded flight:"),
         el("pre", { tabindex: 0 }, el("code", {}, `sorvolo stream FLIGHT.MP4 --to ${location.origin}`)))));

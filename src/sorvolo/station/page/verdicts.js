@@ -1,5 +1,6 @@
 // A person's vote on an object or a change: confirm, reject, not sure, note; votes that differ are shown as disputed, none is overwritten.
 
+import { get, siteUrl } from "./api.js";
 import { button, el, fill } from "./dom.js";
 import { isChange } from "./site_data.js";
 import { votes } from "./votes.js";
@@ -26,7 +27,9 @@ export function verdictLine(feature) {
 export function verdictForm(screen, feature, { keys = false, given = null } = {}) {
   const may = screen.station.status.role !== "view";
   const line = el("div", {}, verdictLine(feature));
-  if (!may) return el("div", {}, line, el("p", { class: "note" }, "Your token may look, not review."));
+  const others = el("ul", { class: "plain votes", "aria-label": "Votes" });
+  showVotes(screen, feature, others);
+  if (!may) return el("div", {}, line, others, el("p", { class: "note" }, "View only. Ask the team lead for reviewer access."));
   const note = el("input", { type: "text", maxlength: 2000, placeholder: "Note", "aria-label": "Note", ".value": feature.properties.note ?? "" });
   const current = feature.properties.review;
   const give = (verdict) => {
@@ -40,11 +43,20 @@ export function verdictForm(screen, feature, { keys = false, given = null } = {}
   });
   const press = (verdict) => (given ? given(verdict, note.value.trim()) : give(verdict));
   const hint = (key) => (keys ? el("kbd", { "aria-hidden": true }, key) : null);
-  return el("div", { class: "verdict-form" }, line,
+  return el("div", { class: "verdict-form" }, line, others,
     el("div", { class: "row" },
       el("button", { type: "button", class: "confirm", "aria-pressed": String(current === "confirmed"), on: { click: () => press("confirmed") } }, "Confirm", hint("C")),
       el("button", { type: "button", class: "reject", "aria-pressed": String(current === "rejected"), on: { click: () => press("rejected") } }, "Reject", hint("R")),
       el("button", { type: "button", class: "quiet", "aria-pressed": String(current === "unsure"), on: { click: () => press("unsure") } }, "Not sure"),
       current ? el("button", { type: "button", class: "quiet", on: { click: () => press("none") } }, "Withdraw", hint("U")) : null),
     el("div", { class: "row" }, note, button("Save note", () => give(null), { class: "quiet" })));
+}
+
+/** Each person's last vote, where several people voted. */
+async function showVotes(screen, feature, list) {
+  if (!feature.properties.review && !feature.properties.reviewer) return;
+  const query = new URLSearchParams({ kind: isChange(feature) ? "change" : "object", id: feature.id });
+  const given = await get(`${siteUrl(screen.data.id, "reviews")}?${query}`).catch(() => []);
+  const last = [...new Map(given.reverse().map((each) => [each.who, each])).values()].filter(({ verdict }) => verdict !== "none");
+  if (last.length > 1) fill(list, last.map(({ who, verdict, at }) => el("li", {}, el("b", {}, who), `: ${verdict}, ${words.time(at)}`)));
 }

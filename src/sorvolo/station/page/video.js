@@ -5,7 +5,9 @@ import { choices } from "./choices.js";
 import { button, el, fill, tick } from "./dom.js";
 import { CLASSES, OTHER_CLASS } from "./map_style.js";
 import { PictureMotion } from "./picture_motion.js";
-import { number, percent } from "./words.js";
+import * as words from "./words.js";
+
+const { number, percent } = words;
 
 const BOXES_WITHIN_US = 250000; // boxes further from a picture than this were not seen in it
 const KEPT_BOXES = 300;
@@ -18,75 +20,113 @@ const STATE_MS = 1000;
 const QUIET_S = 3; // without a picture of a drone that sends: stated
 const DEAD_S = 10; // the connection looks open and is dead, as after a sleep: made anew
 
-/** The pane over the map; it appears when a stream is on. `jump(view)` plays a recorded flight at a second. */
-export function videoPane(screen) {
-  return new VideoPane(screen);
+const NEAR_DEG = 0.02; // of a site's ground: a drone there is shown with it
+
+/** The videos beside a site's map: one for each drone that flies there. `play(view)` shows a recorded flight at a second. */
+export function videoWall(screen) {
+  return new VideoWall(screen);
 }
 
-class VideoPane {
+class VideoWall {
   constructor(screen) {
-    Object.assign(this, { screen, boxes: [], motion: new PictureMotion(), stream: null, socket: null, late_s: 0 });
+    Object.assign(this, { screen, panes: new Map(), closed: new Set() });
+    this.opener = button("Video", () => { this.closed.clear(); this.look(); }, { class: "video-open", icon: "video" });
+    this.opener.hidden = true;
+    screen.stage.append(this.opener);
+    const heard = ({ detail: { data } }) => {
+      if (data.is_connected) this.look();
+      else {
+        this.panes.get(data.stream)?.off(data.flights?.at(-1)?.is_over ? "ended" : "no signal");
+        screen.live.drones.delete(data.stream);
+        screen.live.drawSoon();
+      }
+    };
+    screen.station.events.addEventListener("stream.state", heard);
+    this.end = () => screen.station.events.removeEventListener("stream.state", heard);
+    this.look();
+  }
+
+  /** Which drones fly here? */
+  async look() {
+    let streams;
+    try {
+      streams = await get("/api/streams");
+    } catch { return; } // the connection's own sign shows it
+    if (this.screen.closed) return;
+    for (const each of streams) if (each.is_connected && this.isHere(each) && !this.panes.has(each.stream) && !this.closed.has(each.stream)) this.open(each.stream);
+    this.opener.hidden = !streams.some((each) => each.is_connected && this.closed.has(each.stream));
+  }
+
+  /** Whether a mission of the site follows a drone, or it flies there, or nobody knows where it is. */
+  isHere({ stream, telemetry }) {
+    const { runs, data: { detail: { bounds_wgs84: bounds } } } = this.screen;
+    if (runs.some((each) => each.state === "running" && each.input?.stream === stream)) return true;
+    const { latitude_deg: lat, longitude_deg: lon } = telemetry ?? {};
+    if (lat === undefined || lat === null || !bounds) return true;
+    return lon > bounds[0] - NEAR_DEG && lon < bounds[2] + NEAR_DEG && lat > bounds[1] - NEAR_DEG && lat < bounds[3] + NEAR_DEG;
+  }
+
+  open(stream) {
+    const pane = new DroneVideo(stream, { heard: (telemetry) => this.screen.live.heard(stream, telemetry), leave: () => this.leave(stream) });
+    this.panes.set(stream, pane);
+    pane.pane.querySelector("header").prepend(el("button", { type: "button", class: "quiet", "aria-label": "Larger or smaller", on: { click: () => { this.screen.wall.classList.toggle("large"); this.screen.view?.map.resize(); } } }, "⤢"));
+    this.screen.wall.append(pane.pane);
+    this.fit();
+  }
+
+  leave(stream) {
+    this.closed.add(stream);
+    this.panes.get(stream)?.close();
+    this.panes.delete(stream);
+    this.opener.hidden = false;
+    this.fit();
+  }
+
+  /** The map has the room that the videos leave. */
+  fit() {
+    this.screen.wall.hidden = !this.panes.size;
+    this.screen.view?.map.resize();
+  }
+
+  /** Play the recorded flight of a place's view. */
+  play(view) {
+    if (!view.video_url) return;
+    const name = view.flight;
+    this.panes.get(name)?.close();
+    const player = el("video", { src: view.video_url, controls: true, playsinline: true, ".muted": true });
+    player.addEventListener("loadedmetadata", () => { player.currentTime = view.video_s; player.play().catch(() => {}); }, { once: true });
+    const pane = el("aside", { class: "video", "aria-label": `Recording of ${name}` }, el("header", {}, el("b", {}, name), el("span", { class: "delay" }, "recorded"),
+      el("button", { type: "button", class: "quiet", "aria-label": "Close the video", on: { click: () => { this.panes.get(name).close(); this.panes.delete(name); this.fit(); } } }, "×")), el("div", { class: "picture" }, player));
+    this.panes.set(name, { close: () => pane.remove(), off() {} });
+    this.screen.wall.append(pane);
+    this.fit();
+  }
+
+  close() {
+    this.end();
+    for (const each of this.panes.values()) each.close();
+  }
+}
+
+/** A drone's moving picture with what is detected in it: `pane` is its element; `heard(telemetry)` gets what it states. */
+export class DroneVideo {
+  constructor(stream, { heard = () => {}, leave = null } = {}) {
+    Object.assign(this, { stream, told: heard, boxes: [], motion: new PictureMotion(), socket: null, late_s: 0 });
     this.canvas = el("canvas", { width: 640, height: 360 });
     this.overlay = el("canvas", { class: "boxes", width: 640, height: 360, "aria-hidden": true });
     this.player = el("video", { ".muted": true, playsinline: true, hidden: true });
     this.delay = el("span", { class: "delay" });
-    this.name = el("b", {}, "Video");
-    this.picture = el("div", { class: "picture" }, this.canvas, this.player, this.overlay);
-    this.pane = el("aside", { class: "video", hidden: true, "aria-label": "Live video" },
-      el("header", {}, this.name, this.delay, el("button", { type: "button", class: "quiet", "aria-label": "Larger or smaller", on: { click: () => this.pane.classList.toggle("large") } }, "⤢"),
-        el("button", { type: "button", class: "quiet", "aria-label": "Close the video", on: { click: () => this.leave() } }, "×")),
-      this.picture, el("footer", {}, tick("hold for boxes", choices.get("holdForBoxes"), (on) => choices.set("holdForBoxes", on), { title: "Show each picture when its boxes are known" }), this.seen = el("span", { class: "soft" })));
-    this.opener = button("Video", () => this.open(), { class: "video-open", icon: "video" });
-    this.opener.hidden = true;
-    screen.stage.append(this.pane, this.opener);
-    const hear = (type, listener) => {
-      screen.station.events.addEventListener(type, listener);
-      return () => screen.station.events.removeEventListener(type, listener);
-    };
-    this.ends = [hear("stream.state", ({ detail }) => this.heard(detail))];
-    this.look();
-  }
-
-  /** Is a stream on? */
-  async look() {
-    try {
-      const list = await get("/api/streams");
-      const on = list.find((each) => each.is_connected) ?? null;
-      if (on) this.offer(on.stream);
-    } catch { /* the connection's own sign shows it */ }
-  }
-
-  heard({ data }) {
-    if (data.is_connected) this.offer(data.stream);
-    else if (data.stream === this.stream) this.off(data.flights?.at(-1)?.is_over ? "ended" : "no signal");
+    this.pane = el("aside", { class: "video", "aria-label": `Live video of ${stream}` },
+      el("header", {}, el("b", {}, stream), this.delay, leave ? el("button", { type: "button", class: "quiet", "aria-label": "Close the video", on: { click: leave } }, "×") : null),
+      el("div", { class: "picture" }, this.canvas, this.player, this.overlay),
+      el("footer", {}, tick("Sync video to detections", choices.get("holdForBoxes"), (on) => choices.set("holdForBoxes", on), { title: "Show each picture when its boxes are known" }), this.seen = el("span", { class: "soft" })));
+    this.connect();
   }
 
   /** No pictures come, and why. */
   off(why) {
     this.isOff = true;
     fill(this.delay, why);
-  }
-
-  offer(name) {
-    if (this.stream === name && !this.pane.hidden) return;
-    this.stream = name;
-    this.opener.hidden = false;
-    if (!this.wasClosed) this.open();
-  }
-
-  open() {
-    this.wasClosed = false;
-    this.pane.hidden = false;
-    this.opener.hidden = true;
-    fill(this.name, this.stream);
-    this.connect();
-  }
-
-  leave() {
-    this.wasClosed = true;
-    this.drop();
-    this.pane.hidden = true;
-    this.opener.hidden = !this.stream;
   }
 
   connect() {
@@ -120,7 +160,7 @@ class VideoPane {
       const state = await get(`/api/streams/${encodeURIComponent(this.stream)}`);
       this.ahead_us = (asked_us + Date.now() * 1000) / 2 - state.time_us;
       if (state.is_connected) {
-        this.screen.live.heard(state.telemetry);
+        this.told(state.telemetry);
         if (quiet_s > DEAD_S && this.cameAlive) this.connect();
       } else if (state.flights.at(-1)?.is_over) this.off("ended");
     } catch { /* the connection's own sign shows it */ }
@@ -172,7 +212,7 @@ class VideoPane {
     const whole_s = this.epoch_us !== undefined && this.ahead_us !== undefined ? (Date.now() * 1000 - this.ahead_us - this.epoch_us - pts_us) / 1e6 : null;
     // a picture that left the drone after it came here: the two clocks disagree
     const behind_s = whole_s === null || whole_s < (here_s ?? 0) - CLOCKS_AGREE_S ? here_s : whole_s;
-    if (behind_s !== null) fill(this.delay, `${number(Math.max(0, behind_s), 2)} s behind`);
+    if (behind_s !== null) fill(this.delay, `${number(Math.max(0, behind_s), 2)} s delay`);
   }
 
   drawBoxes(pts_us) {
@@ -195,7 +235,7 @@ class VideoPane {
       if (boxes.length && !oldest) oldest = { isOwn, carried, ago_s: (pts_us - look.pts_us) / 1e6 };
       count += boxes.length;
     }
-    fill(this.seen, count ? `${count} in the picture${oldest.isOwn ? "" : `, ${oldest.carried ? "dashed" : "faint"}: seen ${number(oldest.ago_s, 1)} s ago`}` : "");
+    fill(this.seen, count ? `${words.counted(count, "detection")}${oldest.isOwn ? "" : `, ${oldest.carried ? "dashed" : "faint"}: seen ${number(oldest.ago_s, 1)} s ago`}` : "");
   }
 
   /** The looks that show most of a picture, the older first: the nearest whole one, and where cars of a later one are known already, those. */
@@ -212,24 +252,6 @@ class VideoPane {
     return whole ? [{ ...whole, boxes: whole.boxes.filter((box) => !best.classes.includes(box.class)) }, best] : [best];
   }
 
-  /** Play the recorded flight of a place's view. */
-  jump(view) {
-    const url = view.video_url;
-    this.drop();
-    this.pane.hidden = false;
-    fill(this.name, view.flight);
-    if (!url) {
-      fill(this.delay, `second ${number(view.video_s, 1)} of ${view.flight}`);
-      return;
-    }
-    this.canvas.hidden = true;
-    this.player.hidden = false;
-    this.player.controls = true;
-    this.player.src = url;
-    this.player.addEventListener("loadedmetadata", () => { this.player.currentTime = view.video_s; this.player.play().catch(() => {}); }, { once: true });
-    fill(this.delay, "recorded");
-  }
-
   drop() {
     clearTimeout(this.timer);
     clearInterval(this.poll);
@@ -243,8 +265,8 @@ class VideoPane {
   }
 
   close() {
-    for (const end of this.ends) end();
     this.drop();
+    this.pane.remove();
   }
 }
 

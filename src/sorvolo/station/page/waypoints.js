@@ -1,21 +1,24 @@
 // Waypoints over ground that deserves another look: holes of a measured search, ground that no comparison reached.
 
-import { area_m2, metresOfDegree } from "./places.js";
+import { area_m2, distance_m, metresOfDegree } from "./places.js";
 
 const LEAST_M2 = 20; // smaller holes are not worth a flight
 const FEWEST_M = 25; // between waypoints: about the width of a frame's ground from 30 m
 const MOST = 60;
 
-/** Waypoints as features, the largest holes first; strips of points where a hole is wider than a frame. */
+/** Waypoints as features, a route from the largest hole on; strips of points where a hole is wider than a frame. */
 export function waypointsFor(data) {
-  const holes = [
-    ...data.all.pod.filter((each) => each.properties.kind === "hole"),
-    ...data.all.coverage.filter((each) => each.properties.status === "hole"),
-    ...data.all.coverage.filter((each) => each.properties.status === "not-compared" && ["view-rejected", "one-view", "blurred"].includes(each.properties.gap)),
-  ];
+  const searched = data.all.pod.filter((each) => each.properties.kind === "hole"); // it knows better than flights where nobody looked
+  const holes = data.all.pod.length ? searched : data.all.coverage.filter(({ properties: { status, gap } }) => status === "hole" || (status === "not-compared" && ["view-rejected", "one-view", "blurred"].includes(gap)));
   const rings = holes.flatMap((each) => (each.geometry.type === "MultiPolygon" ? each.geometry.coordinates : [each.geometry.coordinates]).map((rings_) => rings_[0]));
   const large = rings.map((ring) => [ring, area_m2(ring.slice(0, -1))]).filter(([, m2]) => m2 >= LEAST_M2).sort((one, other) => other[1] - one[1]);
-  return large.flatMap(([ring]) => pointsOver(ring)).slice(0, MOST).map((coordinates, k) => ({
+  const waiting = large.flatMap(([ring]) => pointsOver(ring)).slice(0, MOST);
+  const route = waiting.splice(0, 1);
+  while (waiting.length) { // one route: always on to the nearest
+    const nearest = waiting.reduce((best, each, k) => (distance_m(route.at(-1), each) < distance_m(route.at(-1), waiting[best]) ? k : best), 0);
+    route.push(...waiting.splice(nearest, 1));
+  }
+  return route.map((coordinates, k) => ({
     type: "Feature", id: `planned-${k + 1}`, geometry: { type: "Point", coordinates }, properties: { purpose: "waypoint", planned: true, name: `W${k + 1}` },
   }));
 }

@@ -86,18 +86,27 @@ export function day(iso) {
 
 const metres = (value, digits) => String(Math.round(value)).padStart(digits, "0");
 
-/** A place as the user wants it: degrees, UTM or MGRS. */
-export function place([lon, lat], { local = false } = {}) {
-  if (local) return "no place on Earth (a site without GPS)";
-  const kind = choices.get("coordinates");
-  const degrees = `${lat.toFixed(6)}, ${lon.toFixed(6)}`;
-  if (kind === "mgrs") return mgrs(lon, lat) ?? degrees;
-  if (kind === "utm") {
-    const found = utm(lon, lat);
-    return found ? `${found.zone}${found.band} ${metres(found.east_m, 6)} ${metres(found.north_m, 7)}` : degrees;
-  }
-  return degrees;
+/** Degrees, minutes and seconds to a third of a metre. */
+function sexagesimal([lon, lat]) {
+  const part = (value, [plus, minus]) => {
+    const hundredths = Math.round(Math.abs(value) * 360000);
+    const seconds = (hundredths % 6000) / 100;
+    return `${Math.floor(hundredths / 360000)}°${String(Math.floor(hundredths / 6000) % 60).padStart(2, "0")}'${seconds.toFixed(2).padStart(5, "0")}"${value < 0 ? minus : plus}`;
+  };
+  return `${part(lat, "NS")} ${part(lon, "EW")}`;
 }
+
+/** A place [lon, lat] in one system: "latlon", "dms", "utm" or "mgrs"; beyond the last two's ends in degrees. */
+export function placeIn(kind, [lon, lat]) {
+  const degrees = `${lat.toFixed(6)}, ${lon.toFixed(6)}`;
+  if (kind === "dms") return sexagesimal([lon, lat]);
+  if (kind === "mgrs") return mgrs(lon, lat) ?? degrees;
+  const found = kind === "utm" && utm(lon, lat);
+  return found ? `${found.zone}${found.band} ${metres(found.east_m, 6)} ${metres(found.north_m, 7)}` : degrees;
+}
+
+/** A place as the user wants it. */
+export const place = (at, { local = false } = {}) => (local ? "no place on Earth (a site without GPS)" : placeIn(choices.get("coordinates"), at));
 
 /** "1 person", "4 people". */
 export function counted(count, one, many = `${one}s`) {

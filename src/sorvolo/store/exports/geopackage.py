@@ -1,6 +1,7 @@
 """Layers of features as a GeoPackage (OGC 12-128r19): one SQLite file that QGIS and others open."""
 
 import json
+import re
 import sqlite3
 import struct
 from collections.abc import Mapping, Sequence
@@ -20,6 +21,7 @@ from sorvolo.store.atomic import atomic_path
 
 Feature = Mapping[str, Any]
 
+_TIME = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d{1,6})?(Z|[+-]\d\d:\d\d)")
 _APPLICATION = 0x47504B47  # "GPKG"
 _VERSION = 10300  # GeoPackage 1.3.0, as its requirement 2 writes it
 _WGS84 = 4326
@@ -91,7 +93,10 @@ def _write_layer(file: sqlite3.Connection, name: str, features: Sequence[Feature
     file.executemany(
         f"INSERT INTO {_quoted(name)} ({names}) VALUES ({marks})",
         [
-            (_blob(geometry), *(_plain(each["properties"].get(column)) for column in columns))
+            (
+                _blob(geometry),
+                *(_plain(each["properties"].get(name), sql) for name, sql in columns.items()),
+            )
             for geometry, each in zip(shapes, features, strict=True)
         ],
     )
@@ -147,7 +152,17 @@ def _columns(features: Sequence[Feature]) -> dict[str, str]:
 def _sql_type(value: object) -> str:
     if isinstance(value, bool):
         return "BOOLEAN"
+    if isinstance(value, str):
+        return "TEXT" if _moment(value) is None else "DATETIME"
     return "INTEGER" if isinstance(value, int) else "REAL" if isinstance(value, float) else "TEXT"
+
+
+def _moment(text: str) -> str | None:
+    """A time of RFC 3339 as GeoPackages write one, in UTC to the millisecond; None for other text."""
+    if not _TIME.fullmatch(text):
+        return None
+    moment = datetime.fromisoformat(text).astimezone(UTC)
+    return moment.strftime("%Y-%m-%dT%H:%M:%S.") + f"{moment.microsecond // 1000:03d}Z"
 
 
 def _common_type(kinds: set[str]) -> str:
@@ -156,7 +171,9 @@ def _common_type(kinds: set[str]) -> str:
     return "REAL" if kinds == {"INTEGER", "REAL"} else "TEXT"
 
 
-def _plain(value: object) -> object:
+def _plain(value: object, sql: str) -> object:
+    if sql == "DATETIME" and isinstance(value, str):
+        return _moment(value)
     return json.dumps(value) if isinstance(value, list | dict | tuple) else value
 
 

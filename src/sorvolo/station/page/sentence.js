@@ -1,0 +1,76 @@
+// The line above every room: what is known, as a result. It never states that nobody is there.
+
+import { area_m2 } from "./places.js";
+import { counted, day, duration, percent } from "./words.js";
+
+const ACTS = { map: "Mapping", compare: "Comparing", watch: "Looking for people and vehicles", search: "Measuring the search" };
+const BAD_ENDS = { failed: "The last mission failed", incomplete: "The last mission is incomplete", lost: "The last mission broke off", stopped: "The last mission was stopped" };
+
+/** A polygon's area without its holes, m2. */
+function polygonArea_m2([outer, ...inner]) {
+  return inner.reduce((sum, each) => sum - area_m2(each), area_m2(outer));
+}
+
+const featureArea_m2 = ({ geometry: { type, coordinates } }) => (type === "MultiPolygon" ? coordinates : [coordinates]).reduce((sum, each) => sum + polygonArea_m2(each), 0);
+
+/** How much of the ground of a measured search was looked at (a share), and with which chance somebody on all of it would
+ * have been seen: null without a measured search. */
+export function lookedAt(pod) {
+  const seen = pod.filter(({ properties: { kind } }) => kind === "pod");
+  const sum = (list, weight) => list.reduce((total, each) => total + featureArea_m2(each) * weight(each.properties), 0);
+  const seen_m2 = sum(seen, () => 1);
+  const whole_m2 = seen_m2 + sum(pod.filter(({ properties: { reason } }) => reason === "not seen"), () => 1);
+  if (!(whole_m2 > 0)) return null;
+  return { share: seen_m2 / whole_m2, from: sum(seen, (each) => each.pod_from) / whole_m2, to: sum(seen, (each) => each.pod_to) / whole_m2 };
+}
+
+/**
+ * The parts of the sentence: {words, act, kind}. `link` is "live", "waiting" or "lost"; `loaded` "yes", "no" or "failed";
+ * `runs` the site's missions, newest first; objects, changes and pod are ALL features, whatever a filter hides.
+ */
+export function sentence({ link, loaded, runs, objects, changes, pod, versions, votes = 0, isLow = false, now = Date.now() }) {
+  const parts = [];
+  const say = (words, act = null, kind = "") => parts.push({ words, act, kind });
+  if (link !== "live") say(link === "lost" ? "No connection: this may be old" : "Connecting: this may be old", null, "warning");
+  if (votes) say(`${counted(votes, "verdict")} ${votes === 1 ? "waits" : "wait"} to be sent`, null, "warning");
+  if (isLow) say("The disk is nearly full", null, "warning");
+  if (loaded !== "yes") {
+    say(loaded === "failed" ? "What is known here could not be loaded" : "Loading what is known", null, loaded === "failed" ? "warning" : "");
+    return parts;
+  }
+  const running = runs.filter(({ state }) => state === "running");
+  for (const run of running) {
+    const isFlying = Boolean(run.input?.stream || run.input?.stream_url) && !run.progress?.landed;
+    say(run.progress?.landed ? "Landed, searching the rest" : `${isFlying ? "Flying" : ACTS[run.mission]} ${duration((now - new Date(run.started_at)) / 1000)}`, "live");
+  }
+  if (!running.length) {
+    const newest = versions.at(-1);
+    say(newest ? `Map of ${day(newest.flown_at ?? newest.made_at)}` : "No map yet", "live");
+    const ending = BAD_ENDS[runs[0]?.state];
+    if (ending) say(ending, "live", "warning");
+  }
+  say(...found(objects, pod, running, runs));
+  const looked = lookedAt(pod);
+  say(looked ? `${percent(looked.share)} of the ground looked at (a person on it: ${percent(looked.from)}–${percent(looked.to)})` : "how much was looked at is not measured", "coverage");
+  const open = [...objects, ...changes].filter(({ properties }) => !properties.review && !properties.gone).length;
+  if (changes.length) say(counted(changes.length, "change"), "compare");
+  if (open) say(`${open} to review`, "review");
+  return parts;
+}
+
+/** People first, then all else; where there is no person, why that says little. */
+function found(objects, pod, running, runs) {
+  const there = objects.filter(({ properties: { review, gone } }) => review !== "rejected" && !gone);
+  const number = (name) => there.filter(({ properties }) => properties.class === name).length;
+  const [people, cars] = [number("person"), number("car")];
+  const others = there.length - people - cars;
+  const more = [cars ? counted(cars, "car") : null, others ? `${counted(others, "other object")}` : null].filter(Boolean);
+  if (people) return [[counted(people, "person", "people"), ...more].join(", "), "review", "found"];
+  const seen = (property) => objects.filter(({ properties }) => properties.class === "person" && property(properties)).length;
+  const [rejected, gone] = [seen(({ review }) => review === "rejected"), seen(({ gone: isGone, review }) => isGone && review !== "rejected")];
+  const wasLooked = pod.length || runs.some(({ mission, state }) => ["watch", "search"].includes(mission) && state === "finished");
+  const why = rejected || gone
+    ? [gone ? `${counted(gone, "person", "people")} on an earlier date only` : null, rejected ? `${counted(rejected, "person", "people")} found and rejected in review` : null].filter(Boolean).join(", ")
+    : running.length ? "no person found so far" : wasLooked ? "no person found in what was looked at" : "no search for people is on record";
+  return [[...more, why].join(", "), "review"];
+}

@@ -1,0 +1,57 @@
+// Places handed on: every way to write one, a link, what the device can send by.
+
+import { button, el, fill } from "./dom.js";
+import { placeIn } from "./words.js";
+
+/** Copy text, also where the page is not secure and the browser has no clipboard for it. */
+export async function copy(text) {
+  try {
+    await navigator.clipboard.writeText(text);
+  } catch {
+    const box = el("textarea", { ".value": text, readonly: true });
+    (document.querySelector("dialog[open]") ?? document.body).append(box);
+    box.select();
+    document.execCommand("copy");
+    box.remove();
+  }
+}
+
+/** The page's address of a place on a site's map. */
+export function linkTo(site, [lon, lat]) {
+  return `${location.origin}/#/site/${encodeURIComponent(site)}/place?at=${lon.toFixed(7)},${lat.toFixed(7)}`;
+}
+
+/** What is sent of a place: what is there, where, how surely, a link. */
+function wordsOf(name, place, sigma_m, link) {
+  const lines = [name, ...["latlon", "mgrs", "utm"].map((kind) => placeIn(kind, place))];
+  if (sigma_m) lines.push(`to ${sigma_m.toFixed(1)} m (1 sigma)`);
+  return [...new Set(lines), `geo:${place[1].toFixed(6)},${place[0].toFixed(6)}`, link].join("\n");
+}
+
+/** Buttons that hand a place on; `name` says what is there. */
+export function handover(site, name, place, sigma_m = null) {
+  const link = linkTo(site, place);
+  const done = el("span", { class: "soft", role: "status" });
+  const give = async (what, text) => {
+    await copy(text);
+    fill(done, `${what} copied`);
+  };
+  const send = async () => {
+    const text = wordsOf(name, place, sigma_m, link);
+    if (navigator.share) {
+      try {
+        await navigator.share({ title: name, text });
+        return void fill(done, "Sent");
+      } catch (error) {
+        if (error.name === "AbortError") return;
+      }
+    }
+    await give("Place", text);
+  };
+  const systems = [["latlon", "Degrees"], ["dms", "Degrees, minutes, seconds"], ["utm", "UTM"], ["mgrs", "MGRS"]];
+  return el("div", { class: "handover" },
+    el("div", { class: "row" }, button("Send place", send, { class: "main", icon: "export" }), el("a", { class: "button", href: `geo:${place[1].toFixed(6)},${place[0].toFixed(6)}` }, "Navigate"), done),
+    el("details", {}, el("summary", {}, "Coordinates and link"), el("ul", { class: "plain" },
+      systems.map(([kind, words]) => [words, placeIn(kind, place)]).concat([["Link", link]]).map(([words, text]) =>
+        el("li", {}, button(text, () => give(words, text), { class: "link", title: `${words}: a tap copies it` }))))));
+}
