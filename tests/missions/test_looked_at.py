@@ -121,6 +121,17 @@ def test_a_headline_never_clears_ground_that_was_not_looked_at(
     assert headline["complete"] == ("no person" in text or "98 %" in text)
 
 
+def test_what_nobody_looks_for_in_coarse_pixels_is_too_coarse_and_not_skipped() -> None:
+    """Detectors look for no people where they cannot be seen; the ground was flown all the same."""
+    ground = _flown({})
+    for east_m in range(0, 400, 40):
+        ground.look(_frame(float(east_m)), 0.2, ["car"])
+    person = ground.of_classes()["person"]
+    assert person.skipped_m2 == 0 and person.coarse_m2 == pytest.approx(ground.flown_m2)
+    looked = looked_at(ground, 10, 10, excuses=True)
+    assert looked.is_enough and "too coarse for person" in looked.words()
+
+
 def test_a_map_answers_for_ground_it_skipped_and_for_classes_that_were_asked_for() -> None:
     coarse = _flown({40.0 * k: 0.2 for k in range(10)})
     assert not looked_at(coarse, 10, 10).is_enough

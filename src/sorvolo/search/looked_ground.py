@@ -66,11 +66,12 @@ class LookedGround:
         self._layers[0][at] |= inside
 
     def look(self, outline_m: PointsM, m_per_px: float, classes: Collection[str]) -> None:
-        """A frame of this ground was searched for these classes; a pixel of it covers `m_per_px`."""
+        """A frame of this ground was searched for these classes; a pixel of it covers `m_per_px`. What that is too coarse
+        for counts as too coarse, searched for or not."""
         at, inside = self._within(outline_m)
         self._layers[0][at] |= inside
         for row, (name, coarsest_m) in enumerate(self._coarsest_m.items()):
-            if name in classes:
+            if name in classes or m_per_px > coarsest_m:
                 self._layers[1 + 2 * row][at] |= inside
                 if m_per_px <= coarsest_m:
                     self._layers[2 + 2 * row][at] |= inside
