@@ -16,10 +16,11 @@ const featureArea_m2 = ({ geometry: { type, coordinates } }) => (type === "Multi
 /** How much of the ground of a measured search was looked at (a share), and with which chance somebody on all of it would
  * have been seen: null without a measured search. */
 export function lookedAt(pod) {
-  const seen = pod.filter(({ properties: { kind } }) => kind === "pod");
+  const ofPeople = pod.filter(({ properties }) => (properties.class ?? "person") === "person"); // a search may be for cars
+  const seen = ofPeople.filter(({ properties: { kind } }) => kind === "pod");
   const sum = (list, weight) => list.reduce((total, each) => total + featureArea_m2(each) * weight(each.properties), 0);
   const seen_m2 = sum(seen, () => 1);
-  const whole_m2 = seen_m2 + sum(pod.filter(({ properties: { reason } }) => reason === "not seen"), () => 1);
+  const whole_m2 = seen_m2 + sum(ofPeople.filter(({ properties: { reason } }) => reason === "not seen"), () => 1);
   if (!(whole_m2 > 0)) return null;
   return { share: seen_m2 / whole_m2, from: sum(seen, (each) => each.pod_from) / whole_m2, to: sum(seen, (each) => each.pod_to) / whole_m2 };
 }
@@ -68,7 +69,7 @@ function found(objects, pod, running, runs) {
   if (people) return [[counted(people, "person", "people"), ...more].join(", "), "review", "found"];
   const seen = (property) => objects.filter(({ properties }) => properties.class === "person" && property(properties)).length;
   const [rejected, gone] = [seen(({ review }) => review === "rejected"), seen(({ gone: isGone, review }) => isGone && review !== "rejected")];
-  const wasLooked = pod.length || runs.some(({ mission, state }) => ["watch", "search"].includes(mission) && state === "finished");
+  const wasLooked = lookedAt(pod) || runs.some(({ mission, state }) => ["watch", "search"].includes(mission) && state === "finished");
   const why = rejected || gone
     ? [gone ? `${counted(gone, "person", "people")} on an earlier date only` : null, rejected ? `${counted(rejected, "person", "people")} found and rejected in review` : null].filter(Boolean).join(", ")
     : running.length ? "no person found so far" : wasLooked ? "no person found in what was looked at" : "no search for people is on record";
