@@ -32,6 +32,7 @@ from sorvolo.missions.flight.map_objects import ObjectFinder, open_detector
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.flight.threads import made_at_low_priority
 from sorvolo.missions.map.flights import map_flights
+from sorvolo.missions.mission import flight_outcome
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.findings import Change, ChangeKind, Patch
 from sorvolo.survey.flight import CameraPrior, Frame, PosedFrame
@@ -149,7 +150,8 @@ def test_the_headline_counts_what_was_looked_at_and_people_are_events(
     assert (mapped / "flights/flight1/searched.geojson").is_file()
 
     lines = BytesIO()
-    worker._mapped(worker.Journal(lines), mapped, 0, [])
+    outcome = flight_outcome(mapped / "flights/flight1", report)
+    worker._mapped(worker.Journal(lines), mapped, [outcome])
     events = [json.loads(each) for each in lines.getvalue().splitlines()]
     people = [row for row in objects["list"] if row["class"] == "person"]
     assert [each["type"] for each in events] == [worker.PERSON_FOUND] * len(people) != []
