@@ -279,7 +279,7 @@ def test_what_cannot_be_measured_names_the_reason(site, simulated, tmp_path):
         (small, empty / "nosuch", "no such folder: .*nosuch; give the folder"),
         (small, other, "no mask in"),
         (small, simulated, "differ in size"),
-        (site, small, "--masks"),
+        (site, small, "writes_masks"),
     ):
         with pytest.raises(InputError, match=words):
             evaluate_changes(found, truth)
