@@ -101,6 +101,22 @@ def test_silence_is_no_absence() -> None:
     assert first.gone == "flight1" and len(first.sightings) == 2
 
 
+def test_looks_from_above_neither_miss_nor_bring_what_lies_under_trees() -> None:
+    hidden = sighting(1, "trees", 0.0, label="person", origin=KnownBy.UNDER_TREES)
+    register = associate([hidden], [look(0), look(1), look(2)])
+    assert len(register.present) == 1
+    assert between(register, "flight0", "flight1") == "nothing known came or left"
+    assert between(register, "flight1", "flight2") == "nothing known came or left"
+    seen = associate([hidden, sighting(2, "map", 0.2, label="person")], [look(day) for day in (2, 3)])
+    assert between(seen, "flight2", "flight3") == "1 person left"
+
+
+def test_a_look_in_no_frame_is_none() -> None:
+    unseen = SearchedDate("flight1", 1, SearchedFrames(np.zeros((0, 4, 2)), {}))
+    words = between(associate([sighting(0, "map", 0.0)], [look(0), unseen]), "flight0", "flight1")
+    assert words.endswith("no objects were searched for on flight1")
+
+
 def test_what_comes_after_it_was_gone_is_another() -> None:
     """A second car in the place of the first has an interval of its own."""
     seen = [sighting(0, "map", 0.0), sighting(2, "map", 0.2)]

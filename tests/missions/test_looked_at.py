@@ -137,6 +137,7 @@ def test_a_map_answers_for_ground_it_skipped_and_for_classes_that_were_asked_for
     assert not looked_at(coarse, 10, 10).is_enough
     assert looked_at(coarse, 10, 10, excuses=True).is_enough
     assert not looked_at(_flown({0.0: 0.05}), 1, 10, excuses=True).is_enough
+    assert not looked_at(_flown({0.0: 0.2, 40.0: 0.2}), 2, 10, excuses=True).is_enough
     for quality, found, good in (
         ("map", {"text": "", "complete": True}, True),
         ("compared", {"text": "", "complete": False}, False),

@@ -1,12 +1,14 @@
 """A mission that one holds: updates, one result, an end from any thread."""
 
+import math
 import threading
 from collections.abc import Generator
+from pathlib import Path
 
 import pytest
 
 from sorvolo.errors import SettingsError
-from sorvolo.missions.mission import mission
+from sorvolo.missions.mission import flight_outcome, mission
 
 
 class Counting:
@@ -59,3 +61,8 @@ def test_a_mission_is_cancelled_from_another_thread_after_its_step() -> None:
     gate.set()
     thread.join(10)
     assert seen == [0] and work.events == ["waits", "left"]
+
+
+def test_a_flight_whose_folder_was_taken_away_is_not_trusted(tmp_path: Path) -> None:
+    made = flight_outcome(tmp_path / "gone", {})
+    assert not made.trusted and not made.paths and math.isnan(made.residual_px)

@@ -65,6 +65,11 @@ def test_any_number_of_changes_makes_a_whole_page(count: int) -> None:
     assert len(page) < 2_000_000
 
 
+def test_small_things_far_apart_are_not_said_to_touch() -> None:
+    changes = [fake_change(k + 1, east_m=40.0 * k, size_m=0.5) for k in range(3)]
+    assert re.search(r"2 more changes listed with number \d<", page_of(changes))
+
+
 def test_the_page_needs_nothing_else() -> None:
     page = page_of([fake_change(1)])
     for address in checked(page).addresses:

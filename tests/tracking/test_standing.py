@@ -278,6 +278,25 @@ def test_a_car_that_sure_views_show_at_many_places_drives() -> None:
     assert car.moves and len(car.members) == 5
 
 
+def test_who_stands_is_not_lost_where_another_walks_by() -> None:
+    """Seen by two of seven frames; the walk goes through one of the two."""
+    laid = list[LaidSighting]()
+    frames = [placed(k, float(k), 0.0) for k in range(7)]
+    for number, frame in enumerate(frames):
+        people = [(5.0, 2.6, 0.98)] if number in (3, 5) else []
+        people += [(5.0 + 1.3 * (number - 5), 2.0, 0.6)] if number != 5 else []
+        boxes = [box_of(frame, "person", east_m, north_m, 90.0) for east_m, north_m, _ in people]
+        seen = Detections(
+            np.array(boxes),
+            np.array([score for *_, score in people]),
+            np.full(len(people), CLASSES.index("person")),
+            CLASSES,
+        )
+        laid += [each for each in lay_on_ground(seen, frame) if each is not None]
+    fused = fuse(laid, frames, {"person": 0.3})
+    assert sorted(each.moves for each in fused.objects) == [False, True] and fused.dropped == 0
+
+
 def test_a_walker_is_one_and_moves() -> None:
     """1.3 m/s along the strip: seen at many places, reported once, with its velocity and where it was last."""
     frames = survey()[:10]

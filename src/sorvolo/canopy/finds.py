@@ -132,7 +132,7 @@ def judge(
         for each in (split, ~split)
         if (each & shows).sum() >= LEAST_VIEWS // 3
     ]
-    weakest = min(share(_average(laid[each])) for each in halves)
+    weakest = min(share(average(laid[each])) for each in halves)
     if weakest < _HALF:
         return "not in each half of the views"
 
@@ -163,10 +163,10 @@ def _mean(
 ) -> tuple[Floats32, Numbers]:
     """(H, W, bands) the views' mean on a window at one height, and (N, H, W, bands) each of them."""
     laid = np.stack([lay(view, image, window, up_m) for view, image in zip(views, images)])
-    return _average(laid), laid
+    return average(laid), laid
 
 
-def _average(laid: Floats32) -> Floats32:
+def average(laid: Floats32) -> Floats32:
     """(H, W, bands) the mean of N, NaN where none shows anything."""
     with np.errstate(invalid="ignore"):
         return np.asarray(np.nansum(laid, axis=0) / np.isfinite(laid).sum(axis=0), np.float32)

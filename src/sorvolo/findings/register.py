@@ -37,6 +37,7 @@ class KnownBy(StrEnum):
     DETECTED = "detected"
     CHANGED = "changed"
     MARKED = "marked"
+    UNDER_TREES = "under trees"  # no look from above shows whether it is there
 
 
 class Presence(StrEnum):
@@ -179,7 +180,11 @@ def begun_and_ended(
 ) -> Iterator[tuple[ChangeKind, GroundFinding]]:
     """What came to be there, or left, between dates that both looked for it: appeared or disappeared."""
     searches = [each.frames for each in register.looks if each.date in before]
-    new = [each for each in register.findings if each.dates[0] == after]
+    new = [
+        each
+        for each in register.findings
+        if each.dates[0] == after and _is_in_the_open(each.sightings)
+    ]
     places_m = np.array([each.position_m for each in new]).reshape(-1, 2)
     was_looked_for = looked_at(places_m, [each.label for each in new], searches)
     for found, is_known in zip(new, was_looked_for):
@@ -191,6 +196,11 @@ def begun_and_ended(
     for found in register.findings:
         if found.gone == after and any(each in found.dates for each in before):
             yield ChangeKind.DISAPPEARED, found
+
+
+def _is_in_the_open(sightings: Sequence[MissionSighting]) -> bool:
+    """Whether a look from above can miss it; what only looks below crowns saw it cannot."""
+    return any(each.origin is not KnownBy.UNDER_TREES for each in sightings)
 
 
 def _order(each: MissionSighting | SearchedDate) -> tuple[float, str, str, int, str]:
@@ -294,7 +304,11 @@ class _Working:
                 self._stands[number] = False
         if outlines_m := [each.outlines_m.reshape(-1, 2) for each in searches]:
             near = self._standing_near(np.concatenate(outlines_m))
-            unseen = [number for number in near.tolist() if number not in self._seen]
+            unseen = [
+                number
+                for number in near.tolist()
+                if number not in self._seen and _is_in_the_open(self.things[number].sightings)
+            ]
             things = [self.things[number] for number in unseen]
             labels = [next(iter(_shares(each.sums))) for each in things]
             is_gone = looked_at(self._places_m[unseen], labels, searches)

@@ -107,7 +107,7 @@ def flight_outcome(
         {name: count for name, count in counts.items() if isinstance(count, int)},
         float("nan") if median is None else median,
         tuple(report.get("warnings") or ()),
-        {path.name: path for path in (*more, *folder.iterdir()) if path.is_file()},
+        {path.name: path for path in (*more, *folder.glob("*")) if path.is_file()},
         done_utc,
     )
 

@@ -128,10 +128,17 @@ def fuse(
     # two places alone may be those of two things that stand
     walks = [each for each in walks if len(each) >= _LEAST_VIEWS or doubted.isdisjoint(each)]
     walked = set().union(*walks) & doubted
-    objects = [each for each in standing if walked.isdisjoint(each.members)]
+    whole = {k for k, each in enumerate(laid) if strong[k] and not each.is_cut}
+    # one that was seen there beside the walk stands
+    objects = [
+        each
+        for each in standing
+        if walked.isdisjoint(each.members) or whole.intersection(each.members) - walked
+    ]
     objects += [_moving(each, laid) for each in walks]
-    used = sum(int(strong[list(each.members)].sum()) for each in objects)
-    return Fused(tuple(sorted(objects, key=lambda each: -each.score)), int(strong.sum()) - used)
+    used = set[int]().union(*(each.members for each in objects))
+    dropped = int(strong.sum()) - int(strong[list(used)].sum())
+    return Fused(tuple(sorted(objects, key=lambda each: -each.score)), dropped)
 
 
 def fitted_size_m(

@@ -41,7 +41,7 @@ class LookedAt:
     enough: float = ENOUGH_LOOKED_AT
     ground: Mapping[str, ClassGround] = field(default_factory=dict)
     flown_m2: float = 0.0
-    excused: frozenset[str] = frozenset()  # classes that nobody asked for, in too coarse pixels
+    excuses: bool = False  # pixels too coarse for a class: nobody asked for it
 
     def share_of(self, name: str) -> float:
         """The share, 0 to 1, that was looked at for a class: of the ground, else of the pictures."""
@@ -58,8 +58,15 @@ class LookedAt:
     def is_enough(self) -> bool:
         """Whether as much was looked at as was asked for."""
         least = min(self.enough, _ALL)
-        classes = self.ground.keys() - self.excused if self.ground else {""}
-        return all(self.share_of(each) >= least for each in classes)
+        if not self.ground:
+            return self.share >= least
+        return all(
+            own.share >= least
+            or self.excuses
+            and own.coarse_m2 > own.looked_m2
+            and own.skipped_m2 <= (1 - least) * self.flown_m2
+            for own in self.ground.values()
+        )
 
     def words(self) -> str:
         """In pictures and shares of the ground."""
@@ -119,10 +126,7 @@ def looked_at(
     unasked needs no finer pixels than there are."""
     if ground is None or not ground.flown_m2:
         return LookedAt(searched, seen, enough)
-    classes = ground.of_classes()
-    coarse = {name for name, own in classes.items() if own.coarse_m2 > own.looked_m2}
-    excused = frozenset(coarse if excuses else ())
-    return LookedAt(searched, seen, enough, classes, ground.flown_m2, excused)
+    return LookedAt(searched, seen, enough, ground.of_classes(), ground.flown_m2, excuses)
 
 
 def _searched_geojson(ground: LookedGround, site: Site) -> bytes:

@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sorvolo.canopy.finds import Find, Finds, look_under_trees
+from sorvolo.canopy.finds import Find, Finds, average, look_under_trees
 from sorvolo.canopy.integral import LEAST_VIEWS, Floor, Picture, UnderTrees, lay, levelled
 from sorvolo.canopy.planting import PlantedFloor, free_share, plant_on_floor
 from sorvolo.errors import InputError
@@ -238,12 +238,12 @@ def _crop(find: Find, views: Sequence[View], picture: Picture) -> Any:
     east_m, north_m, up_m = find.place_m
     corner = [[_CROP_CELL_M, 0, east_m - half], [0, -_CROP_CELL_M, north_m + half], [0, 0, 1]]
     window = Lattice(np.array(corner), cells, cells, _CROP_CELL_M)
-    laid: list[Numbers] = [
+    laid = [
         lay(view, levelled(picture(number)), window, float(up_m))
         for number, view in enumerate(views)
     ]
     numbers = {view.name: number for number, view in enumerate(views)}
-    shown = [laid[numbers[find.pictures[0]]], np.nanmean(laid, axis=0)]
+    shown = [laid[numbers[find.pictures[0]]], average(np.stack(laid))]
     return np.hstack([_stretched(each) for each in shown])
 
 

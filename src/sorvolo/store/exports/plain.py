@@ -71,7 +71,7 @@ def _line(value: Any) -> str:
 def feature_collection(
     name: str, features: Sequence[Mapping[str, Any]], *, is_local: bool, note: str = _OF_OWN_MAP
 ) -> dict[str, Any]:
-    """FeatureList with a geometry as a GeoJSON FeatureCollection; of a local site as plain JSON, which no map would open.
+    """Features with a geometry as a GeoJSON FeatureCollection; of a local site as plain JSON, which no map would open.
 
     A local site has no place on Earth: its coordinates are pixels, of its own map where `note` states nothing else.
     """
@@ -87,7 +87,7 @@ def feature(geometry: Any, properties: Any, **own: Any) -> dict[str, Any]:
 
 
 class FeatureList(list[dict[str, Any]]):
-    """FeatureList of GeoJSON, which libraries that know `__geo_interface__` take as they are."""
+    """Features of GeoJSON, which libraries that know `__geo_interface__` take as they are."""
 
     def __init__(self, features: Iterable[dict[str, Any]] = (), *, is_local: bool = False) -> None:
         super().__init__(features)

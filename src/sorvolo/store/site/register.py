@@ -74,12 +74,13 @@ def present_objects(register: Register, objects: Sequence[StoredObject]) -> list
 
 def sighting_of(thing: MapObject, flight_id: str, rank: float) -> MissionSighting:
     """An object that a flight's map or comparison found."""
+    origin = KnownBy.UNDER_TREES if is_under_trees(thing.id) else KnownBy.DETECTED
     return MissionSighting(
         flight_id,
         rank,
-        f"{flight_id} {'under trees' if is_under_trees(thing.id) else 'objects'}",
+        f"{flight_id} {'objects' if origin is KnownBy.DETECTED else origin}",
         thing.id,
-        KnownBy.DETECTED,
+        origin,
         thing.label,
         thing.score,
         thing.position_m,
