@@ -107,7 +107,9 @@ def test_looks_from_above_neither_miss_nor_bring_what_lies_under_trees() -> None
     assert len(register.present) == 1
     assert between(register, "flight0", "flight1") == "nothing known came or left"
     assert between(register, "flight1", "flight2") == "nothing known came or left"
-    seen = associate([hidden, sighting(2, "map", 0.2, label="person")], [look(day) for day in (2, 3)])
+    seen = associate(
+        [hidden, sighting(2, "map", 0.2, label="person")], [look(day) for day in (2, 3)]
+    )
     assert between(seen, "flight2", "flight3") == "1 person left"
 
 
