@@ -79,7 +79,7 @@ app.add_typer(site_app, name="site")
 class GlobalOptions:
     """The options before the command, and the last line of a command that was stopped."""
 
-    debug: bool
+    debug: bool = False
     quiet: bool = False
     stop_words: str = "stopped; unfinished work was discarded, everything before it is unchanged"
 
@@ -189,8 +189,9 @@ def options(
 
     New here? Run `sorvolo demo`. With a flight of your own: `sorvolo inspect`, then `map`, `compare` or `watch`.
     """
-    context.obj.debug |= debug
-    context.obj.quiet = quiet
+    given = context.ensure_object(GlobalOptions)
+    given.debug |= debug
+    given.quiet = quiet
     if config is not None:
         try:
             tables = tomllib.loads(config.read_text(encoding="utf-8"))
