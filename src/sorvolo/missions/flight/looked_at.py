@@ -62,9 +62,11 @@ class LookedAt:
             return self.share >= least
         return all(
             own.share >= least
-            or (self.excuses
-            and own.coarse_m2 > own.looked_m2
-            and own.skipped_m2 <= (1 - least) * self.flown_m2)
+            or (
+                self.excuses
+                and own.coarse_m2 > own.looked_m2
+                and own.skipped_m2 <= (1 - least) * self.flown_m2
+            )
             for own in self.ground.values()
         )
 
