@@ -125,6 +125,7 @@ def npy(header: str) -> bytes:
         (["x", {}, ["m"]], npy("{'descr': '<f8', 'fortran_order': False, 'shape': (-1,)}")),
         (["x", {}, ["m"]], npy("{'descr': '|O', 'fortran_order': False, 'shape': (1,)}")),
         (["x", {}, ["m"]], npy("{'descr': '<f8', 'fortran_order': False, 'shape': (2,)}")),
+        (["x", {}, ["m"]], npy("{'shape': ((1\n")),
         (["x", {}, ["m"]], npy("__import__('os').abort()")),
         (["x", {}, ["m"]], b""),
         (["x", [], []], b""),

@@ -161,7 +161,10 @@ def _moment(text: str) -> str | None:
     """A time of RFC 3339 as GeoPackages write one, in UTC to the millisecond; None for other text."""
     if not _TIME.fullmatch(text):
         return None
-    moment = datetime.fromisoformat(text).astimezone(UTC)
+    try:
+        moment = datetime.fromisoformat(text).astimezone(UTC)
+    except (ValueError, OverflowError):  # digits of no day or hour, as names may have them
+        return None
     return moment.strftime("%Y-%m-%dT%H:%M:%S.") + f"{moment.microsecond // 1000:03d}Z"
 
 

@@ -16,6 +16,7 @@ from enum import Enum
 from functools import cache
 from io import BufferedRandom
 from pathlib import Path
+from tokenize import TokenError
 from types import MappingProxyType
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
@@ -232,6 +233,7 @@ def _read(file: Any) -> Entry | None:
     except (
         zlib.error,
         struct.error,
+        TokenError,
         ValueError,
         TypeError,
         OverflowError,
