@@ -12,7 +12,9 @@ RUN python -m venv /opt/sorvolo \
     && cp -r src/sorvolo/detection/data models/sorvolo/detection/ \
     && /opt/sorvolo/bin/pip install --no-cache-dir ./models
 
+# rasterio's wheel takes the system's libexpat, which this image lacks
 FROM python:3.12-slim
+RUN apt-get update && apt-get install -y --no-install-recommends libexpat1 && rm -rf /var/lib/apt/lists/*
 COPY --from=build /opt/sorvolo /opt/sorvolo
 RUN useradd --create-home --uid 1000 sorvolo && mkdir /data && chown sorvolo /data
 USER sorvolo

@@ -30,21 +30,22 @@ bench: $(READY)
 
 # dist/: an sdist, and a wheel made from it, which holds the compiled kernels: a C++17 compiler is needed.
 PACKING := build/packing
-wheel: requirements-build.lock
-	$(PYTHON) -m venv $(PACKING)
-	$(PACKING)/bin/python -m pip install --quiet --disable-pip-version-check -r requirements-build.lock
+wheel: $(PACKING)/.ready
 	$(PACKING)/bin/python -m build --no-isolation --outdir dist .
 
 # dist/: the models as a wheel of their own, for all platforms. build/models has all that it is made from.
-models-wheel: build/models
-	$(PYTHON) -m venv $(PACKING)
-	$(PACKING)/bin/python -m pip install --quiet --disable-pip-version-check -r requirements-build.lock
+models-wheel: build/models $(PACKING)/.ready
 	$(PACKING)/bin/python -m build --no-isolation --wheel --outdir dist build/models
 
 build/models: $(wildcard src/sorvolo/detection/data/*) models/pyproject.toml NOTICE
 	rm -rf $@ && mkdir -p $@/sorvolo/detection
 	cp -r src/sorvolo/detection/data $@/sorvolo/detection/
 	cp -r models/pyproject.toml NOTICE LICENSES $@
+
+$(PACKING)/.ready: requirements-build.lock
+	$(PYTHON) -m venv $(PACKING)
+	$(PACKING)/bin/python -m pip install --quiet --disable-pip-version-check -r requirements-build.lock
+	touch $@
 
 # build/site/: this documentation as web pages; a broken link ends it with an error.
 WRITING := build/docs-env

@@ -347,6 +347,7 @@ def test_a_file_gives_options_and_a_name_that_is_none_is_refused(
     for text, words in (
         ("[plan]\nsped = 4\n", "[plan] there is no 'sped'; there are"),
         ("[plant]\n", "there is no 'plant'; there are archive, batch,"),
+        ("plan = 4\n", "[plan] is no table of options, but 4"),
         ("[plan\n", "no TOML file that can be read"),
     ):
         config.write_text(text)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sorvolo.errors import SettingsError
+from sorvolo.errors import InputError, SettingsError
 from sorvolo.missions.mission import flight_outcome, mission
 
 
@@ -46,8 +46,32 @@ def test_a_cancelled_mission_has_no_result() -> None:
     with work.count() as counting:
         next(counting)
     assert work.events == ["left"]
-    with pytest.raises(SettingsError, match="was cancelled and made nothing"):
+    with pytest.raises(SettingsError, match="was cancelled or failed and made nothing"):
         counting.result()
+
+
+def test_a_mission_that_failed_has_no_result_either() -> None:
+    @mission
+    def failing() -> Generator[int, None, str]:
+        yield from ()
+        raise InputError("no film")
+
+    work = failing()
+    with pytest.raises(InputError, match="no film"):
+        work.result()
+    with pytest.raises(SettingsError, match="failed and made nothing"):
+        work.result()
+
+
+def test_a_mission_that_ends_in_the_step_in_which_it_is_cancelled_keeps_its_result() -> None:
+    @mission
+    def ending() -> Generator[int, None, str]:
+        yield 0
+        work.cancel()  # as from another thread: the step is at work
+        return "in the site"
+
+    work = ending()
+    assert work.result() == "in the site"
 
 
 def test_a_mission_is_cancelled_from_another_thread_after_its_step() -> None:

@@ -144,6 +144,10 @@ def open_sources(
         raise InputError(
             "no input; give a video file, a folder of photos, photos, or a live stream's address"
         )
+    if given and not (telemetry is None and camera is None):
+        raise InputError(
+            f"{given[0].name}: --telemetry or --camera was given for frames that have their own; give them to `frames`"
+        )
     addresses = [live_address(text) for text in map(str, inputs) if is_live_address(text)]
     videos, albums = _sort_inputs(_recorded(inputs))
     names = _distinct_names(

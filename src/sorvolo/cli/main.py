@@ -205,6 +205,8 @@ def _defaults(command: Any, table: Mapping[str, Any], where: str) -> dict[str, A
 
     Raises SettingsError for a name that is none of them.
     """
+    if not isinstance(table, Mapping):
+        raise SettingsError(f"{where.rstrip(': ')} is no table of options, but {table!r}")
     below = getattr(command, "commands", {})
     names = {
         option.lstrip("-"): each.name

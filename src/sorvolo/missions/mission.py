@@ -29,7 +29,7 @@ class Mission(Iterator[U], Generic[U, R]):
         try:
             update = next(self._work)
         except StopIteration as end:
-            if not self._made and not self._is_cancelled:
+            if end.value is not None:  # it came to its end; what failed or was closed gives None
                 self._made.append(end.value)
             raise
         if self._is_cancelled:
@@ -38,11 +38,12 @@ class Mission(Iterator[U], Generic[U, R]):
         return update
 
     def result(self) -> R:
-        """What it made, when all updates that are left are over. Raises SettingsError where it was cancelled."""
+        """What it made, when all updates that are left are over. Raises SettingsError where it was cancelled or
+        had failed before."""
         for _ in self:
             pass
         if not self._made:
-            raise SettingsError("the mission was cancelled and made nothing; start it again")
+            raise SettingsError("the mission was cancelled or failed and made nothing; start it again")
         return self._made[0]
 
     def cancel(self) -> None:

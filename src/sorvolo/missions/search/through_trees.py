@@ -137,7 +137,7 @@ def _solved(views: Sequence[View], pictures: FlightPictures) -> tuple[Cameras3D 
                 held = f"{why}: people may be missed; fly slower and with narrower strips"
                 return solved, "" if sigma_deg is None else held
     except InputError as error:
-        why = str(error)
+        why = f"{error}"
     return None, (
         f"cameras are as mapped, not solved in space ({why}): 0.5 m or 1 degree of error hides people"
     )
