@@ -134,7 +134,9 @@ def test_the_images_steps_can_be_taken() -> None:
         for name in line.split()[:-1]
     ]
     assert copied and all((ROOT / name).exists() and name in shown for name in copied)
-    assert "libexpat1" in steps.rpartition("\nFROM ")[2]  # of the image that runs: rasterio's wheel lacks it
+    assert (
+        "libexpat1" in steps.rpartition("\nFROM ")[2]
+    )  # of the image that runs: rasterio's wheel lacks it
     (extras,) = re.findall(r'"\.\[(.*?)\]"', steps)
     assert set(extras.split(",")) <= set(PROJECT["project"]["optional-dependencies"])
     (python,) = set(re.findall(r"^FROM python:([\d.]+)-slim", steps, re.M))

@@ -124,7 +124,10 @@ def test_what_frames_must_be() -> None:
         with pytest.raises(sorvolo.InputError, match=words):
             sorvolo.frames(pictures)
     flight = sorvolo.frames([(0, picture), (1, picture)])
-    for option in ({"telemetry": "log.csv"}, {"camera": "aov=70"}):  # of which nothing would be used
+    for option in (
+        {"telemetry": "log.csv"},
+        {"camera": "aov=70"},
+    ):  # of which nothing would be used
         with pytest.raises(sorvolo.InputError, match="give them to `frames`"):
             open_sources([flight], **option)
 

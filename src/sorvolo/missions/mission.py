@@ -43,7 +43,9 @@ class Mission(Iterator[U], Generic[U, R]):
         for _ in self:
             pass
         if not self._made:
-            raise SettingsError("the mission was cancelled or failed and made nothing; start it again")
+            raise SettingsError(
+                "the mission was cancelled or failed and made nothing; start it again"
+            )
         return self._made[0]
 
     def cancel(self) -> None:
