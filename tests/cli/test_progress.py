@@ -2,8 +2,11 @@
 
 from io import StringIO
 
+import typer
 from rich.console import Console
+from typer.testing import CliRunner
 
+from sorvolo.cli.main import options
 from sorvolo.cli.progress import ProgressReport, Resumed
 
 
@@ -34,6 +37,21 @@ def test_what_is_quick_leaves_nothing_in_a_log() -> None:
         clock.now_s = 9.0
         progress.show("mapping, frame", 3, 10)
     assert out.getvalue() == ""
+
+
+def test_a_quiet_command_shows_none() -> None:
+    out, app = StringIO(), typer.Typer()
+    app.callback()(options)
+
+    @app.command()
+    def work() -> None:
+        clock = _Clock()
+        with ProgressReport(Console(file=out), clock=clock) as progress:
+            clock.now_s = 20.0
+            progress.show("mapping")
+
+    assert CliRunner().invoke(app, ["--quiet", "work"]).exit_code == 0 and out.getvalue() == ""
+    assert CliRunner().invoke(app, ["work"]).exit_code == 0 and out.getvalue() == "mapping\n"
 
 
 def test_a_terminal_gets_a_bar() -> None:

@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TextIO
 
@@ -28,6 +29,7 @@ from sorvolo.cli.map import map_command
 from sorvolo.cli.models import models_app
 from sorvolo.cli.plan import plan
 from sorvolo.cli.printing import FAILED, STOPPED
+from sorvolo.cli.progress import IS_QUIET
 from sorvolo.cli.reproduce import reproduce
 from sorvolo.cli.search import search_command
 from sorvolo.cli.serve import serve, token
@@ -80,7 +82,6 @@ class GlobalOptions:
     """The options before the command, and the last line of a command that was stopped."""
 
     debug: bool = False
-    quiet: bool = False
     stop_words: str = "stopped; unfinished work was discarded, everything before it is unchanged"
 
 
@@ -189,9 +190,8 @@ def options(
 
     New here? Run `sorvolo demo`. With a flight of your own: `sorvolo inspect`, then `map`, `compare` or `watch`.
     """
-    given = context.ensure_object(GlobalOptions)
-    given.debug |= debug
-    given.quiet = quiet
+    context.ensure_object(GlobalOptions).debug |= debug
+    context.call_on_close(partial(IS_QUIET.reset, IS_QUIET.set(quiet)))
     if config is not None:
         try:
             tables = tomllib.loads(config.read_text(encoding="utf-8"))

@@ -2,9 +2,9 @@
 
 import time
 from collections.abc import Callable, Generator, Iterable
+from contextvars import ContextVar
 from typing import TYPE_CHECKING, Self, TypeVar
 
-import click
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
@@ -18,6 +18,9 @@ _LINE_EVERY_S = 10.0  # a log file of an hour stays one to read; by choice
 T = TypeVar("T")
 U = TypeVar("U")
 
+IS_QUIET = ContextVar("IS_QUIET", default=False)
+"""Whether the command that runs was asked to show no progress."""
+
 
 class ProgressReport:
     """What runs, how much of it is done, and how it goes. A context manager.
@@ -30,8 +33,7 @@ class ProgressReport:
         self, console: Console, *, stays: bool = False, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self.console, self._clock = console, clock
-        running = click.get_current_context(silent=True)
-        self._is_quiet = bool(running and getattr(running.find_root().obj, "quiet", False))
+        self._is_quiet = IS_QUIET.get()
         self._is_live = console.is_interactive and not self._is_quiet
         self._last_s = clock()
         self._task = ""
