@@ -515,6 +515,8 @@ def test_a_reload_in_the_field_shows_what_was_known_and_keeps_verdicts(
         page.reload(wait_until="commit")
         page.locator(KNOWN).wait_for()
         expect(page.locator("#sentence")).to_contain_text("may be old")
+        mark = "fetch('/api/sites/field').then(each => each.headers.get('x-kept'))"
+        assert page.evaluate(mark) == "1"
         page.locator("#rooms [data-panel=findings]").click()
         page.locator(".strip button").first.wait_for()
         chosen = page.locator(".strip [aria-current]").get_attribute("data-id")
@@ -853,6 +855,72 @@ def test_of_two_missions_at_once_the_map_s_figures_are_shown(
     happens("run-watch", "run.finished", {"headline": "two cars found"})
     page.locator(".message", has_text="two cars found").wait_for()
     expect(mapping).to_have_text("3 of 5 frames matched, 2 rejected")
+
+
+def test_a_full_browser_keeps_votes_as_long_as_the_page(opened: Watched) -> None:
+    waiting = opened.page.evaluate("""async () => {
+      const {votes} = await import('/page/votes.js?full');
+      votes.send = () => {};
+      const set = Storage.prototype.setItem;
+      Storage.prototype.setItem = () => { throw new DOMException('full', 'QuotaExceededError'); };
+      votes.add({site: 'field', kind: 'change', id: 'b-0', verdict: 'confirmed', note: ''});
+      Storage.prototype.setItem = set;
+      return votes.waiting.length;
+    }""")
+    assert waiting == 1
+
+
+def test_what_could_not_be_loaded_or_was_kept_is_never_the_last_word(
+    opened: Watched, served: Served
+) -> None:
+    page, sentence = opened.page, opened.page.locator("#sentence")
+    findings = re.compile("collections/findings")
+
+    def kept(route: Any) -> None:  # as the service worker marks what it kept
+        answer = route.fetch()
+        route.fulfill(response=answer, headers={**answer.headers, "x-kept": "1"})
+
+    page.route(findings, kept)
+    announce(served, "site.changed", {"versions": 2})
+    expect(sentence).to_contain_text("answers late: this may be old")
+    page.unroute_all()
+    page.route(findings, lambda route: route.fulfill(status=503, json={"title": "busy"}))
+    announce(served, "site.changed", {"versions": 2})
+    expect(sentence).to_contain_text("could not be loaded")
+    page.unroute_all()
+    expect(sentence).to_contain_text("to review")  # it is tried again
+    assert [each for each in opened.faults if "503" not in each] == []
+    opened.faults.clear()
+
+
+def test_people_found_before_there_is_a_map_are_there_after_a_reload(
+    browser: Any, tmp_path: Path
+) -> None:
+    with Served(tmp_path) as station:
+        watch_run(station.station, "run-1", "new")
+        watched = Watched(context_of(browser), station.url)
+        watched.page.goto(f"{station.url}/#/site/new/live")
+        expect(watched.page.locator("#sentence")).to_contain_text("1 person")
+        assert watched.faults == []
+        watched.page.context.close()
+
+
+def test_what_is_about_to_be_pressed_stays(opened: Watched, served: Served) -> None:
+    """Progress comes four times a second, and other data: neither takes a button from under the finger."""
+    page = opened.page
+    running(served, page, "run-map")
+    page.locator(".run.running").get_by_role("button", name="Stop").focus()
+    for frames in (7, 8):
+        announced = {"frames": frames, "selected": frames, "matched": 3}
+        served.station.events.append(NewEvent("run.progress", announced, "field", "run-map"))
+        expect(page.locator(".run .figures")).to_contain_text(f"3 of {frames} frames")
+    assert page.evaluate("document.activeElement.innerText") == "Stop"
+    page.locator("#rooms [data-panel=findings]").click()
+    page.locator(".gallery .confirm").focus()
+    with page.expect_response(re.compile("collections/coverage")):
+        announce(served, "coverage.changed", {})
+    page.wait_for_timeout(200)
+    assert page.evaluate("document.activeElement.className") == "confirm"
 
 
 def test_a_map_that_grows_is_not_called_missing(browser: Any, served: Served) -> None:
@@ -1300,6 +1368,20 @@ def test_the_drone_s_video_is_shown_with_boxes(
         )  # the label of a box at the upper edge is in the picture
         drone.send(Message(Kind.END, 0, 0, b"").to_bytes())
     page.locator(".delay", has_text="ended").wait_for()
+
+
+def test_a_damaged_picture_does_not_end_the_video(opened: Watched) -> None:
+    state = opened.page.evaluate("""async () => {
+      const {FramePlayer} = await import('/page/video.js');
+      const player = new FramePlayer(document.createElement('canvas'), () => {}, () => 0);
+      player.begin({codec: 'avc1.42001f', width: 160, height: 120});
+      const first = player.decoder;
+      player.take(new Uint8Array([0, 0, 0, 1, 0x65, 1, 2, 3, 4, 5, 6, 7]), 0);
+      for (let k = 0; k < 100 && first.state !== 'closed'; k++) await new Promise((done) => setTimeout(done, 50));
+      await new Promise((done) => setTimeout(done, 50));
+      return [first.state, player.decoder.state];
+    }""")
+    assert state == ["closed", "configured"]
 
 
 def test_the_drone_s_video_lies_beside_the_map_and_what_is_reviewed(
@@ -1780,6 +1862,13 @@ def test_a_station_with_tokens_asks_who_comes(
         page.keyboard.press("c")
         page.wait_for_timeout(200)
         assert not served_votes(station)
+        page.goto(station.url)
+        page.locator(".card").wait_for()
+        page.context.clear_cookies()
+        page.get_by_label("Token").wait_for()  # the list asks every 5 s
+        page.keyboard.press("Escape")
+        page.wait_for_timeout(5500)
+        expect(page.get_by_label("Token")).to_have_count(0)
         assert [each for each in watched.faults if "401" not in each] == []
         page.context.close()
 

@@ -2,9 +2,11 @@
 
 import sqlite3
 import struct
+import tempfile
 from pathlib import Path
 from xml.etree.ElementTree import fromstring
 
+import pytest
 import shapely
 from pyproj import CRS
 from starlette.testclient import TestClient
@@ -63,6 +65,19 @@ def test_geopackage_holds_what_the_map_shows(client: TestClient, tmp_path: Path)
     categories = {each.get("value"): each.get("symbol") for each in renderer.iter("category")}
     drawn = {each.get("name") for each in renderer.iter("symbol")}
     assert {row[1] for row in rows} <= set(categories) and set(categories.values()) == drawn
+
+
+def test_a_geopackage_leaves_nothing_behind(
+    client: TestClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    before = set(tmp_path.iterdir())
+    for wanted in ("bytes=0-9", "bytes=99999999-", "nonsense"):
+        answer = client.get(f"{URL}/site.gpkg", headers={"range": wanted})
+        assert answer.status_code == 200 and len(answer.content) > 1000
+    head = client.head(f"{URL}/site.gpkg")
+    assert int(head.headers["content-length"]) > 1000 and not head.content
+    assert set(tmp_path.iterdir()) == before
 
 
 def test_geopackage_mixes_polygons_and_odd_names(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 import math
 import os
-import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -21,7 +20,6 @@ from rasterio.errors import RasterioError
 from rio_tiler.errors import RioTilerError, TileOutsideBounds
 from rio_tiler.io import Reader
 from rio_tiler.models import ImageData
-from starlette.background import BackgroundTask
 from titiler.core.algorithm import Algorithms
 from titiler.core.algorithm.dem import HillShade, Slope
 from titiler.core.dependencies import BidxParams
@@ -328,23 +326,16 @@ def _as_file(name: str) -> dict[str, str]:
     }
 
 
-def _geopackage(site: str, archive: Archive, collections: SiteCollections) -> FileResponse:
+def _geopackage(site: str, archive: Archive, collections: SiteCollections) -> Response:
     if not archive.has_site:
         raise Problem(404, "this site has no map yet, so nothing for a GeoPackage")
     layers = {name: collections.get(site, name).features for name in TITLES}
-    folder = Path(tempfile.mkdtemp(prefix="sorvolo-"))
-    try:
-        styles = {name: qml_of(style) for name, style in LAYER_STYLES.items()}
-        write_geopackage(folder / _GEOPACKAGE, layers, styles)
-    except BaseException:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise
-    return FileResponse(
-        folder / _GEOPACKAGE,
-        media_type="application/octet-stream",
-        headers=_as_file(f"{_plain_name(site)}.gpkg"),
-        background=BackgroundTask(shutil.rmtree, folder, ignore_errors=True),
-    )
+    styles = {name: qml_of(style) for name, style in LAYER_STYLES.items()}
+    with tempfile.TemporaryDirectory(prefix="sorvolo-") as folder:
+        write_geopackage(Path(folder) / _GEOPACKAGE, layers, styles)
+        made = (Path(folder) / _GEOPACKAGE).read_bytes()  # another time other bytes: whole, no ranges
+    headers = _as_file(f"{_plain_name(site)}.gpkg")
+    return Response(made, media_type="application/octet-stream", headers=headers)
 
 
 def _profile(folder: Path, line: str, step_m: float) -> dict[str, Any]:

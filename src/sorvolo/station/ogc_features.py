@@ -470,4 +470,5 @@ def _link_stac(
 
 def _absolute(request: Request, path: str) -> str:
     """A whole address: a catalogue is walked, and its assets are opened, by programs that know no other."""
-    return f"{str(request.base_url).rstrip('/')}{quote(path, safe='/:{}')}"
+    base = request.app.state.station.settings.public_origin or str(request.base_url)
+    return f"{base.rstrip('/')}{quote(path, safe='/:{}')}"

@@ -99,7 +99,7 @@ def status_of(error: SorvoloError) -> int:
 
 def below(root: Path, words: str) -> str:
     """A message without the folder in which the station's sites lie: it is nobody's business who asks."""
-    return words.replace(f"{root.resolve()}/", "").replace(f"{root}/", "")
+    return words.replace(f"{root.resolve()}/", "").replace(f"{root.absolute()}/", "")
 
 
 def answer_problems(app: FastAPI, root: Path) -> None:

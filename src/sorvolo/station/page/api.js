@@ -13,6 +13,9 @@ const UNREACHABLE = "Check that the station runs and that this device is in its 
 /** Who wants to know that a token is needed. */
 export const session = new EventTarget();
 
+/** How many answers were not the station's own but kept by the service worker. */
+export const kept = { answers: 0 };
+
 /** Send a request; give the JSON of the answer (null for none). Throws Problem. */
 export async function ask(method, path, body, { signal, headers = {} } = {}) {
   const init = { method, signal, headers: { accept: "application/json", ...headers } };
@@ -33,6 +36,7 @@ export async function send(path, init) {
     if (error.name === "AbortError") throw error;
     throw new Problem(0, "The station does not answer", UNREACHABLE);
   }
+  if (answer.headers.has("x-kept")) kept.answers += 1;
   if (answer.ok) return answer;
   const problem = await answer.json().catch(() => ({}));
   if (answer.status === 401) session.dispatchEvent(new Event("needed"));

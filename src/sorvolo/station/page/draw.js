@@ -2,6 +2,7 @@
 
 import { get, Problem, put, siteUrl } from "./api.js";
 import { button, el, fill, message, svg } from "./dom.js";
+import { isWritten } from "./feature_card.js";
 import { area_m2, boundsOf, length_m } from "./places.js";
 import { waypointsFor } from "./waypoints.js";
 import * as words from "./words.js";
@@ -57,7 +58,7 @@ class Draw {
     fill(body, el("div", { class: "tools", role: "group", "aria-label": "Tools" }, this.buttons), this.live, this.list,
       this.may ? el("details", {}, el("summary", {}, "Re-fly gaps"), el("p", { class: "note" }, "A route over ground that a measured search saw badly; without one, over ground without pictures."),
         button("Plan a route", () => this.plan())) : null);
-    this.hearer = ({ detail }) => { if (detail.site === screen.data.id) loadDrawings(screen).then(() => this.showList()); };
+    this.hearer = ({ detail }) => { if (detail.site === screen.data.id) loadDrawings(screen).then(() => { if (!isWritten(this.list)) this.showList(); }); };
     screen.station.events.addEventListener("drawings.changed", this.hearer);
     loadDrawings(screen).then(() => this.showList());
   }

@@ -1,5 +1,6 @@
 // The card of the object or change that is chosen: pictures, facts, verdict.
 
+import { choices } from "./choices.js";
 import { button, el, fill } from "./dom.js";
 import { CLASSES, KINDS, OTHER_CLASS } from "./map_style.js";
 import { middleOf } from "./places.js";
@@ -14,10 +15,14 @@ const SHOWN_IN = new Set(["live", "layers", "compare", "place"]); // elsewhere t
 export function featureCard(screen) {
   const box = el("aside", { class: "card-over", hidden: true, "aria-label": "What is chosen" });
   screen.stage.append(box);
+  let told = "";
   return {
     show(feature) {
+      const state = JSON.stringify([feature, screen.shown, choices.all]);
+      if (state === told) return; // what a person is about to press stays under the finger
       const isHidden = !feature || !SHOWN_IN.has(screen.shown);
       if (!isHidden && !box.hidden && isWritten(box) && box.dataset.id === String(feature.id)) return;
+      told = state;
       box.hidden = isHidden;
       box.dataset.id = feature?.id ?? "";
       if (isHidden) return;

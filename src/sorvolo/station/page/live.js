@@ -163,15 +163,15 @@ class Live {
     this.drawSoon();
     if (type === "run.failed") message("The mission failed", { kind: "error", todo: data.error || data.headline || "“Live” states why.", act: this.screen.shown === "live" ? null : button("Live", () => this.screen.open("live", true)) });
     else if (data.state === "incomplete") message("Check this result before you use it", { kind: "warning", todo: data.headline });
-    else message(`The mission is done: ${this.result()}`, { todo: data.headline });
   }
 
-  /** What is there to be looked at, people first. */
-  result() {
+  /** A mission ended well, and what it found is loaded: what is there to be looked at, people first. */
+  done({ headline }) {
     const { objects, changes } = this.screen.data.all;
     const people = objects.filter(({ properties: { class: name, review, gone } }) => name === "person" && review !== "rejected" && !gone).length;
     const open = [...objects, ...changes].filter(({ properties }) => !properties.review && !properties.gone).length;
-    return [people ? words.counted(people, "person", "people") : null, open ? `${open} to review` : "nothing new to review"].filter(Boolean).join(", ");
+    const result = [people ? words.counted(people, "person", "people") : null, open ? `${open} to review` : "nothing new to review"].filter(Boolean).join(", ");
+    message(`The mission is done: ${result}`, { todo: headline });
   }
 
   /** How a running mission goes, in words. */

@@ -143,7 +143,10 @@ function showLogin() {
   let isLoggedIn = false;
   loginBox = dialog("Log in", form);
   loginBox.addEventListener("close", () => { // by Escape: the way in stays
-    if (!isLoggedIn) fill(main, el("div", { class: "starting" }, el("h1", {}, "You are not logged in"), el("p", {}, "This station shows its sites to those who have a token."), button("Log in", showLogin, { class: "main" })));
+    if (isLoggedIn) return;
+    screen?.close?.(); // its questions would bring the dialog back
+    screen = null;
+    fill(main, el("div", { class: "starting" }, el("h1", {}, "You are not logged in"), el("p", {}, "This station shows its sites to those who have a token."), button("Log in", showLogin, { class: "main" })));
   });
   input.focus();
 }

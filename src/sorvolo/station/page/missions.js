@@ -1,6 +1,7 @@
 // The room Live: what was found while it is found, what runs, and what a person can start.
 
 import { get, post, Problem, remove } from "./api.js";
+import { choices } from "./choices.js";
 import { button, choice, dialog, el, field, fill, message, report } from "./dom.js";
 import { badge, picture, titleOf } from "./feature_card.js";
 import { cropsOf } from "./site_data.js";
@@ -30,7 +31,7 @@ export function missionsPanel(screen, body) {
 
 class Missions {
   constructor(screen, body) {
-    Object.assign(this, { screen });
+    Object.assign(this, { screen, rows: new Map(), told: "" });
     this.list = el("div", { class: "runs" });
     this.finds = el("ul", { class: "strip finds", "aria-label": "Found, people first" });
     this.drones = el("div", { class: "stack" });
@@ -52,6 +53,9 @@ class Missions {
     const isPerson = (each) => each.properties.class === "person";
     const found = this.screen.data.all.objects.filter(({ properties: { gone, review } }) => !gone && review !== "rejected")
       .sort((one, other) => isPerson(other) - isPerson(one) || String(other.properties.first_seen ?? "").localeCompare(String(one.properties.first_seen ?? ""))).slice(0, MOST_FINDS);
+    const state = JSON.stringify([found, choices.all]);
+    if (state === this.told) return;
+    this.told = state;
     fill(this.finds, found.map((each) => el("li", {}, el("button", { type: "button", data: { id: each.id }, on: { click: () => this.screen.live.showFound(each) } },
       cropsOf(each).length ? picture(cropsOf(each).at(-1), "") : null,
       el("span", { class: "name" }, badge(each), titleOf(each), el("span", { class: "soft" }, each.properties.first_seen ? ` ${clock(each.properties.first_seen)}` : ""))))));
@@ -181,7 +185,34 @@ class Missions {
 
   running() {
     const { runs } = this.screen;
-    fill(this.list, runs.length ? [...runs.filter(({ state }) => state === "running"), ...runs.filter(({ state }) => state !== "running")].map((run) => this.row(run)) : el("p", { class: "hint" }, "No mission yet."));
+    const is = (running) => runs.filter(({ state }) => (state === "running") === running);
+    const rows = [...is(true), ...is(false)].map((run) => this.rowOf(run));
+    const { children } = this.list;
+    if (!rows.length) fill(this.list, el("p", { class: "hint" }, "No mission yet."));
+    else if (rows.length !== children.length || rows.some((each, k) => each !== children[k])) fill(this.list, rows);
+  }
+
+  /** A mission's row: the same element while its progress alone changes, so that its buttons stay under the finger. */
+  rowOf(run) {
+    const { progress, ...fixed } = run;
+    const state = JSON.stringify([fixed, choices.all]);
+    const there = this.rows.get(run.id);
+    if (there?.state !== state) {
+      const moving = el("div", {});
+      this.rows.set(run.id, { state, moving, row: this.row(run, moving) });
+    }
+    const { moving, row } = this.rows.get(run.id);
+    if (run.state === "running") fill(moving, this.moving(run));
+    return row;
+  }
+
+  /** What changes while a mission runs. */
+  moving(run) {
+    const { frames, frames_expected: expected, searched, to_search: wanted, landed } = run.progress ?? {};
+    return [el("progress", { ...(expected ? { value: Math.min(frames, expected), max: expected } : {}), "aria-label": "Progress" }),
+      wanted ? el("p", {}, `${landed ? "landed, searching the rest: " : ""}${searched} of ${wanted} pictures searched`) : null,
+      frames ? el("p", {}, expected ? `frame ${frames} of ${expected}` : counted(frames, "frame")) : null,
+      el("p", { class: "soft figures" }, this.screen.live.figures(run.id))];
   }
 
   /** What the station keeps of streams and uploads, with its size; taken away by whoever may start missions. */
@@ -205,16 +236,12 @@ class Missions {
       }, { class: "main" }));
   }
 
-  row(run) {
+  row(run, moving) {
     const running = run.state === "running";
-    const { frames, frames_expected: expected, searched, to_search: wanted, landed } = run.progress ?? {};
     return el("article", { class: `run ${run.state}` },
       el("header", {}, el("b", {}, KINDS[run.mission]?.[0] ?? run.mission), el("span", { class: "state" }, run.stop_asked && running ? "stopping" : run.state), el("span", { class: "soft" }, `${time(run.started_at)}${run.who ? `, ${run.who}` : ""}`)),
       run.input?.name || run.input?.stream || run.input?.stream_url ? el("p", { class: "soft" }, run.input.name ?? run.input.stream ?? run.input.stream_url) : null,
-      running ? el("progress", { ...(expected ? { value: Math.min(frames, expected), max: expected } : {}), "aria-label": "Progress" }) : null,
-      running && wanted ? el("p", {}, `${landed ? "landed, searching the rest: " : ""}${searched} of ${wanted} pictures searched`) : null,
-      running && frames ? el("p", {}, expected ? `frame ${frames} of ${expected}` : counted(frames, "frame")) : null,
-      running ? el("p", { class: "soft figures" }, this.screen.live.figures(run.id)) : null,
+      moving,
       run.notice ? el("p", { class: "error", role: "status" }, run.notice) : null,
       run.headline ? el("p", {}, run.headline) : null,
       run.error ? el("p", { class: "error" }, run.error) : null,

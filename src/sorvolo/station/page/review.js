@@ -1,6 +1,7 @@
 // The room Findings: objects and changes one after another, large pictures, judged with the keyboard.
 
 import { get, siteUrl } from "./api.js";
+import { choices } from "./choices.js";
 import { button, choice, el, fill, icon, svg, tick } from "./dom.js";
 import { badge, facts, isWritten, picture, pictures, titleOf } from "./feature_card.js";
 import { middleOf } from "./places.js";
@@ -82,8 +83,10 @@ class Review {
     this.big.hidden = at < 0;
     if (at < 0) return;
     if (isWritten(this.big) && this.drawn === this.at) return;
-    this.drawn = this.at;
     const feature = list[at];
+    const state = JSON.stringify([feature, at, list.length, choices.all]);
+    if (state === this.told) return; // what a person is about to press stays under the finger
+    Object.assign(this, { drawn: this.at, told: state });
     this.pictures = pictures(feature);
     this.film = el("ol", { class: "film", tabindex: 0, "aria-label": "Seen here, in order of time" });
     const { data } = this.screen;

@@ -5,6 +5,7 @@ import { counted, day, duration, percent } from "./words.js";
 
 const ACTS = { map: "Mapping", compare: "Comparing", watch: "Looking for people and vehicles", search: "Measuring the search" };
 const BAD_ENDS = { failed: "The last mission failed", incomplete: "The last mission is incomplete", lost: "The last mission broke off", stopped: "The last mission was stopped" };
+const LINKS = { late: "The station answers late", waiting: "Connecting", lost: "No connection" };
 
 /** A polygon's area without its holes, m2. */
 function polygonArea_m2([outer, ...inner]) {
@@ -26,13 +27,13 @@ export function lookedAt(pod) {
 }
 
 /**
- * The parts of the sentence: {words, act, kind}. `link` is "live", "waiting" or "lost"; `loaded` "yes", "no" or "failed";
+ * The parts of the sentence: {words, act, kind}. `link` is "live", "late" (kept answers are shown), "waiting" or "lost"; `loaded` "yes", "no" or "failed";
  * `runs` the site's missions, newest first; objects, changes and pod are ALL features, whatever a filter hides.
  */
 export function sentence({ link, loaded, runs, objects, changes, pod, versions, votes = 0, isLow = false, now = Date.now() }) {
   const parts = [];
   const say = (words, act = null, kind = "") => parts.push({ words, act, kind });
-  if (link !== "live") say(link === "lost" ? "No connection: this may be old" : "Connecting: this may be old", null, "warning");
+  if (link !== "live") say(`${LINKS[link]}: this may be old`, null, "warning");
   if (votes) say(`${counted(votes, "verdict")} ${votes === 1 ? "waits" : "wait"} to be sent`, null, "warning");
   if (isLow) say("The disk is nearly full", null, "warning");
   if (loaded !== "yes") {

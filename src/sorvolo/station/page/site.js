@@ -1,6 +1,6 @@
 // The screen of one site: three rooms, Live, Findings and Compare; the map with its tools; the sentence of what is known.
 
-import { get, siteUrl } from "./api.js";
+import { get, kept, siteUrl } from "./api.js";
 import { showStationMap } from "./base_map.js";
 import { choices } from "./choices.js";
 import { comparePanel } from "./compare.js";
@@ -88,7 +88,7 @@ class SiteScreen {
     this.hear(choices, "change", (event) => { this.view?.follow(); if (event.detail !== "layers") this.redraw(); });
     this.hear(matchMedia("(prefers-color-scheme: dark)"), "change", () => this.view?.follow());
     for (const type of ["site.changed", ...RUNS_CHANGE.slice(1)]) this.hear(events, type, (event) => this.reload(event.detail));
-    for (const type of RUNS_CHANGE) this.hear(events, type, here(() => this.loadRuns()));
+    this.hear(events, "run.started", here(() => this.loadRuns()));
     this.hear(events, "run.progress", here(({ run, data }) => { const found = this.runs.find(({ id }) => id === run); if (found) { found.progress = data; this.opened?.running?.(); this.tell(); } }));
     this.hear(events, "site.gone", here(() => this.gone()));
     this.hear(events, "state", ({ detail }) => { if (detail === "live") this.check(); this.tell(); });
@@ -149,19 +149,29 @@ class SiteScreen {
       this.view.go(this.lastPlace, 20.5, true);
     });
     try {
-      await this.loadRuns();
-      if (!isNew) {
-        await this.data.load(["changes", "objects", "track", "pod"]);
-        this.loaded = "yes";
-        this.tell();
-        await drawn;
-        await this.data.load(["coverage", "frames"]); // mostly not shown at first
-      } else this.loaded = "yes";
+      await this.learn(async () => {
+        await this.loadRuns();
+        if (!isNew) await this.data.load(["changes", "objects", "track", "pod"]);
+        else if (this.runs.some(({ mission }) => mission === "watch")) await this.data.load(["objects"]); // that needs no map
+      });
+      await drawn;
+      if (!isNew) await this.data.load(["coverage", "frames"]); // mostly not shown at first
     } catch (problem) {
-      if (this.loaded !== "yes") this.loaded = "failed";
       if (problem.status !== 401) throw problem;
-    } finally { this.tell(); }
+    }
     if (!this.closed) this.opened?.refresh?.();
+  }
+
+  /** Load what the sentence states; where that fails, or what comes was kept, it says so. */
+  async learn(load) {
+    const before = kept.answers;
+    try {
+      await load();
+      Object.assign(this, { loaded: "yes", isOld: kept.answers > before });
+    } catch (problem) {
+      this.loaded = "failed";
+      throw problem;
+    } finally { this.tell(); }
   }
 
   async loadRuns() {
@@ -171,11 +181,14 @@ class SiteScreen {
     this.tell();
   }
 
-  /** The station's own state: its disk. */
+  /** The station's own state: its disk, who is logged in; and what could not be loaded is tried again. */
   async look() {
     try {
       this.station.status = { ...this.station.status, ...await get("/api/status") };
-    } catch { /* the sentence states that there is no connection */ }
+      if (this.closed || this.station.events.state !== "live") return;
+      if (this.station.status.name !== votes.who) location.reload(); // another tab changed it
+      if (this.loaded === "failed" || this.isOld) await this.reload({ site: this.data.id });
+    } catch { /* the sentence states it */ }
   }
 
   /** State what is known, in a sentence whose parts lead to it. */
@@ -183,7 +196,7 @@ class SiteScreen {
     if (this.closed) return;
     const { status, events } = this.station;
     const { objects, changes, pod } = this.data.all;
-    const parts = sentence({ link: events.state, loaded: this.loaded, runs: this.runs, objects, changes, pod, versions: this.data.detail.versions, votes: votes.mine.length,
+    const parts = sentence({ link: events.state === "live" && this.isOld ? "late" : events.state, loaded: this.loaded, runs: this.runs, objects, changes, pod, versions: this.data.detail.versions, votes: votes.mine.length,
       isLow: status.disk_floor_gb !== undefined && status.disk_free_gb < 2 * status.disk_floor_gb });
     const text = JSON.stringify(parts);
     if (text === this.told) return;
@@ -193,16 +206,22 @@ class SiteScreen {
     fill(this.known, parts.map(({ words: said, act, kind }, k) => [k ? " · " : null, act ? el("button", { type: "button", class: `link ${kind}`, on: { click: acts[act] } }, said) : el("span", { class: kind }, said)]));
   }
 
-  async reload({ site, type }) {
+  async reload({ site, type, data }) {
     if (site !== this.data.id) return;
     try {
       // its first mission failed, or the records of its missions go because it does
-      if ((this.data.detail.is_new || type === "run.deleted") && !(await isMade(site))) return;
+      const isHere = !(this.data.detail.is_new || type === "run.deleted") || await isMade(site);
       const wasNew = this.data.detail.is_new || !this.data.detail.bounds_wgs84;
-      await this.data.loadDetail();
-      await this.data.load();
-      this.loaded = "yes";
-      this.tell();
+      await this.learn(async () => {
+        if (isHere) {
+          await this.data.loadDetail();
+          await this.data.load();
+        }
+        await this.loadRuns(); // after what they found: a mission is not called done before that is known
+      });
+      if (this.closed) return;
+      if (["run.finished", "run.stopped"].includes(type) && data?.state !== "incomplete") this.live.done(data ?? {});
+      if (!isHere) return;
       if (this.view) {
         this.view.site = this.data.detail;
         if (wasNew && this.data.detail.bounds_wgs84) this.view.go(this.data.detail.bounds_wgs84);
@@ -218,7 +237,7 @@ class SiteScreen {
     if (this.data.detail.is_new) return;
     try {
       await get(siteUrl(this.data.id));
-      if (this.loaded === "failed") this.load();
+      if (this.loaded === "failed") await this.reload({ site: this.data.id });
     } catch (problem) { this.lost(problem); }
   }
 

@@ -15,13 +15,16 @@ export class SiteData extends EventTarget {
     this.all = Object.fromEntries(NAMES.map((name) => [name, []]));
     this.filters = { ...ALL };
     this.chosen = null;
+    this.turns = {}; // of loading, by name: an answer that a later one has overtaken is not shown
     this.versions = null; // [from, to] of a comparison that narrows the changes
   }
 
   /** Load collections anew. */
   async load(names = NAMES) {
     await Promise.all(names.map(async (name) => {
+      const mine = this.turns[name] = (this.turns[name] ?? 0) + 1;
       const kept = await features(this.id, name === "objects" ? "findings" : name);
+      if (mine !== this.turns[name]) return;
       for (const { properties } of kept) if (properties.review === "none") properties.review = null; // withdrawn: open again
       const watched = this.all[name].filter((each) => each.properties.watched && !kept.some((other) => isOf(other, each.id)));
       this.all[name] = [...kept, ...watched]; // what a running watch has just found is not in its file yet

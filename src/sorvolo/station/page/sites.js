@@ -15,11 +15,12 @@ export async function showSites({ main, title }, station) {
   fill(title, el("h1", { class: "sr" }, "Sites"));
   document.title = "Sorvolo station";
   const videos = new Map();
-  let shown = "";
+  let [shown, closed] = ["", false];
   const drones = el("section", { class: "drones", "aria-label": "Drones" });
   const below = el("div", {});
   const load = async () => {
     const [sites, streams] = await Promise.all([get("/api/sites"), get("/api/streams")]);
+    if (closed) return;
     const on = streams.filter((each) => each.is_connected);
     for (const [name, video] of videos) {
       if (on.some((each) => each.stream === name)) continue;
@@ -41,6 +42,7 @@ export async function showSites({ main, title }, station) {
   const timer = setInterval(again, LOOK_MS); // where a drone is becomes known as it flies
   return {
     close() {
+      closed = true;
       clearInterval(timer);
       for (const type of HEARD) station.events.removeEventListener(type, again);
       choices.removeEventListener("change", again);

@@ -21,9 +21,11 @@ let awayUntil = 0; // the station did not answer lately: what is kept is shown a
 
 async function answer(request) {
   const kept = await caches.open(KEPT);
-  const known = await kept.match(request);
+  const found = await kept.match(request);
+  const known = found && new URL(request.url).pathname.startsWith("/api/") ? marked(found) : found;
   const asked = fetch(request).then((response) => {
     awayUntil = 0;
+    if (response.status === 401) forget(kept);
     if (response.status === 200) kept.put(request, response.clone()).then(() => trim(kept)).catch(() => {}); // a full disk keeps nothing
     return response;
   });
@@ -34,11 +36,16 @@ async function answer(request) {
   return Promise.race([asked.catch(away), new Promise((done) => setTimeout(done, WAIT_MS)).then(() => "late")]).then((first) => (first === "late" ? away() : first));
 }
 
-let puts = 0;
+/** What is kept, marked as such: the page states that it may be old. */
+const marked = (response) => new Response(response.body, { status: response.status, headers: [...response.headers, ["x-kept", "1"]] });
+
+/** Who is not logged in is shown nothing of the sites. */
+async function forget(kept) {
+  for (const each of await kept.keys()) if (new URL(each.url).pathname.startsWith("/api/")) await kept.delete(each);
+}
 
 async function trim(kept) {
-  puts += 1;
-  if (puts % 200) return;
+  if (Math.random() > 0.005) return;
   const keys = await kept.keys();
   for (const each of keys.slice(0, Math.max(0, keys.length - MOST_KEPT))) await kept.delete(each);
 }

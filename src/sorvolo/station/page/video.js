@@ -158,6 +158,7 @@ export class DroneVideo {
     try {
       const asked_us = Date.now() * 1000;
       const state = await get(`/api/streams/${encodeURIComponent(this.stream)}`);
+      if (!this.socket) return; // closed meanwhile
       this.ahead_us = (asked_us + Date.now() * 1000) / 2 - state.time_us;
       if (state.is_connected) {
         this.told(state.telemetry);
@@ -285,13 +286,13 @@ function drawBox(pen, { class: name, score, xywh_px: [x, y, w, h] }, size) {
 }
 
 /** Access units (Annex B) decoded by WebCodecs and drawn when due. */
-class FramePlayer {
+export class FramePlayer {
   constructor(canvas, shown, hold_s) {
     Object.assign(this, { canvas, shown, hold_s, waiting: [], pen: canvas.getContext("2d") });
   }
 
   begin({ codec, width, height }) {
-    this.decoder?.close();
+    ended(this.decoder);
     Object.assign(this.canvas, { width, height });
     this.needsKey = true;
     this.config = { codec, optimizeForLatency: true };
@@ -337,8 +338,13 @@ class FramePlayer {
   close() {
     this.closed = true;
     clearTimeout(this.timer);
-    if (this.decoder && this.decoder.state !== "closed") this.decoder.close();
+    ended(this.decoder);
   }
+}
+
+/** Close a decoder; one that met damaged data is closed already. */
+function ended(decoder) {
+  if (decoder && decoder.state !== "closed") decoder.close();
 }
 
 /** Whether an access unit holds a picture that depends on no other: H.264 NAL type 5, or H.265 types 16 to 21. */
@@ -363,10 +369,13 @@ class SegmentPlayer {
 
   begin({ codec }) {
     const type = `video/mp4; codecs="${codec}"`;
-    this.source = new MediaSource();
-    this.player.src = URL.createObjectURL(this.source);
-    this.source.addEventListener("sourceopen", () => {
-      this.buffer = this.source.addSourceBuffer(type);
+    if (this.player.src) URL.revokeObjectURL(this.player.src);
+    const source = new MediaSource();
+    Object.assign(this, { source, buffer: null, queue: [] });
+    this.player.src = URL.createObjectURL(source);
+    source.addEventListener("sourceopen", () => {
+      if (source !== this.source) return;
+      this.buffer = source.addSourceBuffer(type);
       this.buffer.addEventListener("updateend", () => {
         const held = this.buffer.buffered;
         if (held.length) this.appended(held.end(held.length - 1) * 1e6);
@@ -376,8 +385,9 @@ class SegmentPlayer {
     }, { once: true });
     this.player.play().catch(() => {});
     const follow = (_, { mediaTime }) => {
+      if (this.closed || source !== this.source) return;
       this.shown(mediaTime * 1e6);
-      if (!this.closed) this.player.requestVideoFrameCallback?.(follow);
+      this.player.requestVideoFrameCallback?.(follow);
     };
     this.player.requestVideoFrameCallback?.(follow);
   }

@@ -19,6 +19,7 @@ class Votes extends EventTarget {
 
   /** All votes that the station does not have yet, the oldest first; those of other tabs, too. */
   get waiting() {
+    if (this.isFull) return this.memory;
     try {
       return JSON.parse(localStorage.getItem(KEPT) || "[]");
     } catch { return this.memory; }
@@ -28,7 +29,8 @@ class Votes extends EventTarget {
     this.memory = list;
     try {
       localStorage.setItem(KEPT, JSON.stringify(list));
-    } catch { /* a browser without storage keeps them as long as the page */ }
+      this.isFull = false;
+    } catch { this.isFull = true; /* a browser without storage keeps them as long as the page */ }
     this.changed();
   }
 
@@ -54,7 +56,8 @@ class Votes extends EventTarget {
     clearTimeout(this.timer);
     this.sending = true;
     try {
-      await (navigator.locks ? navigator.locks.request(KEPT, () => this.sendAll()) : this.sendAll());
+      do await (navigator.locks ? navigator.locks.request(KEPT, () => this.sendAll()) : this.sendAll());
+      while (this.mine.length); // one was given just when the last was taken
     } catch {
       this.timer = setTimeout(() => this.send(), this.wait_ms);
       this.wait_ms = Math.min(this.wait_ms * 1.7, LONGEST_WAIT_MS);
