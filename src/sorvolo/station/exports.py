@@ -333,7 +333,9 @@ def _geopackage(site: str, archive: Archive, collections: SiteCollections) -> Re
     styles = {name: qml_of(style) for name, style in LAYER_STYLES.items()}
     with tempfile.TemporaryDirectory(prefix="sorvolo-") as folder:
         write_geopackage(Path(folder) / _GEOPACKAGE, layers, styles)
-        made = (Path(folder) / _GEOPACKAGE).read_bytes()  # another time other bytes: whole, no ranges
+        made = (
+            Path(folder) / _GEOPACKAGE
+        ).read_bytes()  # another time other bytes: whole, no ranges
     headers = _as_file(f"{_plain_name(site)}.gpkg")
     return Response(made, media_type="application/octet-stream", headers=headers)
 

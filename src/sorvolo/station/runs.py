@@ -408,7 +408,9 @@ class Runs(ThreadOwner):
             if line["type"] in (BOXES, MOTION):  # ten a second: shown with the video, not kept
                 self._show(line["type"], line["data"])
                 continue
-            data = json.loads(below(self._settings.root, json.dumps(line["data"], ensure_ascii=False)))
+            data = json.loads(
+                below(self._settings.root, json.dumps(line["data"], ensure_ascii=False))
+            )
             run, event = _taken(run, {"type": line["type"], "data": data})
             events.append(event)
         return run, events
