@@ -103,7 +103,7 @@ def in_short(changes: Sequence[ChangeFacts], *, is_local: bool = False) -> str:
     Lengths are left out of a map without metres."""
     came: Counter[str] = Counter()
     left: Counter[str] = Counter()
-    others: Counter[str] = Counter()
+    others: Counter[tuple[str, bool]] = Counter()
     labels: dict[str, None] = {}  # in order of importance
     areas = [each.length_m for each in changes if each.kind is ChangeKind.AREA]
     for each in sorted(changes, key=_importance):
@@ -112,18 +112,20 @@ def in_short(changes: Sequence[ChangeFacts], *, is_local: bool = False) -> str:
         before = each.class_before if each.kind in _HAS_BEFORE else ""
         after = each.class_after if each.kind is not ChangeKind.DISAPPEARED else ""
         for label, counts in ((before, left), (after, came)):
-            counts.update([label] if label else [])
-            labels |= {label: None} if label else {}
+            if label:
+                counts[label] += 1
+                labels[label] = None
         if not before and not after:
             size = "" if is_local else "large " if each.length_m >= _LARGE_M else "small "
-            others[
-                f"{size}thing that {'moves' if each.kind is ChangeKind.MOVING else 'changed'}"
-            ] += 1
+            others[f"{size}thing", each.kind is ChangeKind.MOVING] += 1
     parts = [_came_and_left(label, came[label], left[label]) for label in labels]
     if areas:
         size = "" if is_local else f", {'up to ' if len(areas) > 1 else ''}{max(areas):.0f} m long"
         parts.append(f"changed ground in {counted(len(areas), 'place')}{size}")
-    parts += [_counted_that(count, what) for what, count in others.items()]
+    for (what, moves), count in others.items():
+        parts.append(
+            f"{counted(count, what)} that {plural('moves', count) if moves else 'changed'}"
+        )
     return "; ".join(parts) or "nothing changed"
 
 
@@ -132,11 +134,6 @@ def _came_and_left(label: str, came: int, left: int) -> str:
     if not came:
         return f"{counted(left, label)} left"
     return f"{counted(came, label)} came" + (f", {left} left" if left else "")
-
-
-def _counted_that(count: int, what: str) -> str:
-    noun, _, did = what.partition(" that ")
-    return f"{counted(count, noun)} that {plural(did, count) if did == 'moves' else did}"
 
 
 def _name(change: ChangeFacts) -> str:
