@@ -15,7 +15,7 @@ from fake_changes import fake_change
 from real_data import real_data
 from small_flights import simulate_into
 from sorvolo.cli.main import main
-from sorvolo.errors import GeometryError, InputError, SettingsError, StoreError
+from sorvolo.errors import GeometryError, InputError, NotFoundError, SettingsError, StoreError
 from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     OutputSettings,
@@ -158,7 +158,7 @@ def test_heights_of_a_map_that_contradicts_itself_or_mixes_lenses_state_it(
 
 
 def test_heights_name_what_is_missing(mapped: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="nowhere"):
+    with pytest.raises(NotFoundError, match="nowhere"):
         list(make_heights(mapped, flight="nowhere"))
     with pytest.raises(StoreError, match="no site"):
         list(make_heights(tmp_path / "none"))

@@ -238,7 +238,6 @@ def test_commands_take_a_place_in_a_store(
             "flight one of .* has no heights",
         ),
         (["search", address, "--model", "default", "--flight", "nine"], "nine"),
-        (["evaluate", "objects", address, "--truth", "x"], "x: no truth/frames.geojson in it"),
         (["evaluate", "changes", address, "--truth", "x"], "no such folder: x"),
     ):
         assert main(command) == 1

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from fake_flights import CAMERA, LOCAL_SITE, SITE, frame, image, map_flight, tile
 
-from sorvolo.errors import GeometryError, SettingsError, StoreError
+from sorvolo.errors import GeometryError, NotFoundError, SettingsError, StoreError
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue_place import is_site
@@ -143,7 +143,8 @@ def test_images_come_out_of_the_writer_as_out_of_the_archive(file_folder: Path) 
             writer.commit([frame(index) for index in range(3)], paths, {}, "")
         stored = [archive.image(keyframe) for keyframe in archive.keyframes("a")]
         assert all(np.array_equal(one, other) for one, other in zip(stored, seen, strict=True))
-        assert archive.keyframes("b") == []
+        with pytest.raises(NotFoundError, match="no flight 'b'"):
+            archive.keyframes("b")
 
 
 def test_leaving_without_commit_changes_nothing(folder: Path) -> None:
