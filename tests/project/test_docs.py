@@ -1,9 +1,12 @@
 """The pages keep to the program and stay readable; `make docs` checks the site."""
 
+import ast
+import inspect
 import posixpath
 import re
 import shlex
 from collections.abc import Iterator
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +14,7 @@ import pytest
 import typer
 import typer.main
 
+import sorvolo
 from sorvolo.cli.main import app
 
 ROOT = Path(__file__).parents[2]
@@ -133,6 +137,23 @@ def options_of_other_programs() -> set[str]:
     }
     ray = {"--head", "--node-ip-address", "--ray-client-server-port", "--include-dashboard"}
     return own | ray | {"--address", "--no-deps", "--strict"}  # of ray, pip and mypy
+
+
+def test_functions_take_what_the_page_on_python_gives_them() -> None:
+    text = (ROOT / "docs/python.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```python\n(.*?)```", text, re.S)
+    calls = 0
+    for call in ast.walk(ast.parse("".join(blocks))):
+        if not isinstance(call, ast.Call):
+            continue
+        path = ast.unparse(call.func)
+        if not re.fullmatch(r"sorvolo(\.\w+)+", path):
+            continue
+        function = reduce(getattr, path.split(".")[1:], sorvolo)
+        named = {str(each.arg): each.value for each in call.keywords}
+        inspect.signature(function).bind(*call.args, **named)
+        calls += 1
+    assert calls > 30
 
 
 def test_functions_and_rooms_of_an_explanation_exist() -> None:
