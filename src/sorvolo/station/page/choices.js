@@ -3,7 +3,7 @@
 const KEY = "sorvolo-choices";
 const FIRST = {
   units: "metric", coordinates: "latlon", theme: "auto", clock: "local", sound: true, holdForBoxes: false,
-  layers: {}, seenHelp: false,
+  layers: {},
 };
 
 class Choices extends EventTarget {

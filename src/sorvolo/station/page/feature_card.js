@@ -64,10 +64,10 @@ export function badge(feature) {
   return mark;
 }
 
-/** The pictures of a feature: before and after of a change, the best view of an object. */
+/** The pictures of a feature: before and after of a change, the latest view of an object. */
 export function pictures(feature) {
-  const names = isChange(feature) ? ["before", "after"] : ["best view"];
-  const crops = cropsOf(feature);
+  const names = isChange(feature) ? ["before", "after"] : ["latest view"];
+  const crops = isChange(feature) ? cropsOf(feature) : cropsOf(feature).slice(-1); // of an object the latest, as in the lists
   if (!crops.length) return el("p", { class: "hint" }, "Pictures come when the mission has ended.");
   return el("div", { class: `pictures n${names.length}` }, crops.map((src, k) =>
     el("figure", {}, picture(src, `${titleOf(feature)}, ${names[k] ?? ""}`), el("figcaption", {}, names[k] ?? ""))));

@@ -85,8 +85,6 @@ function foundLayers() {
     { id: "changes-fill", group: "changes", type: "fill", source: "changes", paint: { "fill-color": kind, "fill-opacity": ["case", rejected, 0.05, 0.18] } },
     { id: "changes-halo", group: "changes", type: "line", source: "changes", paint: { "line-color": "#fff", "line-width": 4.5, "line-opacity": ["case", rejected, 0.2, 0.7] } },
     { id: "changes-line", group: "changes", type: "line", source: "changes", paint: { "line-color": kind, "line-width": 2.4, "line-opacity": ["case", rejected, 0.4, 1] } },
-    { id: "changes-dot", group: "changes", type: "circle", source: "changes", maxzoom: 21, filter: ["has", "middle"],
-      paint: { "circle-radius": 0, "circle-color": kind } },
     { id: "objects", group: "objects", type: "circle", source: "objects",
       paint: { "circle-radius": ["interpolate", ["linear"], ["zoom"], 16, 4, 20, 9], "circle-color": matched("class", CLASSES, OTHER_CLASS[1]),
         "circle-opacity": ["case", rejected, 0.35, 1], "circle-stroke-color": ["case", ["==", ["get", "review"], "confirmed"], "#ffffff", "#10201b"],
