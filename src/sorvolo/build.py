@@ -1,8 +1,9 @@
 """Which program made a result: its version, a hash of its code, which an update always changes, and what is added."""
 
 import hashlib
+from collections.abc import Callable
 from functools import cache
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
@@ -26,20 +27,22 @@ def build() -> str:
 
 
 @cache
-def added(group: str, name: str = "") -> dict[str, Any]:
-    """What installed packages add in the group of entry points `sorvolo.<group>`, by name: all, or that of a `name`.
+def added(group: str) -> dict[str, Callable[[], Any]]:
+    """What installed packages add in the group of entry points `sorvolo.<group>`, by name: what loads it.
 
-    Raises ImportError for what cannot be loaded.
+    That raises ImportError for what cannot be loaded.
     """
-    found = {}
-    for each in entry_points(group=f"sorvolo.{group}"):
-        if name not in ("", each.name):
-            continue
-        try:
-            found[each.name] = each.load()
-        except Exception as error:
-            raise ImportError(
-                f"{each.value}, which an installed package adds to sorvolo.{group}, cannot be loaded: {error}; mend or "
-                "remove that package"
-            ) from error
-    return found
+
+    def loading(entry: EntryPoint) -> Callable[[], Any]:
+        def loaded() -> Any:
+            try:
+                return entry.load()
+            except Exception as error:
+                raise ImportError(
+                    f"{entry.value}, which an installed package adds to sorvolo.{group}, cannot be loaded: {error}; "
+                    "mend or remove that package"
+                ) from error
+
+        return loaded
+
+    return {each.name: loading(each) for each in entry_points(group=f"sorvolo.{group}")}

@@ -53,6 +53,7 @@ def broken(site, flight):
     raise OSError("no herd here")
 """
 ENTRIES = """[sorvolo.telemetry]
+gone = not_there:Log
 herd = herd_plugin:Log
 [sorvolo.sources]
 herd = herd_plugin:source
@@ -61,6 +62,7 @@ herd = herd_plugin:Herd
 [sorvolo.exports]
 herd = herd_plugin:export
 lost = herd_plugin:broken
+gone = not_there:export
 """
 
 
@@ -84,7 +86,10 @@ def test_a_package_adds_a_reader_a_source_and_a_detector(tmp_path: Path) -> None
     (source,) = open_sources(["herd:north"], telemetry=None)
     assert (source.name, source.frame_count, source.frame_rate_hz) == ("north", 2, 1.0)
     picture = next(source.frames(lambda *_: True)).image
-    given = sorvolo.frames([(1, picture), (2, picture)], telemetry=log)
+    with pytest.warns(
+        SorvoloWarning, match=r"the telemetry reader 'gone' is left out: .*not_there:Log"
+    ):
+        given = sorvolo.frames([(1, picture), (2, picture)], telemetry=log)
     assert given.telemetry.format == "herd" and given.telemetry["latitude_deg"][8] == 52.008
     detector = load_detector("herd")
     assert (detector.classes, detector.info.name, detector.info.version) == (("cow",), "Herd", "1")
@@ -100,10 +105,11 @@ def test_frames_from_memory_are_mapped_and_given_to_exports(tmp_path: Path) -> N
         pictures, camera=flown.parent / "camera.xml", telemetry=video.telemetry, name="memory"
     )
     settings = sorvolo.MapSettings(model="none")
-    with pytest.warns(
-        SorvoloWarning, match=r"the export 'lost' of memory failed: OSError: no herd"
-    ):
+    with pytest.warns(SorvoloWarning) as told:
         (made,) = sorvolo.map_flights(flight, tmp_path / "site", settings).result()
+    words = "\n".join(str(each.message) for each in told)
+    assert "the export 'lost' of memory failed: OSError: no herd" in words
+    assert "the export 'gone' of memory failed: ImportError: not_there:export" in words
     assert made.trusted and made.frames["vision"] == made.frames["selected"] > 3, made
     assert 0 < made.residual_px < 1 and made.done_utc == "" and made.paths["mosaic.tif"].is_file()
     assert json.loads(made.paths["report.json"].read_bytes())["headline"]["text"] == made.headline

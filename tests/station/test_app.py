@@ -54,6 +54,19 @@ def test_status_and_sites(client: TestClient) -> None:
     ]
 
 
+def test_head_answers_as_get_without_the_body(client: TestClient) -> None:
+    west, south, east, north = client.get(FIELD).json()["bounds_wgs84"]
+    tile = f"{FIELD}/tiles/2/{tile_of((west + east) / 2, (south + north) / 2, 20)}.webp"
+    for path in ("/", "/sw.js", "/page/main.js", "/api/status", FIELD, tile, f"{FIELD}/exports/site.gpkg",
+                 f"{FIELD}/collections/changes/items", "/api/sites/nowhere", "/api/uploads", "/nothing"):  # fmt: skip
+        got, head = client.get(path), client.head(path)
+        assert (head.status_code, head.content) == (got.status_code, b""), path
+        for name in ("content-type", "cache-control"):
+            assert head.headers.get(name) == got.headers.get(name), (path, name)
+        assert int(head.headers["content-length"]) > 0
+    assert client.head("/api/session").status_code == 405
+
+
 def test_a_sites_one_folder_deeper_are_found_and_links_are_not(root: Path, tmp_path: Path) -> None:
     """`sorvolo demo` puts its site one deeper; a link could lead anywhere."""
     (root / "demo").mkdir()

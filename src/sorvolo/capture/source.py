@@ -187,8 +187,8 @@ def _given(one: Any) -> "GivenFrames | None":
     name, colon, rest = str(one).partition(":")
     if not colon or Path(str(one)).exists():
         return None
-    readers = added("sources", name)
-    return readers[name](rest) if readers else None
+    load = added("sources").get(name)
+    return load()(rest) if load else None
 
 
 class GivenFrames:

@@ -14,6 +14,7 @@ import uvicorn
 from fastapi import APIRouter, Body, FastAPI, Request, Response
 from fastapi.responses import FileResponse, JSONResponse
 from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from sorvolo import __version__
@@ -206,6 +207,7 @@ def station_app(
     ):
         app.include_router(router)
     _serve_page(app)
+    app.add_middleware(_Heads, but=f"{_UPLOADS}/")
     app.add_middleware(Doorkeeper, settings=settings, state=station.state, upload_path=_UPLOADS)
     app.add_middleware(
         Observer, count=metrics.count
@@ -359,6 +361,30 @@ def _serve_page(app: FastAPI) -> None:
         return FileResponse(PAGE_FOLDER / "sw.js", headers={"cache-control": "no-cache"})
 
     app.mount("/page", _PageFiles(directory=PAGE_FOLDER), name="page")
+
+
+class _Heads:
+    """ASGI middleware: HEAD is answered as GET is, without the body; addresses below `but` answer it themselves."""
+
+    def __init__(self, app: ASGIApp, but: str) -> None:
+        self._app, self._but = app, but
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on, a HEAD as the GET that it asks about."""
+        if scope.get("method") != "HEAD" or scope["path"].startswith(self._but):
+            await self._app(scope, receive, send)
+            return
+
+        async def sending(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                await send(message)
+                await send({"type": "http.response.body"})
+
+        # the extension keeps files from being read for a body that nobody gets
+        extensions = {**scope.get("extensions", {}), "http.response.pathsend": {}}
+        asked = {**scope, "method": "GET", "extensions": extensions}
+        await self._app(asked, receive, sending)
+        scope["route"] = asked.get("route")
 
 
 class _PageFiles(StaticFiles):

@@ -251,7 +251,6 @@ def export_routes(shelf: SiteShelf, collections: SiteCollections) -> APIRouter:
             rows.insert(min(2, len(rows)), _row(site, package, None))
         return rows
 
-    @router.head("/exports/{export_id}", include_in_schema=False)
     @router.get("/exports/{export_id}", response_class=FileResponse)
     def one(site: str, export_id: str) -> Response:
         """One of them, to be kept; ranges are answered, so that GDAL reads of a GeoTIFF what it needs."""

@@ -1,14 +1,15 @@
 """Telemetry files: the content decides which reader a file needs, and where a video's telemetry lies."""
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, cast
 
 from sorvolo.build import added
 from sorvolo.capture.telemetry import dji_srt, flight_table, gpx, nmea
 from sorvolo.capture.telemetry.autopilot_logs import AUTOPILOT_READERS
 from sorvolo.capture.telemetry.mcap_log import McapReader
-from sorvolo.errors import InputError
+from sorvolo.errors import InputError, SorvoloWarning
 from sorvolo.survey.flight import Telemetry
 
 LARGEST_FILE_BYTES = 500_000_000
@@ -193,8 +194,14 @@ def _bytes_of(path: Path) -> bytes:
 
 
 def _reader_for(head: bytes) -> Reader | None:
-    readers = (*added("telemetry").values(), *TELEMETRY_READERS.values())
-    return next((each for each in readers if each.recognises(head)), None)
+    for name, load in added("telemetry").items():
+        try:
+            if (reader := load()).recognises(head):
+                return cast(Reader, reader)
+        except Exception as error:  # a file of another format is read, whatever others make of it
+            text = f"the telemetry reader {name!r} is left out: {type(error).__name__}: {error}"
+            warnings.warn(text, SorvoloWarning, stacklevel=2)
+    return next((each for each in TELEMETRY_READERS.values() if each.recognises(head)), None)
 
 
 def _unknown(data: bytes) -> str:

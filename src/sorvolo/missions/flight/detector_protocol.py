@@ -160,5 +160,5 @@ def load_detector(name: str) -> ObjectDetector:
 
     Raises InputError for what is not there or cannot be used.
     """
-    brought = added("detectors", name)
-    return as_detector(brought[name]()) if brought else Detector.load(name)
+    load = added("detectors").get(name)
+    return as_detector(load()()) if load else Detector.load(name)

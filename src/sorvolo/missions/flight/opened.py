@@ -64,9 +64,9 @@ def opened_flights(
 def outcome_of(archive: Archive, flight: str, done_utc: str = "") -> FlightOutcome:
     """What a site has of a flight. One that is new to it is given to the exports that packages add."""
     folder = archive.flight_folder(flight)
-    for name, export in ({} if done_utc else added("exports")).items():
+    for name, load in ({} if done_utc else added("exports")).items():
         try:
-            export(archive.folder, flight)
+            load()(archive.folder, flight)
         except Exception as error:  # the flight is in the site, whatever others make of it
             text = f"the export {name!r} of {flight} failed: {type(error).__name__}: {error}"
             warnings.warn(text, SorvoloWarning, stacklevel=2)
