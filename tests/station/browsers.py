@@ -101,12 +101,10 @@ class Watched:
         self.page = context.new_page()
         self.page.set_default_timeout(WAIT_MS)
         self.faults: list[str] = []
-        self.bytes = 0
         self._url = url
         self.page.on("console", self._heard)
         self.page.on("pageerror", lambda error: self.faults.append(f"uncaught: {error}"))
         self.page.on("request", self._asked)
-        self.page.on("response", self._answered)
 
     def _heard(self, message: Any) -> None:
         is_ours = not re.search("GPU stall|blocked by Playwright", message.text)
@@ -118,6 +116,3 @@ class Watched:
             (self._url, "blob:", "data:", self._url.replace("http", "ws"))
         ):
             self.faults.append(f"asked a third party: {request.url}")
-
-    def _answered(self, response: Any) -> None:
-        self.bytes += int(response.headers.get("content-length", 0))

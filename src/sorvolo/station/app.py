@@ -13,6 +13,7 @@ from typing import Annotated, Any
 import uvicorn
 from fastapi import APIRouter, Body, FastAPI, Request, Response
 from fastapi.responses import FileResponse, JSONResponse
+from starlette.middleware.gzip import GZipMiddleware
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -360,7 +361,8 @@ def _serve_page(app: FastAPI) -> None:
     def service_worker() -> Response:
         return FileResponse(PAGE_FOLDER / "sw.js", headers={"cache-control": "no-cache"})
 
-    app.mount("/page", _PageFiles(directory=PAGE_FOLDER), name="page")
+    files = GZipMiddleware(_PageFiles(directory=PAGE_FOLDER), compresslevel=5)
+    app.mount("/page", files, name="page")
 
 
 class _Heads:

@@ -89,14 +89,17 @@ export function dialog(title, ...children) {
   return box;
 }
 
+const messages = document.getElementById("messages");
+new ResizeObserver(() => document.body.style.setProperty("--said", `${messages.offsetHeight}px`)).observe(messages); // room is made for them: they lie over nothing
+
 /** A message that goes away by itself, or stays until closed where a person must act. */
 export function message(words, { kind = "note", todo = "", act = null } = {}) {
   const box = el("div", { class: `message ${kind}` },
     el("div", {}, el("b", {}, words), todo ? el("p", {}, todo) : null),
     act, el("button", { type: "button", class: "quiet", "aria-label": "Close message", on: { click: () => box.remove() } }, icon("close")));
-  const shown = document.getElementById("messages");
-  shown.append(box);
-  while (shown.children.length > 4) (shown.querySelector(".message:not(.person)") ?? shown.firstElementChild).remove(); // a person found stays
+  act?.addEventListener("click", () => box.remove());
+  messages.append(box);
+  while (messages.children.length > 4) (messages.querySelector(".message:not(.person)") ?? messages.firstElementChild).remove(); // a person found stays
   if (kind === "note") setTimeout(() => box.remove(), 6000);
   return box;
 }
@@ -104,5 +107,5 @@ export function message(words, { kind = "note", todo = "", act = null } = {}) {
 /** A problem in words, with what to do. */
 export function report(problem) {
   if (problem?.name === "AbortError") return;
-  message(problem.title || "This did not work", { kind: "error", todo: problem.detail || String(problem.message || problem) });
+  message(problem.title || "This did not work", { kind: `error${problem.status === 0 ? " away" : ""}`, todo: problem.detail || String(problem.message || problem) });
 }

@@ -58,7 +58,9 @@ function listen() {
     linkState.className = state;
     const { length } = votes.waiting;
     fill(linkState, words[state], length ? ` · ${length} waiting` : "");
-    if (state === "live") votes.send();
+    if (state !== "live") return;
+    for (const each of document.querySelectorAll(".message.away")) each.remove();
+    votes.send();
   };
   show();
   votes.addEventListener("change", show);
@@ -69,8 +71,9 @@ function listen() {
 
 /** The station's disk fell below its floor of free space, or has room again. */
 function disk({ is_low: isLow, free_gb: free, floor_gb: floor }) {
+  document.querySelector(".message.disk")?.remove();
   if (!isLow) return void message("The station's disk has room again", { todo: "Streams and uploads go on by themselves." });
-  return void message("The station's disk is full", { kind: "error",
+  return void message("The station's disk is full", { kind: "error disk",
     todo: `${free} GB are free, and ${floor} GB must stay so. No upload, mission or stream is taken in until there is room: delete uploads, recordings or flights.` });
 }
 

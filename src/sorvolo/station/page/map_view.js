@@ -157,7 +157,7 @@ export class MapView {
   /** How much of the map's lower part a sheet or a card of a phone lies over, px. */
   covered() {
     const whole = this.map.getContainer().getBoundingClientRect();
-    const over = [...document.querySelectorAll(".card-over, .panel")].map((each) => each.getBoundingClientRect()).filter((box) => box.height && box.width > whole.width * 0.8 && box.bottom > whole.bottom - 80);
+    const over = [...document.querySelectorAll(".card-over, .panel, #messages")].map((each) => each.getBoundingClientRect()).filter((box) => box.height && box.width > whole.width * 0.8 && box.bottom > whole.bottom - whole.height / 3);
     return Math.max(0, ...over.map((box) => whole.bottom - box.top));
   }
 

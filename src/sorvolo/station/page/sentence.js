@@ -53,7 +53,7 @@ export function sentence({ link, loaded, runs, objects, changes, pod, versions, 
   }
   say(...found(objects, pod, running, runs));
   const looked = lookedAt(pod);
-  say(looked ? `${percent(looked.share)} of the ground looked at (a person on it: ${percent(looked.from)}–${percent(looked.to)})` : "how much was looked at is not measured", "coverage");
+  say(looked ? `${percent(looked.share)} of the ground looked at (a person on it: ${Math.round(looked.from * 100)}–${percent(looked.to)})` : "how much was looked at is not measured", "coverage");
   const open = [...objects, ...changes].filter(({ properties }) => !properties.review && !properties.gone).length;
   if (changes.length) say(counted(changes.length, "change"), "compare");
   if (open) say(`${open} to review`, "review");
