@@ -41,6 +41,19 @@ def test_colour_steps_become_ramps_and_texture_stays():
     assert np.abs(picture[64, 128:140:2, 0] - picture[64, 129:141:2, 0]).min() > 15
 
 
+def test_a_brighter_neighbour_burns_no_texture():
+    """Ground with bright grains beside the same ground 60 levels brighter: the seam's ramp would push grains to white."""
+    grains = np.full((96, 160, 3), 150, np.uint8)
+    grains[::5, ::5] = 240
+    brighter = np.minimum(grains, 194) + np.uint8(60)
+    labels = np.where(np.arange(160) < 80, 0, 1) * np.ones((96, 1), np.int64)
+    found = blend(labels.astype(np.int16), [Layer(0, 0, 0, grains), Layer(1, 0, 0, brighter)])
+    assert found[:, :80].max() < 255
+    beside = found[:, 60:80]
+    assert beside[grains[:, 60:80] == 150].max() > 160  # the ramp is there
+    assert beside[grains[:, 60:80] == 240].min() > beside[grains[:, 60:80] == 150].max()
+
+
 def test_a_layer_may_cover_part_of_the_window():
     labels = np.full((160, 160), -1, np.int16)
     labels[64:96, 64:96] = 0

@@ -140,10 +140,14 @@ class _Bands:
         self._fine = [np.zeros((height >> k, width >> k, 3), np.int16) for k in range(_HARD_BANDS)]
         self._sums = [np.zeros((height >> k, width >> k, 3), np.float32) for k in soft]
         self._weights = [np.full((height >> k, width >> k), 1e-9, np.float32) for k in soft]
+        self._winners = np.zeros((height, width, 3), np.uint8)
 
     def add(self, layer: Layer, mask: ImageGray) -> None:
         """Add a layer where its `mask`, of its image's height and width, is 255."""
         gaussian, share = layer.image, mask.astype(np.float32)
+        rows = slice(layer.y_px, layer.y_px + layer.image.shape[0])
+        here = rows, slice(layer.x_px, layer.x_px + layer.image.shape[1])
+        self._winners[here] = cv2.copyTo(layer.image, mask, self._winners[here])
         for k in range(BANDS):
             rows = slice(layer.y_px >> k, (layer.y_px + layer.image.shape[0]) >> k)
             here = rows, slice(layer.x_px >> k, (layer.x_px + layer.image.shape[1]) >> k)
@@ -162,7 +166,10 @@ class _Bands:
                 gaussian, share = coarser, _coarser(share)
 
     def picture(self) -> ImageRGB:
-        """The bands added up again, (height, width, 3)."""
+        """The bands added up again, (height, width, 3).
+
+        Brighter neighbours take at most three quarters of what a pixel lacks to white: they burn none.
+        """
         coarse = [total / weight[..., None] for total, weight in zip(self._sums, self._weights)]
         soft: Numbers = coarse[-1]
         for band in coarse[-2::-1]:
@@ -172,7 +179,9 @@ class _Bands:
             picture = cv2.pyrUp(
                 cv2.add(picture, self._fine[k]), dstsize=self._fine[k - 1].shape[1::-1]
             )
-        return cv2.add(picture, self._fine[0], dtype=cv2.CV_8U)  # type: ignore[return-value]
+        brightest = (np.arange(256) + 3 * 255) // 4
+        most = cv2.LUT(self._winners, brightest.astype(np.uint8))
+        return cv2.min(cv2.add(picture, self._fine[0], dtype=cv2.CV_8U), most)  # type: ignore[return-value]
 
 
 def _coarser(picture: NDArray[_Pixel]) -> NDArray[_Pixel]:
