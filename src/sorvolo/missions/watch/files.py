@@ -3,6 +3,7 @@
 import queue
 import threading
 import time
+from bisect import bisect
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
@@ -75,7 +76,7 @@ class WatchFiles:
         self._shown_s = time.monotonic()
         self._labelled: list[tuple[LabelledPicture, Floats]] = []
         self._classes: tuple[str, ...] = ()
-        self._label_due_ns = -1
+        self._labelled_ns: list[int] = []  # rising
         self._queue: queue.Queue[SeenFrame | None] = queue.Queue(_MOST_WAITING)
         self._error: BaseException | None = None
         self._stack = ExitStack()
@@ -198,25 +199,29 @@ class WatchFiles:
             self._video.add(_drawn(seen), seen.time_ns)
         elif self._outputs.save == "pictures" and has_picture and len(seen.detections):
             write_annotated(self.folder / ANNOTATED_PICTURES, _file_name(seen.frame), _drawn(seen))
-        if self._outputs.labels and seen.time_ns >= self._label_due_ns:
-            self._label_due_ns = seen.time_ns + _LABELS_EVERY_NS
-            self._label(seen)
+        # times come in any order: a live flight's rest is searched after its newest frames
+        at = bisect(self._labelled_ns, seen.time_ns)
+        near = self._labelled_ns[max(at - 1, 0) : at + 1]
+        is_due = all(abs(each - seen.time_ns) >= _LABELS_EVERY_NS for each in near)
+        if self._outputs.labels and is_due and self._label(seen):
+            self._labelled_ns.insert(at, seen.time_ns)
 
-    def _label(self, seen: SeenFrame) -> None:
-        """Keep a frame as a picture, and what was seen in it for the files of labels."""
+    def _label(self, seen: SeenFrame) -> bool:
+        """Keep a frame as a picture, and what was seen in it for the files of labels; whether its picture is there."""
         images = self.folder / LABELS / "images"
         name = f"{self._site.name}_{_file_name(seen.frame)}.jpg"
         if seen.frame.image.size:
             make_folder(images)
             atomic_write_bytes(images / name, jpeg_from_image(seen.frame.image), durable=False)
         elif not (images / name).is_file():
-            return
+            return False
         height, width = seen.frame.image.shape[:2]
         picture = picture_of_detections(
             f"images/{name}", width, height, self._site.name, seen.detections
         )
         self._labelled.append((picture, seen.detections.scores))
         self._classes = seen.detections.classes
+        return True
 
     def _write_labels(self) -> None:
         if not self._labelled:
