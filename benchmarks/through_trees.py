@@ -14,7 +14,7 @@ import numpy as np
 
 from provenance import commit, machine, seeds_or_drawn
 from sorvolo.canopy.finds import look_under_trees
-from sorvolo.canopy.integral import LEAST_VIEWS
+from sorvolo.canopy.integral import LEAST_VIEWS, levelled
 from sorvolo.canopy.planting import plant_on_floor
 from sorvolo.geometry.summary import wilson
 from sorvolo.heights.lattice import Lattice
@@ -33,7 +33,7 @@ def look(seed: int, leaves_per_m2: float) -> dict[str, Any]:
     floor_m = float(draw.uniform(-4, 0))
     forest = make_forest(seed, 72.0, leaves_per_m2, people_m, floor_m)
     views = fly(forest, np.arange(-14, 15, 4.0), np.arange(-14, 15, 2.0), seed=seed)
-    pictures = [photograph(forest, view) for view in views]
+    pictures = [levelled(photograph(forest, view)) for view in views]
     count = round(SIDE_M / CELL_M)
     half_m = SIDE_M / 2
     lattice = Lattice(

@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 
 from sorvolo.canopy.finds import Finds, find_people, look_under_trees
-from sorvolo.canopy.integral import Floor, UnderTrees, against_surroundings, focus, integrate
+from sorvolo.canopy.integral import (
+    Floor,
+    UnderTrees,
+    against_surroundings,
+    focus,
+    integrate,
+    levelled,
+)
 from sorvolo.errors import InputError
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.views import View
@@ -34,7 +41,7 @@ def views(forest: Forest) -> list[View]:
 
 @pytest.fixture(scope="module")
 def pictures(forest: Forest, views: list[View]) -> list[np.ndarray]:
-    return [photograph(forest, view) for view in views]
+    return [levelled(photograph(forest, view)) for view in views]
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +79,10 @@ def test_warm_leaves_in_a_crown_are_no_people(
     hot = replace(
         forest, ground=forest.ground * 0, leaves=np.array([[0, 0, _FLOOR_M + 25, 0.5, 250]])
     )
-    seen = [np.maximum(photograph(hot, view), picture) for view, picture in zip(views, pictures)]
+    seen = [
+        np.maximum(levelled(photograph(hot, view)), picture)
+        for view, picture in zip(views, pictures)
+    ]
     floor_m = np.full(_LATTICE.shape, _FLOOR_M, np.float32)
     under = integrate(views, seen.__getitem__, _LATTICE, floor_m)
     assert len(find_people(under, views, seen.__getitem__).people) == len(_PEOPLE_M)
@@ -94,7 +104,7 @@ def test_one_strip_straight_on_a_spot_names_no_person(
 def test_ground_that_too_few_views_show_is_not_called_empty() -> None:
     bare = make_forest(5, 60, 0.0, _PEOPLE_M, _FLOOR_M)
     views = fly(bare, np.arange(-12, 13, 6.0), np.arange(-12, 13, 8.0))
-    pictures = [photograph(bare, view) for view in views]
+    pictures = [levelled(photograph(bare, view)) for view in views]
     with pytest.raises(InputError, match="more than 20 pictures, 24 are needed"):
         look_under_trees(views, pictures.__getitem__, _LATTICE, -9.0, 7.0)
 
@@ -128,7 +138,7 @@ def test_an_odd_colour_is_found_that_is_neither_bright_nor_dark() -> None:
         body = photograph(warm, view).astype(int) - photograph(bare, view)
         green = np.clip(draw.normal(100, 4, body.shape) - body // 2, 0, 255)
         red = np.clip(draw.normal(100, 4, body.shape) + body // 2, 0, 255)
-        colour.append(np.dstack([red, green, np.full_like(red, 80)]).astype(np.uint8))
+        colour.append(levelled(np.dstack([red, green, np.full_like(red, 80)])))
     floor_m = np.full(_LATTICE.shape, _FLOOR_M, np.float32)
     under = integrate(views, colour.__getitem__, _LATTICE, floor_m)
     assert len(find_people(under, views, colour.__getitem__).people) == len(_PEOPLE_M)

@@ -17,7 +17,6 @@ from sorvolo.canopy.integral import (
     focus,
     integrate,
     lay,
-    levelled,
     seeing,
 )
 from sorvolo.errors import InputError
@@ -75,7 +74,7 @@ def find_people(under: UnderTrees, views: Sequence[View], picture: Picture) -> F
         cell = int(columns[at]), int(rows[at])
         window = spot_window(under, cell)
         numbers = seeing(views, window, float(under.floor_m[cell[1], cell[0]]))
-        images = [levelled(picture(k)) for k in numbers]
+        images = [picture(k) for k in numbers]
         found = judge(under, cell, [views[k] for k in numbers], images)
         if isinstance(found, Find):
             people.append(found)

@@ -17,8 +17,8 @@ from sorvolo.geometry.arrays import Floats, Floats32, Mask, Numbers
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.views import View, inside, laid_pixels
 
-Picture = Callable[[int], Numbers]
-"""The picture of view k, (H, W) of a thermal camera or (H, W, 3) in colour."""
+Picture = Callable[[int], Floats32]
+"""The picture of view k as `levelled` gives it, (H, W) of a thermal camera or (H, W, 3) in colour."""
 
 LEAST_VIEWS = 24
 """Fewer views of a place do not blur crowns away; by choice."""
@@ -83,7 +83,7 @@ def lay(view: View, picture: Floats32, lattice: Lattice, floor_m: Floats32 | flo
 
 def pixels_from_cells(view: View, lattice: Lattice, up_m: float) -> Floats:
     """(3, 3) from cells on level ground to a view's pixels."""
-    plane = np.insert(lattice.site_from_cells, 2, [0, 0, up_m], axis=0)[:3]
+    plane = np.array([*lattice.site_from_cells[:2], [0, 0, up_m]])
     plane[:, 2] -= view.site_from_camera.translation_m
     return view.camera.matrix @ view.site_from_camera.rotation.T @ plane
 
@@ -133,7 +133,7 @@ def _sums(
     """For each floor (2, H, W, bands) sums and (2, H, W) counts of views, of the northern and the southern ones."""
     sums: list[tuple[Floats32, Numbers]] = []
     for number in seeing(views, lattice, floors_m[len(floors_m) // 2]):
-        view, image = views[number], levelled(picture(number))
+        view, image = views[number], picture(number)
         row = lattice.cells_from_site(view.site_from_camera.translation_m[None, :2])[0, 1]
         row = int(np.clip(row, 0, lattice.height))
         for k, floor_m in enumerate(floors_m):

@@ -12,7 +12,6 @@ from sorvolo.canopy.integral import (
     Picture,
     UnderTrees,
     lay,
-    levelled,
     pixels_from_cells,
     seeing,
 )
@@ -70,7 +69,7 @@ def plant_on_floor(
         cell = int(column), int(row)
         up_m = float(under.floor_m[row, column])
         window = spot_window(under, cell)
-        near = [(views[k], levelled(picture(k))) for k in seeing(views, window, up_m)]
+        near = [(views[k], picture(k)) for k in seeing(views, window, up_m)]
         laid = np.stack([lay(*each, window, up_m)[..., 0] for each in near])
         floor, shown, share = gaps(laid, window.cell_m)
         body = _body(window, draw)
@@ -96,9 +95,7 @@ def free_share(under: UnderTrees, views: Sequence[View], picture: Picture) -> Fl
     for x0, y0, x1, y1 in lattice.windows(_WINDOW_CELLS):
         box, window = np.s_[y0:y1, x0:x1], lattice.window(x0, y0, x1, y1)
         numbers = seeing(views, window, floor_m[box])
-        laid = [
-            lay(views[k], levelled(picture(k)), window, floor_m[box]).mean(axis=2) for k in numbers
-        ]
+        laid = [lay(views[k], picture(k), window, floor_m[box]).mean(axis=2) for k in numbers]
         if len(laid) > 1:
             share[box] = gaps(np.stack(laid), window.cell_m)[2]
     return np.asarray(cv2.resize(share, under.lattice.shape[::-1], interpolation=cv2.INTER_NEAREST))
@@ -130,15 +127,21 @@ def _mode(laid: Floats32) -> Floats32:
     """(H, W) the level that most of the views agree on, their mean there."""
     if not np.isfinite(laid).any():
         return np.full(laid.shape[1:], np.nan, np.float32)
-    low, high = np.nanmin(laid), np.nanmax(laid)
-    best, total = np.zeros((2, *laid.shape[1:]), np.float32)
-    for level in np.arange(low, high + _SENSOR_SIGMA, _SENSOR_SIGMA):
-        near = np.abs(laid - level) < 2 * _SENSOR_SIGMA
-        count = near.sum(axis=0)
-        better = count > best
-        best[better] = count[better]
-        total[better] = np.where(near, laid, 0).sum(axis=0)[better]
-    return total / np.maximum(best, 1)
+    known = np.isfinite(laid)
+    step = ((laid[known] - np.nanmin(laid)) / _SENSOR_SIGMA).astype(int) + 3
+    steps = step.max() + 4  # three empty ones at either end: a level takes two on each side
+    cell = np.nonzero(known.reshape(len(laid), -1))[1] * steps + step
+    size = laid[0].size
+    near, total = (
+        each.reshape(size, steps)[:, 4:] - each.reshape(size, steps)[:, :-4]
+        for each in (
+            np.cumsum(np.bincount(cell, weights, size * steps)) for weights in (None, laid[known])
+        )
+    )
+    best = near.argmax(axis=1)[:, None]
+    shown = np.take_along_axis(near, best, 1)
+    level = np.take_along_axis(total, best, 1) / np.maximum(shown, 1)
+    return level.astype(np.float32).reshape(laid.shape[1:])
 
 
 def _body(window: Lattice, draw: np.random.Generator) -> Floats32:

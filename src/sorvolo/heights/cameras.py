@@ -39,6 +39,7 @@ _LEAST_INLIERS = 20  # matches of two photos; by choice
 _LEAST_OVERLAP = 0.15  # of two views that are matched
 _NEIGHBOURS = 14  # views matched with each at most
 _MARGIN = 0.2  # of a picture: features so far beside what two views share on level ground may be shared too
+_NEARLY_ALL = 0.9  # of two views' features: what these do not share, all of them do not
 _REJECTED_PX = (8.0, 3.0)  # observations farther off are dropped, round by round
 _LEAST_SIGMA_M = 0.02  # of a fix
 
@@ -127,6 +128,8 @@ def _shared(left: _Found, right: _Found) -> Rows:
         good = _agreeing(left.rays[matched[:, 0]], right.rays[matched[:, 1]], threshold)
         if good.sum() >= _LEAST_INLIERS:
             return matched[good]
+        if sum(map(len, rows)) > _NEARLY_ALL * sum(map(len, every)):
+            break
     return matched[:0]
 
 
@@ -158,7 +161,7 @@ def _matched(
 
 def _agreeing(left: Floats, right: Floats, threshold: float) -> NDArray[np.bool_]:
     """(N,) which pairs of rays fit one relative motion of two cameras."""
-    if len(left) < 8:
+    if len(left) < _LEAST_INLIERS:
         return np.zeros(len(left), bool)
     _, inliers = cv2.findEssentialMat(left, right, np.eye(3), cv2.USAC_MAGSAC, 0.999, threshold)
     return np.zeros(len(left), bool) if inliers is None else inliers[:, 0] > 0

@@ -3,7 +3,7 @@
 import json
 import time
 from collections.abc import Generator, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import Floats32, ImageGray, ImageRGB, ImageRGBA
 from sorvolo.geometry.grid import SiteGrid, TileIndex
+from sorvolo.geometry.pose import Pose
 from sorvolo.heights.cameras import Cameras3D, solve_cameras
 from sorvolo.heights.figures import (
     camera_figures,
@@ -401,6 +402,46 @@ def write_heights(
     }
     atomic_write_bytes(folder / HeightFile.REPORT, json_bytes(report))
     return report
+
+
+def solved_before(
+    archive: Archive, keyframes: Sequence[StoredKeyframe], views: Sequence[View]
+) -> Cameras3D | None:
+    """The cameras in space that this mapping run's heights were made with; None without heights."""
+    path = archive.height_path(keyframes[0].flight_id, HeightFile.REPORT)
+    by_name = {view.name: view for view in views}
+    try:
+        report = json.loads(path.read_text())
+        if report["run"] != run_of(keyframes):
+            return None
+        cameras = report["cameras"]
+        x_px, y_px = cameras["optical_centre_px"]
+        stand = [
+            replace(
+                view,
+                camera=replace(
+                    view.camera.with_focal_px(cameras["focal_px"]), cx_px=x_px, cy_px=y_px
+                ),
+                site_from_camera=Pose(
+                    np.reshape(row["rotation"], (3, 3)),
+                    np.array([row[f"{axis}_m"] for axis in ("east", "north", "up")]),
+                ),
+            )
+            for row in cameras["places"]
+            for view in (by_name[row["frame"]],)
+        ]
+        return Cameras3D(
+            tuple(stand),
+            tuple(cameras["lost"]),
+            np.zeros((0, 3)),
+            cameras["residual_rms_px"],
+            cameras["focal_scale"],
+            tuple(cameras["radial"]),
+            np.full(3, np.nan),
+            cameras["observations"],
+        )
+    except (OSError, ValueError, KeyError, TypeError):  # no heights, or damaged ones
+        return None
 
 
 def ground_tiles(

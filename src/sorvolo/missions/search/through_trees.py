@@ -12,16 +12,22 @@ from sorvolo.canopy.finds import Find, Finds, average, look_under_trees
 from sorvolo.canopy.integral import LEAST_VIEWS, Floor, Picture, UnderTrees, lay, levelled
 from sorvolo.canopy.planting import PlantedFloor, free_share, plant_on_floor
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Numbers
+from sorvolo.geometry.arrays import Floats32, Numbers
 from sorvolo.heights.cameras import Cameras3D, find_tracks, solve_tracks
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.views import View, ground_outlines_m
-from sorvolo.missions.heights.run import FlightPictures, flight_views, height_grid, newest_flight
+from sorvolo.missions.heights.run import (
+    FlightPictures,
+    flight_views,
+    height_grid,
+    newest_flight,
+    solved_before,
+)
 from sorvolo.paths import AnyPath
 from sorvolo.store.atomic import atomic_write_bytes, make_folder
 from sorvolo.store.exports.places import place_deg
 from sorvolo.store.exports.plain import feature, feature_collection, geojson_bytes, json_bytes
-from sorvolo.store.images import ImageCache, jpeg_from_image
+from sorvolo.store.images import BytesCache, jpeg_from_image
 from sorvolo.store.rasters.height_model import write_height_cog
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import StoredKeyframe
@@ -30,7 +36,7 @@ from sorvolo.survey.map_objects import MapObject
 from sorvolo.survey.objects import PERSON
 from sorvolo.survey.wording import counted
 
-_PICTURES_BYTES = 160 << 20
+_PICTURES_BYTES = 224 << 20
 _LEAST_CELL_M = 0.08  # a body is ten cells long; finer ones cost more and show no more
 _GRAY = 12  # levels between the colours of a pixel in a thermal picture, at most
 _FLOOR_M = -30.0, 5.0  # where the floor is looked for, above the map's level ground
@@ -71,7 +77,8 @@ def search_under_trees(
                 f"{LEAST_VIEWS} or more: map photos of strips side by side (of a video only few frames are kept)"
             )
         yield UnderTreesUpdate(name, "cameras", 0)
-        solved, warning = _solved(views, FlightPictures(archive, keyframes))
+        before = solved_before(archive, keyframes, views)
+        solved, warning = _solved(views, FlightPictures(archive, keyframes), before)
         radial = (0.0, 0.0)
         if solved is not None:
             views, radial = solved.views, solved.radial
@@ -84,10 +91,17 @@ def search_under_trees(
 
         def load(number: int) -> Any:
             size = views[number].camera.width_px, views[number].camera.height_px
-            image = cv2.resize(pictures.colour(number), size, interpolation=cv2.INTER_AREA)
-            return image[..., 1] if is_thermal else image
+            image = np.asarray(
+                cv2.resize(pictures.colour(number), size, interpolation=cv2.INTER_AREA), np.uint8
+            )
+            # half levels take half the memory of floats: a median is at one
+            return (2 * levelled(image[..., 1] if is_thermal else image)).astype(np.int16)
 
-        picture = ImageCache(load, _PICTURES_BYTES).get
+        kept = BytesCache[int, Any](_PICTURES_BYTES, lambda image: image.nbytes)
+
+        def picture(number: int) -> Floats32:
+            return np.asarray(kept.get(number, lambda: load(number)) * np.float32(0.5))
+
         lattice = Lattice.over(ground_outlines_m(views), height_grid(site, cell_m))
         under, floor, finds = look_under_trees(views, picture, lattice, *_FLOOR_M)
         planted = None
@@ -117,15 +131,22 @@ def search_under_trees(
     yield report
 
 
-def _solved(views: Sequence[View], pictures: FlightPictures) -> tuple[Cameras3D | None, str]:
-    """The cameras in space, else none, and a warning where they are not what they should be.
+def _solved(
+    views: Sequence[View], pictures: FlightPictures, before: Cameras3D | None
+) -> tuple[Cameras3D | None, str]:
+    """The cameras in space, as solved before where heights are made, else none, and a warning where they are not what
+    they should be.
 
     Where crowns share few points, cameras that are free end anywhere; then the map's attitudes hold them.
     """
     try:
-        tracks = find_tracks(views, pictures.gray)
+        tracks = None
         for sigma_deg, most_lost in ((None, 0.1), (_ATTITUDE_SIGMA_DEG, 0.3)):
-            solved = solve_tracks(views, tracks, sigma_deg)
+            if sigma_deg is None and before is not None:
+                solved = before
+            else:
+                tracks = tracks or find_tracks(views, pictures.gray)
+                solved = solve_tracks(views, tracks, sigma_deg)
             why = (
                 f"points hold {len(solved.views)} of {len(views)} pictures, and a focal length "
                 f"{solved.focal_scale:.2f} times the map's"
@@ -238,10 +259,7 @@ def _crop(find: Find, views: Sequence[View], picture: Picture) -> Any:
     east_m, north_m, up_m = find.place_m
     corner = [[_CROP_CELL_M, 0, east_m - half], [0, -_CROP_CELL_M, north_m + half], [0, 0, 1]]
     window = Lattice(np.array(corner), cells, cells, _CROP_CELL_M)
-    laid = [
-        lay(view, levelled(picture(number)), window, float(up_m))
-        for number, view in enumerate(views)
-    ]
+    laid = [lay(view, picture(number), window, float(up_m)) for number, view in enumerate(views)]
     numbers = {view.name: number for number, view in enumerate(views)}
     shown = [laid[numbers[find.pictures[0]]], average(np.stack(laid))]
     return np.hstack([_stretched(each) for each in shown])
