@@ -11,6 +11,7 @@ import pytest
 import rasterio
 from fake_changes import fake_change
 from fake_flights import LOCAL_SITE, SITE, frame, map_flight, tile
+from rasterio.warp import transform as warp_transform
 
 from sealing import seal_again
 from sorvolo.cli.main import main
@@ -158,11 +159,23 @@ def test_the_map_is_written_as_it_was(site: Path, tmp_path: Path) -> None:
     assert np.array_equal(picture[:, 512:, 2], tile(21)[..., 0])
     export_version(site, "1", tmp_path / "map.KMZ")
     assert (tmp_path / "map.KMZ").read_bytes()[:2] == b"PK"
-    assert {path.name for path in tmp_path.iterdir()} == {"site", "map.tif", "map.png", "map.KMZ"}
+    export_version(site, "1", tmp_path / "map.mbtiles")
+    with (
+        rasterio.open(tmp_path / "map.mbtiles") as web,
+        rasterio.open(tmp_path / "map.tif") as map_,
+    ):
+        assert web.crs.to_epsg() == 3857 and len(web.overviews(1)) >= 2
+        middle = warp_transform(map_.crs, web.crs, *([each] for each in map_.xy(256, 768)))
+        assert abs(next(web.sample([(middle[0][0], middle[1][0])]))[0] - 21) <= 1
+    export_version(site, "1", tmp_path / "map.pdf")
+    written = (tmp_path / "map.pdf").read_bytes()
+    assert written[:5] == b"%PDF-" and b"/GPTS" in written
+    names = {"site", "map.tif", "map.png", "map.KMZ", "map.mbtiles", "map.pdf"}
+    assert {path.name for path in tmp_path.iterdir()} == names
 
 
 def test_what_cannot_be_written_is_refused(site: Path, tmp_path: Path) -> None:
-    with pytest.raises(SettingsError, match=r"\.tif, \.png or \.kmz"):
+    with pytest.raises(SettingsError, match=r"\.tif, \.png, \.kmz, \.mbtiles or \.pdf"):
         export_version(site, None, tmp_path / "map.jpg")
     with pytest.raises(InputError, match="no folder"):
         export_version(site, None, tmp_path / "none" / "map.tif")
@@ -171,8 +184,9 @@ def test_what_cannot_be_written_is_refused(site: Path, tmp_path: Path) -> None:
     with Archive.open(tmp_path / "pond", write=True) as archive:
         archive.create_site(LOCAL_SITE)
         map_flight(archive, "a", 20, count=1)
-    with pytest.raises(SettingsError, match="no place on Earth"):
-        export_version(tmp_path / "pond", None, tmp_path / "map.kmz")
+    for ending in ("kmz", "mbtiles", "pdf"):
+        with pytest.raises(SettingsError, match="no place on Earth"):
+            export_version(tmp_path / "pond", None, tmp_path / f"map.{ending}")
 
 
 def test_lists_fit_a_terminal_of_eighty_letters(

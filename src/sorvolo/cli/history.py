@@ -31,7 +31,8 @@ def history(
         typer.Option(help="Version number, or a date or time (UTC): the newest version by then."),
     ] = None,
     export: Annotated[
-        Path | None, typer.Option(help="Write the map as it was: FILE.tif, .png or .kmz.")
+        Path | None,
+        typer.Option(help="Write the map as it was: FILE.tif, .png, .kmz, .mbtiles or .pdf."),
     ] = None,
     coordinates: PlaceFormatOption = "latlon",
     as_json: AsJson = False,
@@ -47,7 +48,7 @@ def history(
 
     if at is not None and export is None:
         raise SettingsError(
-            "--at chooses the map to write: give --export FILE.tif, FILE.png or FILE.kmz as well"
+            "--at chooses the map to write: give --export FILE.tif (or .png, .kmz, .mbtiles, .pdf) as well"
         )
     with opened_site(site) as place:
         folder = str(place.folder)

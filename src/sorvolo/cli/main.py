@@ -183,7 +183,7 @@ def options(
     ] = False,
     config: Annotated[
         Path | None,
-        typer.Option(help="A TOML file with a table of options for each command, such as [map]."),
+        typer.Option(help="A TOML file with a table of options for each command, such as `map`."),
     ] = None,
 ) -> None:
     """Maps from small drones: geo-referenced, compared with earlier flights, searched for people and cars.

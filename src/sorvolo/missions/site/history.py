@@ -9,7 +9,7 @@ from pathlib import Path
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.findings.importance import between
 from sorvolo.store.exports.map_pictures import write_kmz, write_preview
-from sorvolo.store.rasters.geotiff import write_cog
+from sorvolo.store.rasters.geotiff import write_cog, write_mbtiles_or_pdf
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import VersionEntry
 from sorvolo.survey.findings import Verdict
@@ -19,7 +19,7 @@ _STEPS = {
     4: timedelta(minutes=1),
     6: timedelta(seconds=1),
 }  # by digits of a time of day
-_ENDINGS = (".tif", ".tiff", ".png", ".kmz")
+_ENDINGS = (".tif", ".tiff", ".png", ".kmz", ".mbtiles", ".pdf")
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,8 @@ def find_version(archive: Archive, at: str) -> VersionEntry:
 def export_version(
     site: Path, at: str | None, path: Path, *, compress: str = "deflate"
 ) -> VersionEntry:
-    """Write the map as it was at a version or date (see `find_version`; None: now) to a .tif, .png or .kmz file.
+    """Write the map as it was at a version or date (see `find_version`; None: now) to a .tif, .png, .kmz, .mbtiles or .pdf
+    file.
 
     Returns the version. Raises SettingsError for another ending, InputError when there was no map or the file's
     folder does not exist, StoreError on a full disk.
@@ -141,7 +142,7 @@ def _check_target(path: Path) -> None:
     """Raises SettingsError or InputError where no map can be written to the path."""
     if path.suffix.lower() not in _ENDINGS:
         raise SettingsError(
-            f"{path.name}: the map is written as .tif, .png or .kmz; give a name with such an ending"
+            f"{path.name}: the map is written as .tif, .png, .kmz, .mbtiles or .pdf; give a name with such an ending"
         )
     if not path.resolve().parent.is_dir():
         raise InputError(
@@ -158,14 +159,16 @@ def _write_map(archive: Archive, version: VersionEntry, path: Path, compress: st
             f"version {version.id} of the map of {archive.folder} is empty; there is nothing to write"
         )
     ending = path.suffix.lower()
-    if ending == ".kmz" and site.is_local:
+    if ending in _ENDINGS[3:] and site.is_local:
         raise SettingsError(
-            f"{archive.folder} has no place on Earth, so its map cannot be a KMZ; write .tif or .png"
+            f"{archive.folder} has no place on Earth, so its map cannot be a {ending}; write .tif or .png"
         )
     if ending == ".png":
         write_preview(tiles, path)
     elif ending == ".kmz":
         write_kmz(tiles, archive.site_grid(), site.name, path)
+    elif ending in _ENDINGS[4:]:
+        write_mbtiles_or_pdf(tiles, archive.site_grid(), site.name, path)
     else:
         write_cog(
             tiles, archive.site_grid(), path, crs=version.export_crs or None, compress=compress

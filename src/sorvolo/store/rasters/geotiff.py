@@ -223,6 +223,27 @@ def write_cog(
             _verify(temporary, source, is_jpeg=is_jpeg)
 
 
+def write_mbtiles_or_pdf(
+    tiles: Mapping[TileIndex, ImageRGBA], site_grid: SiteGrid, name: str, path: Path
+) -> None:
+    """Write the map for the apps of a tablet: .mbtiles (web tiles in one file, from one tile on) or .pdf (GeoPDF).
+
+    The site must have a CRS. Raises StoreError for an empty map or a full disk.
+    """
+    with scratch_folder(path.parent) as scratch, quiet_gdal(), _naming_faults(path):
+        write_cog(tiles, site_grid, plain := scratch / "map.tif")
+        with atomic_path(path) as temporary:
+            if path.suffix.lower() == ".pdf":
+                rasterio.shutil.copy(plain, temporary, driver="PDF", title=name)
+                return
+            rasterio.shutil.copy(
+                plain, temporary, driver="MBTiles", tile_format="PNG", name=name, description=name
+            )
+            with rasterio.open(temporary, "r+", driver="MBTiles") as made:
+                levels = range(1, max(1, max(made.shape) // 128).bit_length() + 1)
+                made.build_overviews([2**each for each in levels], Resampling.average)
+
+
 def parse_crs(crs: str, grid: Grid) -> CRS:
     """The CRS to reproject a map to; raises SettingsError when unknown or when the map is not on Earth."""
     if not grid.crs:
