@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from shutil import copytree
 
 import numpy as np
 import pytest
@@ -10,7 +11,14 @@ from forest_site import forest_site
 
 from sorvolo.cli.main import main
 from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.grid import SiteGrid
 from sorvolo.lab.simulation.forest import fly, make_forest, photograph
+from sorvolo.missions.search.measure import MeasuredClass, MeasuredFlight, SearchedPlants
+from sorvolo.missions.search.through_trees import seen_floor
+from sorvolo.search.cells import Cells
+from sorvolo.search.conditions import Conditions
+from sorvolo.search.outcomes import Outcomes
+from sorvolo.search.recall import Chances
 from sorvolo.store.site.archive import Archive
 
 _PEOPLE_M = np.array([[-4.0, -3.0], [4.0, 5.0]])
@@ -58,6 +66,39 @@ def test_the_finds_are_findings_of_the_site(searched: tuple[Path, int], site: Pa
     assert all((site / "flights/flown/objects" / f"{each.thing.id}.jpg").is_file() for each in kept)
     listed = json.loads((site / "objects.geojson").read_text())["features"]
     assert len(listed) == len(_PEOPLE_M)
+
+
+def test_a_search_counts_the_floor_that_was_seen_below_what_hides_it(
+    searched: tuple[Path, int], site: Path
+) -> None:
+    out = Path(copytree(searched[0], site.parent / "again"))
+    written = out / "under_trees.json"
+    report = json.loads(written.read_text())
+    places_m = np.array([report["people"][0]["place_m"][:2], [40.0, 0.0]])
+    with Archive.open(site, write=False) as archive:
+        whole = archive.site()
+        written.write_text(json.dumps(report | {"headline": {"complete": False}}))
+        assert seen_floor(out, archive, "flown") is None  # its cameras may be off
+        written.write_text(json.dumps(report | {"headline": {"complete": True}}))
+        floor = seen_floor(out, archive, "flown")
+        assert seen_floor(out, archive, "another") is None
+    grid = SiteGrid.at(whole.origin, 1.0, whole.crs)
+    cells = Cells(grid, -45, -5, 90, 10, np.ones(900, bool))
+    rows = cells.rows_at(places_m)
+    crowns, roofs = np.zeros(900), np.zeros(900, bool)
+    crowns[rows], roofs[rows] = 1.0, True
+    seen = Conditions(np.full(900, 9), np.zeros((900, 8)), crowns, roofs)
+    chances = Chances(*[np.where(crowns, 0.0, 0.8)] * 3)
+    none = Outcomes(np.zeros((0, 2)), np.zeros((0, 8)), np.zeros(0, bool), np.zeros(0))
+    classes = [MeasuredClass(label, seen, none, None, chances) for label in ("person", "car")]
+    flight = MeasuredFlight(
+        "flown", 36, SearchedPlants(0, 0, 0.0, ()), False, True, True, 0.0, tuple(classes)
+    )
+    assert floor is not None
+    person, car = (each.chances for each in flight.with_floor(floor, cells).classes)
+    assert person.mean[rows].tolist() == [report["detection"]["pod"], 0.0]
+    assert person.low[rows[0]] == report["detection"]["pod_low"]
+    assert (np.delete(person.mean, rows) == 0.8).all() and not car.mean[rows].any()
 
 
 def test_a_flight_with_too_few_pictures_is_refused(

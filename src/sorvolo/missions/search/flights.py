@@ -26,6 +26,7 @@ from sorvolo.missions.search.prepare import (
 )
 from sorvolo.missions.search.report import Searched, write_search
 from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
+from sorvolo.missions.search.through_trees import seen_floor
 from sorvolo.paths import AnyPath
 from sorvolo.search.cells import Cells, cells_of
 from sorvolo.store.atomic import make_folder
@@ -96,4 +97,6 @@ def _measured(
             known[name] = basis, flight.searched
             make_folder(folder)
             write_plants(folder, site, known)
+        if (floor := seen_floor(folder, archive, name)) is not None:
+            measured[-1] = flight.with_floor(floor, cells)
     return measured

@@ -2,13 +2,17 @@
 
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
+import numpy as np
+
+from sorvolo.canopy.integral import LEAST_VIEWS
 from sorvolo.detection.fusing import is_from_above
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import BoxesPx, Floats, ImageRGB, PointsM, Vector3
 from sorvolo.geometry.sun import direction_from_angles
+from sorvolo.heights.field import HeightField
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.map_objects import check_classes
 from sorvolo.missions.flight.setup import sun_over
@@ -22,7 +26,7 @@ from sorvolo.search.plant_places import PlantField, PlantPlace, plant_places, se
 from sorvolo.search.recall import Chances, Recall, fit_recall, map_chances
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import PlacedFrame
-from sorvolo.survey.objects import CLASSES, TYPICAL_SIZE_M
+from sorvolo.survey.objects import CLASSES, PERSON, TYPICAL_SIZE_M
 from sorvolo.tracking.laying import LaidSighting, lay_on_ground, pose_of
 from sorvolo.tracking.map_objects import reported_plants
 from sorvolo.tracking.view_evidence import least_seen
@@ -31,6 +35,7 @@ Planted: TypeAlias = tuple[PlantPlace, bool]
 """Where one plant stood, and whether a map would report it."""
 
 KEEP_OFF_M = 4.0  # plants from what a map shows already
+_LEAST_FREE = 0.1  # of the views of a floor: a roof leaves none, few chance levels; by choice
 _MOST_DETECTIONS = 60  # of one frame beside its plants, as maps take them
 
 
@@ -76,6 +81,42 @@ class MeasuredFlight:
     blur_px: float
     classes: tuple[MeasuredClass, ...]
     is_earlier: bool = False
+    floor: "FloorBelow | None" = None
+
+    def with_floor(self, floor: "SeenFloor", cells: Cells) -> "MeasuredFlight":
+        """The flight with a person's chance on the floor below what hides the ground from single pictures."""
+        views, free = floor.shows.at(cells.centres_m)
+        with np.errstate(invalid="ignore"):
+            shown = (views >= LEAST_VIEWS) & (free >= _LEAST_FREE)
+        classes, area_m2 = [], 0.0
+        for own in self.classes:
+            if own.label == PERSON:
+                below = shown & (own.seen.under_trees | own.seen.roofs)
+                area_m2 = float((below & cells.wanted).sum()) * cells.cell_m**2
+                before = own.chances.mean, own.chances.low, own.chances.high
+                chances = (np.where(below, new, old) for new, old in zip(floor.pod, before))
+                own = replace(own, chances=Chances(*chances))
+            classes.append(own)
+        return replace(self, classes=tuple(classes), floor=FloorBelow(*floor.pod, area_m2))
+
+
+@dataclass(frozen=True, eq=False)
+class SeenFloor:
+    """A look through a flight's trees: the chance of a person on the floor with a 90 % interval, (mean, low, high), and
+    how many views show the floor (`up_m`) and the share of them that crowns leave free (`sigma_m`)."""
+
+    pod: tuple[float, float, float]
+    shows: HeightField
+
+
+@dataclass(frozen=True)
+class FloorBelow:
+    """What a look through the trees adds to a search: a person's chance on so much floor of the area."""
+
+    pod: float
+    pod_low: float
+    pod_high: float
+    area_m2: float
 
 
 @dataclass(frozen=True)

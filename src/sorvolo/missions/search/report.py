@@ -244,6 +244,7 @@ def _flight_row(flight: MeasuredFlight) -> dict[str, Any]:
         "heights": flight.has_heights,
         "thermal": flight.is_thermal,
         "blur_px": round(flight.blur_px, 2),
+        "under_trees": None if flight.floor is None else asdict(flight.floor),
         "classes": classes,
     }
 
@@ -327,9 +328,16 @@ def _warnings(searched: Searched, settings: SearchSettings, *, is_over: bool) ->
             "trees were recognised in the pictures, which miss some that stand alone, and roofs count as ground: "
             "`sorvolo heights` measures both, for the next search"
         )
-    if settings.through_crowns == 0:
+    for flight in searched.flights:
+        if flight.floor is not None:
+            warnings.append(
+                f"{flight.name}: {flight.floor.area_m2:,.0f} m2 below crowns count by its look through the trees: "
+                f"{flight.floor.pod:.2f} (90 % interval {flight.floor.pod_low:.2f} to {flight.floor.pod_high:.2f})"
+            )
+    if settings.through_crowns == 0 and any(each.floor is None for each in searched.flights):
         warnings.append(
-            "ground under trees counts as not found at all; --through-crowns assumes gaps in crowns"
+            "ground under trees counts as not found at all; --through-trees looks below them, --through-crowns assumes "
+            "gaps in crowns"
         )
     if "person" in searched.labels:
         warnings.append(

@@ -1,5 +1,6 @@
 """`sorvolo search --through-trees`: a mapped flight's pictures put together on the floor below crowns, and its finds."""
 
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from sorvolo.canopy.planting import PlantedFloor, free_share, plant_on_floor
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats32, Numbers
 from sorvolo.heights.cameras import Cameras3D, find_tracks, solve_tracks
+from sorvolo.heights.field import HeightField
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.views import View, ground_outlines_m
 from sorvolo.missions.heights.run import (
@@ -21,14 +23,16 @@ from sorvolo.missions.heights.run import (
     flight_views,
     height_grid,
     newest_flight,
+    run_of,
     solved_before,
 )
+from sorvolo.missions.search.measure import SeenFloor
 from sorvolo.paths import AnyPath
 from sorvolo.store.atomic import atomic_write_bytes, make_folder
 from sorvolo.store.exports.places import place_deg
 from sorvolo.store.exports.plain import feature, feature_collection, geojson_bytes, json_bytes
 from sorvolo.store.images import BytesCache, jpeg_from_image
-from sorvolo.store.rasters.height_model import write_height_cog
+from sorvolo.store.rasters.height_model import read_height_cog, write_height_cog
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import StoredKeyframe
 from sorvolo.survey.flight import Site
@@ -42,6 +46,7 @@ _GRAY = 12  # levels between the colours of a pixel in a thermal picture, at mos
 _FLOOR_M = -30.0, 5.0  # where the floor is looked for, above the map's level ground
 _ATTITUDE_SIGMA_DEG = 0.5  # of the map's attitudes where points alone do not hold the cameras
 _MOST_STRETCH = 0.06  # of the focal length, three sigmas of what it may be off
+_POD = "pod", "pod_low", "pod_high"
 _CROP_M, _CROP_CELL_M = 8.0, 0.04
 
 
@@ -112,6 +117,7 @@ def search_under_trees(
         archive.keep_under_trees(name, _objects(name, finds, views, keyframes, picture))
         report = _report(name, site, under, floor, finds, planted)
         report |= {"pictures": len(views), "warnings": [warning] if warning else []}
+        report |= {"run": run_of(keyframes), "cell_m": cell_m}
         report["headline"]["complete"] = not warning
         report["notices"] = [asdict(each) for each in archive.notices]
     make_folder(folder)
@@ -129,6 +135,26 @@ def search_under_trees(
     atomic_write_bytes(folder / "under_trees.geojson", geojson_bytes(collection))
     atomic_write_bytes(folder / "under_trees.json", json_bytes(report))
     yield report
+
+
+def seen_floor(folder: Path, archive: Archive, flight: str) -> SeenFloor | None:
+    """What a look through the trees of a flight's present map, its files in `folder`, saw of the floor; None without
+    one, without its probability of detection, or where its cameras were not solved as they should be."""
+    try:
+        report = json.loads((folder / "under_trees.json").read_text())
+        is_present = report["flight"] == flight and report["run"] == run_of(
+            archive.keyframes(flight)
+        )
+        if not (is_present and report["detection"] and report["headline"]["complete"]):
+            return None
+        grid = height_grid(archive.site(), float(report["cell_m"]))
+        read = read_height_cog(folder / "under_trees.tif", grid.grid)
+        _, _, views, free, _ = read.bands
+        lattice = Lattice.at(grid, read.first, views.shape[1], views.shape[0])
+        mean, low, high = (float(report["detection"][name]) for name in _POD)
+        return SeenFloor((mean, low, high), HeightField(lattice, views, free))
+    except (OSError, ValueError, KeyError, TypeError, InputError):  # damaged: it counts as unseen
+        return None
 
 
 def _solved(
@@ -194,7 +220,7 @@ def _report(
     )
     pod = None
     if planted is not None and len(planted.found):
-        pod = dict(zip(("pod", "pod_low", "pod_high"), planted.pod))
+        pod = dict(zip(_POD, planted.pod))
         pod |= {"planted": len(planted.found), "free_share": float(planted.free_share.mean())}
         text += (
             f"; probability of detection of a person lying there: {pod['pod']:.2f} (90 % interval "
