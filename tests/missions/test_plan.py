@@ -20,6 +20,7 @@ from sorvolo.missions.plan_flight import (
     answer_questions,
     camera_to_plan_with,
     plan_over,
+    through_trees,
     write_plan,
 )
 from sorvolo.survey.area import Area
@@ -106,6 +107,22 @@ def test_answers_fit_together():
     assert answers.footprint_m[1] == pytest.approx(answers.ground_sampling_m * 720)
     assert answers.photo_spacing_m == pytest.approx(0.4 * answers.footprint_m[1])
     assert answers.minimum_frame_rate_hz == pytest.approx(4.0 / answers.photo_spacing_m)
+
+
+def test_strips_are_so_close_that_enough_pictures_show_each_spot_between_crowns():
+    settings = PlanSettings(height_m=45.0)
+    thermal = camera_to_plan_with("aov=50", (512, 512))
+    half, dense = (
+        answer_questions(thermal, through_trees(settings, hidden)) for hidden in (0.5, 0.97)
+    )
+    assert 3.5 < half.strip_spacing_m < 4.5 and 1.8 < half.photo_spacing_m < 2.3
+    assert half.views * 0.5 > 12 and dense.views * 0.03 == pytest.approx(12)
+    assert dense.strip_spacing_m < half.strip_spacing_m
+    assert "detector" not in half.height_bounds_m
+    shown = run("--camera", "aov=50", "--height", 45, "--through-trees", 0.5, "--size", "512x512")
+    assert "200 pictures, 100 of them between crowns" in " ".join(shown.output.split())
+    refused = run("--camera", "aov=50", "--through-trees", 0.99)
+    assert isinstance(refused.exception, SettingsError) and "0 to 0.97" in str(refused.exception)
 
 
 def test_a_preset_plans_with_its_full_photo():

@@ -40,6 +40,12 @@ StripBearing = Annotated[
     float,
     typer.Option(help="Direction of the strips, deg from north.", show_default="along the area"),
 ]
+ThroughTrees = Annotated[
+    float | None,
+    typer.Option(
+        help="Plan for `search --through-trees` below crowns that hide this share of the floor, such as 0.6."
+    ),
+]
 PictureSize = Annotated[str, typer.Option(help="Picture size, such as 1920x1080.")]
 WaypointFiles = Annotated[
     list[Path] | None,
@@ -61,6 +67,7 @@ def plan(
     overlap: ForwardOverlap = 0.75,
     side_overlap: SideOverlap = 0.65,
     bearing: StripBearing = math.nan,
+    through_trees: ThroughTrees = None,
     area: Area = None,
     out: WaypointFiles = None,
     dji_drone: DjiDrone = "fly",
@@ -90,6 +97,8 @@ def plan(
     )
     if not math.isnan(critical_m):  # another object than a person
         settings = replace(settings, critical_m=critical_m, person_m=math.nan)
+    if through_trees is not None:
+        settings = planning.through_trees(settings, through_trees)
     if out and area is None:
         raise SettingsError("--out writes waypoints over an area: give --area FILE as well")
     chosen = planning.camera_to_plan_with(camera, size_px(size))
@@ -102,11 +111,15 @@ def plan(
     if as_json:
         print_json(_as_json(answers, flight, out or []))
     else:
-        _show(answers, flight, out or [], settings)
+        _show(answers, flight, out or [], settings, through_trees)
 
 
 def _show(
-    answers: "FlightAnswers", flight: "FlightPlan | None", out: list[Path], settings: "PlanSettings"
+    answers: "FlightAnswers",
+    flight: "FlightPlan | None",
+    out: list[Path],
+    settings: "PlanSettings",
+    hidden: float | None,
 ) -> None:
     console = Console()
     table = Table("", "", title="Flight plan", show_header=False, title_justify="left")
@@ -156,11 +169,10 @@ def _show(
             f"{answers.strip_spacing_m:.1f} m apart for {settings.side_overlap:.0%} overlap",
         ),
     ]
-    for row in (
-        *camera_rows,
-        *rows,
-        *rate_rows,
-    ):
+    if hidden is not None:
+        free = f"{answers.views * (1 - hidden):.0f} of them between crowns that hide {hidden:.0%}"
+        rate_rows.append(("a spot is in", f"{answers.views:.0f} pictures, {free}"))
+    for row in (*camera_rows, *rows, *rate_rows):
         table.add_row(*row)
     if flight is not None:
         table.add_row(

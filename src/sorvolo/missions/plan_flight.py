@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 
@@ -42,6 +42,11 @@ _REFLY_FORWARD_OVERLAP = 0.7  # as `sorvolo map` selects frames
 REFLY_BESIDE = 0.2  # of the height: how far the passes reach into what was seen
 REFLY_MOST_HOLES = 60  # the largest: more waypoints than drones take, and hours of flight
 REFLY_LEAST_M2 = 20.0  # of a hole in a search
+_MOST_OVERLAP = 0.95  # 45 m high and 50 degrees wide, a picture every 2 m
+_TIED_OVERLAP = (
+    0.9  # strips 4 m apart there: crowns look too different from farther apart to tie them
+)
+_FREE_VIEWS = 12  # between crowns, of each spot
 REFLY_LOWEST_M = 10.0  # above ground, where a search's pictures were too coarse
 
 
@@ -105,6 +110,7 @@ class FlightAnswers:
     minimum_frame_rate_hz: float
     photo_spacing_m: float
     strip_spacing_m: float
+    views: float  # pictures that show each spot
 
 
 def camera_to_plan_with(option: str, size_px: tuple[int, int] | None = None) -> CameraModel:
@@ -157,6 +163,28 @@ def answer_questions(model: CameraModel, settings: PlanSettings) -> FlightAnswer
         ),
         photo_spacing_m=length_m * (1 - strips.forward_overlap),
         strip_spacing_m=width_m * (1 - strips.side_overlap),
+        views=1 / ((1 - strips.side_overlap) * (1 - strips.forward_overlap)),
+    )
+
+
+def through_trees(settings: PlanSettings, hidden: float) -> PlanSettings:
+    """The flight that `search --through-trees` needs below crowns that hide this share of the floor.
+
+    Pictures overlap as settings ask for, or more: strips tie to each other, and enough pictures show each spot between
+    crowns. Raises SettingsError for a share that no flight looks through.
+    """
+    most = 1 - _FREE_VIEWS * (1 - _MOST_OVERLAP) ** 2
+    if not 0 <= hidden <= most:
+        raise SettingsError(
+            f"--through-trees {hidden:g}: give the share of the floor that crowns hide, 0 to {most:.2f}; below denser "
+            f"crowns no flight shows a spot in {_FREE_VIEWS} pictures"
+        )
+    apart = min(1 - _TIED_OVERLAP, (1 - hidden) / (_FREE_VIEWS * (1 - _MOST_OVERLAP)))
+    return replace(
+        settings,
+        model="none",
+        forward_overlap=_MOST_OVERLAP,
+        side_overlap=max(settings.side_overlap, 1 - apart),
     )
 
 
