@@ -4,7 +4,6 @@ A size is a ratchet: a change that makes it smaller lowers the number here. Who 
 """
 
 import ast
-import io
 import re
 import tokenize
 from collections import Counter
@@ -26,16 +25,26 @@ MOST_DOUBLE_CLASS_NAMES = 0
 MOST_SMALL_NEIGHBOURS = 5
 
 _NESTING = (ast.If, ast.For, ast.AsyncFor, ast.While, ast.Match)  # what a reader must decide
-_NO_CODE = {
-    tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.ENCODING, tokenize.ENDMARKER,
-    tokenize.INDENT, tokenize.DEDENT,
-}  # fmt: skip
+_STRING = r'[rbfu]{0,2}(?:"""(?s:.*?)"""|\'{3}(?s:.*?)\'{3}|"(?:\\.|[^"\\])*"|\'(?:\\.|[^\'\\])*\')'
+_NUMBER_OR_SIGN = re.sub(r"(?<!\\)\((?!\?)", "(?:", rf"{tokenize.Number}|\w+|{tokenize.Special}")
+_TOKEN = re.compile(rf"#.*|([^\W\d]\w\w+|{_STRING}|{_NUMBER_OR_SIGN})", re.IGNORECASE)
 _Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
 @cache
-def _parsed(path: Path) -> ast.Module:
-    return ast.parse(path.read_text())
+def _statements(path: Path) -> list[ast.AST]:
+    """A module, and all its statements at any depth."""
+    found: list[ast.AST] = [ast.parse(path.read_text())]
+    for node in found:
+        found.extend(_blocks(node))
+    return found
+
+
+def _blocks(node: ast.AST) -> Iterator[ast.AST]:
+    """What is nested in a statement: statements, and the parts of a `try` and a `match`."""
+    for name in ("body", "orelse", "handlers", "finalbody", "cases"):
+        parts = getattr(node, name, None)
+        yield from parts if isinstance(parts, list) else []
 
 
 def _sources() -> list[Path]:
@@ -43,7 +52,7 @@ def _sources() -> list[Path]:
 
 
 def _functions(path: Path) -> Iterator[_Function]:
-    for node in ast.walk(_parsed(path)):
+    for node in _statements(path):
         if isinstance(node, _Function):
             yield node
 
@@ -51,28 +60,23 @@ def _functions(path: Path) -> Iterator[_Function]:
 def _nesting(node: ast.AST) -> int:
     """Return how many blocks are nested in a node at the deepest place; `elif` is no level."""
     deepest = 0
-    for name, value in ast.iter_fields(node):
-        for child in value if isinstance(value, list) else [value]:
-            if not isinstance(child, ast.AST) or isinstance(child, _Function | ast.ClassDef):
-                continue
-            is_elif = name == "orelse" and isinstance(node, ast.If) and isinstance(child, ast.If)
-            level = 1 if isinstance(child, _NESTING) and not is_elif else 0
-            deepest = max(deepest, level + _nesting(child))
+    for child in _blocks(node):
+        if isinstance(child, _Function | ast.ClassDef):
+            continue
+        is_elif = isinstance(node, ast.If) and child in node.orelse and isinstance(child, ast.If)
+        level = 1 if isinstance(child, _NESTING) and not is_elif else 0
+        deepest = max(deepest, level + _nesting(child))
     return deepest
 
 
 def _tokens(path: Path) -> int:
-    docstrings = {
-        node.body[0].lineno
-        for node in ast.walk(_parsed(path))
-        if isinstance(node, ast.Module | ast.ClassDef | _Function)
+    """Count the tokens of a file, comments and docstrings aside."""
+    docstrings = sum(
+        isinstance(node, ast.Module | ast.ClassDef | _Function)
         and ast.get_docstring(node, False) is not None
-    }
-    return sum(
-        token.type not in _NO_CODE
-        and not (token.type == tokenize.STRING and token.start[0] in docstrings)
-        for token in tokenize.generate_tokens(io.StringIO(path.read_text()).readline)
+        for node in _statements(path)
     )
+    return sum(bool(each) for each in _TOKEN.findall(path.read_text())) - docstrings
 
 
 def test_functions_are_of_a_length_and_depth_that_a_reader_holds() -> None:
@@ -90,7 +94,7 @@ def test_no_more_public_classes_share_a_name() -> None:
     names = Counter(
         node.name
         for path in _sources()
-        for node in _parsed(path).body
+        for node in _statements(path)[0].body  # type: ignore[attr-defined]
         if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
     )
     double = sorted(name for name, count in names.items() if count > 1)
@@ -101,7 +105,7 @@ def test_no_more_small_modules_serve_one_neighbour() -> None:
     """A module of a few lines that one module of its own folder imports belongs into that one."""
     importers: dict[str, set[Path]] = {}
     for path in _sources():
-        for node in ast.walk(_parsed(path)):
+        for node in _statements(path):
             if isinstance(node, ast.ImportFrom) and node.module and not node.level:
                 for module in (node.module, *(f"{node.module}.{name.name}" for name in node.names)):
                     importers.setdefault(module, set()).add(path)

@@ -45,9 +45,13 @@ def chromium() -> Iterator[Any]:
 
 
 def context_of(browser: Any, *, keeps: bool = False, **options: Any) -> Any:
-    """A browser's own world; `keeps`: with the page's service worker, whose requests no route of a test sees."""
+    """A browser's own world; `keeps`: with the page's service worker, whose requests no route of a test sees.
+
+    Its window is small and nothing in it moves by itself: most of a test's time would go into painting it.
+    """
     workers = "allow" if keeps else "block"
-    return browser.new_context(**({"service_workers": workers} | options))
+    still = {"reduced_motion": "reduce", "viewport": {"width": 900, "height": 600}}
+    return browser.new_context(**({"service_workers": workers} | still | options))
 
 
 class Served:
