@@ -302,7 +302,7 @@ def test_a_list_of_files_named_as_a_video_opens_none_of_them(tmp_path: Path) -> 
     with pytest.raises(InputError, match="list of other files"):
         open_sources([named])
     with pytest.raises(InputError, match="no picture"):
-        open_sources([f"follow:{named}"], live=LiveSettings(first_s=0.5))
+        open_sources([f"follow:{named}"], live=LiveSettings(first_s=0.5, give_up_s=0.5))
 
 
 def test_sample_frames_are_spread_over_the_video(tmp_path: Path) -> None:

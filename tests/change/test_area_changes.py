@@ -203,7 +203,14 @@ def cast_shadow(image: Rgb, index: int) -> Rgb:
 
 
 @pytest.mark.parametrize("light", [exposure, cloud, evening, cast_shadow])
-@pytest.mark.parametrize("kind", [GroundKind.COUNTRYSIDE, GroundKind.DIRT, GroundKind.URBAN])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        GroundKind.COUNTRYSIDE,
+        pytest.param(GroundKind.DIRT, marks=pytest.mark.long),
+        pytest.param(GroundKind.URBAN, marks=pytest.mark.long),
+    ],
+)
 def test_light_is_no_change(kind, light):
     ground = painted(kind, 1)
     assert changes_of(ground, ground, light) == ()

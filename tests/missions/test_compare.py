@@ -357,8 +357,15 @@ def test_a_live_view_is_reported_at_once_unless_the_next_one_waits_already(waiti
 
 
 def test_a_rejected_change_does_not_come_back_with_the_next_flight(flown, site, tmp_path):
+    """Nor is the map painted, where it is not to be brought up to date."""
     few = replace(_COMPARE, updates_map=False, views_per_second=1.25)
+    with Archive.open(site, write=False) as archive:
+        before = dict(archive.tiles())
     compare(flown, site, few)
+    with Archive.open(site, write=False) as archive:
+        after = dict(archive.tiles())
+    assert before.keys() == after.keys()
+    assert all(np.array_equal(before[index], after[index]) for index in before)
     (rejected, *others) = features(site)
     with Archive.open(site, write=True) as archive:
         archive.review(rejected["id"], Verdict.REJECTED)
@@ -374,17 +381,6 @@ def test_a_rejected_change_does_not_come_back_with_the_next_flight(flown, site, 
         each["geometry"] for each in others
     ]
     assert report(site, "next")["comparison"]["suppressed"] == 1
-
-
-def test_without_update_the_map_stays(flown, site):
-    with Archive.open(site, write=False) as archive:
-        before = dict(archive.tiles())
-    compare(flown, site, CompareSettings(model="none", updates_map=False))
-    with Archive.open(site, write=False) as archive:
-        after = dict(archive.tiles())
-    assert before.keys() == after.keys()
-    assert all(np.array_equal(before[index], after[index]) for index in before)
-    assert features(site)
 
 
 def test_a_flight_without_telemetry_finds_itself(flown, site, tmp_path):

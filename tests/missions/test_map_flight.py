@@ -97,7 +97,15 @@ def _some_photos(photographed: Path, folder: Path, start: int, end: int) -> Path
 
 
 # The telemetry's height decides the map's scale where only it does; seen against the 7.5 cm of a pixel.
-@pytest.mark.parametrize("name", ["flight1.csv", "flight1.nmea", "flight1.srt", "flight1.gpx"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "flight1.csv",
+        pytest.param("flight1.nmea", marks=pytest.mark.long),  # a fix a second, as GPX
+        "flight1.srt",
+        "flight1.gpx",
+    ],
+)
 def test_a_video_with_telemetry_of_each_format(filmed: Path, tmp_path: Path, name: str) -> None:
     site = tmp_path / "site"
     run_map(
@@ -118,6 +126,9 @@ def test_a_video_with_telemetry_of_each_format(filmed: Path, tmp_path: Path, nam
     assert (
         absolute_m < 0.6
     )  # 1 Hz formats interpolate a fix from two that are 5 m apart, turns included
+    seconds = report["seconds"]  # every one is counted, up to the report itself
+    assert set(seconds) == {"total", "undistort", "register", "paint", "store", "report"}
+    assert seconds["total"] >= sum(value for name, value in seconds.items() if name != "total")
 
 
 def test_a_video_is_mapped_by_the_key_frames_of_its_stream(
@@ -211,29 +222,18 @@ def test_a_video_that_looks_ahead_by_half_a_right_angle(oblique: Path, tmp_path:
 
 
 def test_an_oblique_video_is_recognised_by_its_pictures_alone(
-    oblique: Path, filmed: Path, tmp_path: Path
+    oblique: Path, tmp_path: Path
 ) -> None:
     """Without any telemetry the perspective between the pictures shows how far the camera looks from straight down."""
-    found = []
-    for name, flown in (("oblique", oblique), ("nadir", filmed)):
-        (tmp_path / name).mkdir()
-        shutil.copy(_film(flown), tmp_path / name)
-        site = tmp_path / f"{name} site"
-        run_map(site, tmp_path / name / "flight1.mp4", "--camera", flown / "camera.xml")
-        found.append(
-            [each for each in report_of(site, "flight1")["warnings"] if "straight down" in each]
-        )
-    ((warning,), none) = found
+    shutil.copy(_film(oblique), tmp_path)
+    run_map(tmp_path / "site", tmp_path / "flight1.mp4", "--camera", oblique / "camera.xml")
+    (warning,) = straight_down_warnings(tmp_path / "site", "flight1")
     assert float(warning.split(" deg")[0].rpartition(" ")[2]) == pytest.approx(45, abs=10)
-    assert "there is no telemetry" in warning and not none
+    assert "there is no telemetry" in warning
 
 
-def test_the_report_counts_every_second_up_to_itself(filmed: Path, tmp_path: Path) -> None:
-    site = tmp_path / "site"
-    run_map(site, _film(filmed), "--camera", filmed / "camera.xml")
-    seconds = report_of(site, "flight1")["seconds"]
-    assert set(seconds) == {"total", "undistort", "register", "paint", "store", "report"}
-    assert seconds["total"] >= sum(value for name, value in seconds.items() if name != "total")
+def straight_down_warnings(site: Path, flight: str) -> list[str]:
+    return [each for each in report_of(site, flight)["warnings"] if "straight down" in each]
 
 
 def test_a_clock_offset_is_found_from_motion_or_taken_as_given(
@@ -348,8 +348,8 @@ def test_mosaic_tif_opens_in_its_place(photographed: Path, tmp_path: Path) -> No
     assert np.hypot(*best) <= 0.1 and scores[best] > 0.6  # metres: one pixel of the map
 
 
-@pytest.mark.parametrize(("crs", "epsg"), [("EPSG:3857", 3857), ("EPSG:32632", 32632)])
-def test_another_crs_for_the_map(photographed: Path, tmp_path: Path, crs: str, epsg: int) -> None:
+def test_another_crs_for_the_map(photographed: Path, tmp_path: Path) -> None:
+    crs, epsg = "EPSG:3857", 3857
     photos = _some_photos(photographed, tmp_path / "few", 0, 6)
     site = tmp_path / "site"
     run_map(site, photos, "--camera", photographed / "camera.xml", "--crs", crs)
@@ -362,10 +362,7 @@ def test_another_crs_for_the_map(photographed: Path, tmp_path: Path, crs: str, e
         assert next(mosaic.sample([(x, y)]))[3] == 255
 
 
-@pytest.mark.parametrize("form", ["geojson", "kml", "txt"])
-def test_frames_outside_the_area_are_not_used(
-    photographed: Path, tmp_path: Path, form: str
-) -> None:
+def test_frames_outside_the_area_are_not_used(photographed: Path, tmp_path: Path) -> None:
     true = json.loads((photographed / "truth" / "frames.geojson").read_text())
     longitude = {
         each["properties"]["frame"]: each["properties"]["camera_longitude_deg"]
@@ -384,17 +381,11 @@ def test_frames_outside_the_area_are_not_used(
         [middle, high],
         [middle, low],
     ]
-    area = tmp_path / f"area.{form}"
+    area = tmp_path / "area.kml"
     area.write_text(
-        {
-            "geojson": json.dumps({"type": "Polygon", "coordinates": [ring]}),
-            "kml": (
-                '<kml xmlns="http://www.opengis.net/kml/2.2"><Placemark><Polygon><outerBoundaryIs><LinearRing><coordinates>'
-                + " ".join(f"{x!r},{y!r},0" for x, y in ring)
-                + "</coordinates></LinearRing></outerBoundaryIs></Polygon></Placemark></kml>"
-            ),
-            "txt": "\n".join(f"{y!r} {x!r}" for x, y in ring),  # the thesis's list
-        }[form]
+        '<kml xmlns="http://www.opengis.net/kml/2.2"><Placemark><Polygon><outerBoundaryIs><LinearRing><coordinates>'
+        + " ".join(f"{x!r},{y!r},0" for x, y in ring)
+        + "</coordinates></LinearRing></outerBoundaryIs></Polygon></Placemark></kml>"
     )
     site = tmp_path / "site"
     run_map(
@@ -415,7 +406,9 @@ def test_frames_outside_the_area_are_not_used(
     assert well_inside <= used and not well_outside & used and well_inside and well_outside
 
 
-@pytest.mark.parametrize("transform", ["similarity", "homography"])
+@pytest.mark.parametrize(
+    "transform", ["similarity", pytest.param("homography", marks=pytest.mark.long)]
+)
 def test_the_thesis_method(
     photographed: Path, tmp_path: Path, transform: Literal["similarity", "homography"]
 ) -> None:
@@ -507,7 +500,9 @@ def test_the_same_flight_again_doubles_nothing(
     assert "few is in this site already (version 1): it was mapped again" in notice["text"]
 
 
-def test_the_same_flight_under_another_name_is_named(photographed: Path, tmp_path: Path) -> None:
+def test_the_same_flight_under_another_name_is_named_and_a_map_dated_by_its_flight(
+    photographed: Path, tmp_path: Path
+) -> None:
     site = tmp_path / "site"
     for name in ("few", "card2"):
         run_map(
@@ -523,20 +518,10 @@ def test_the_same_flight_under_another_name_is_named(photographed: Path, tmp_pat
     assert notice["text"].startswith(
         "card2 begins with the same bytes as few, which is in this site already (ver"
     )
-
-
-def test_a_map_is_dated_by_its_flight(photographed: Path, tmp_path: Path) -> None:
-    site = tmp_path / "site"
-    run_map(
-        site,
-        _some_photos(photographed, tmp_path / "few", 0, 4),
-        "--camera",
-        photographed / "camera.xml",
-    )
     frames = json.loads((photographed / "truth" / "frames.geojson").read_text())["features"]
-    (version,) = site_history(site)
-    assert version.flown_utc[:19] == frames[0]["properties"]["time"][:19]
-    assert version.flown_utc[:10] != version.date_utc[:10]
+    for version in site_history(site):
+        assert version.flown_utc[:19] == frames[0]["properties"]["time"][:19]
+        assert version.flown_utc[:10] != version.date_utc[:10]
 
 
 def test_the_map_does_not_depend_on_when_it_was_shown_while_it_grew(
@@ -552,6 +537,7 @@ def test_the_map_does_not_depend_on_when_it_was_shown_while_it_grew(
         monkeypatch.setattr("sorvolo.missions.map.painting.REST", 0)
         run_map(tmp_path / f"every {paint_every}", film, "--camera", filmed / "camera.xml")
         maps.append((tmp_path / f"every {paint_every}" / "mosaic.tif").read_bytes())
+        assert not straight_down_warnings(tmp_path / f"every {paint_every}", "film")
     assert maps[0] == maps[1]
 
 

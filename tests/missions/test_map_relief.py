@@ -57,7 +57,9 @@ def test_the_report_names_ground_that_is_not_level(
     assert (off_m < 2 * report["sigma_m"] * np.sqrt(2)).mean() > 0.9, (off_m, report["sigma_m"])
 
 
-@pytest.mark.parametrize("seed", [6, 8], ids=["a house", "trees"])
+@pytest.mark.parametrize(
+    "seed", [pytest.param(6, id="a house"), pytest.param(8, id="trees", marks=pytest.mark.long)]
+)
 def test_what_stands_on_level_ground_makes_no_hill_of_it(seed: int, tmp_path: Path) -> None:
     scene = replace(_LEVEL.scene, ground="urban", has_scenery=True)
     simulate_into(tmp_path / "made", replace(_LEVEL, seed=seed, scene=scene))

@@ -20,6 +20,8 @@ from sorvolo.missions.search.flights import search_site
 from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
 from sorvolo.store.site.archive import Archive
 
+_CARS = SearchSettings(plants=20, classes=("car",), sun_deg=(215, 48))
+
 
 @pytest.fixture
 def site(photo_map: Path) -> Path:
@@ -35,27 +37,35 @@ def _report(
     return report
 
 
+@pytest.fixture(scope="module")
+def searched(
+    photo_map: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, dict[str, Any]]:
+    """The files and the report of a search for cars by a detector that sees all."""
+    out = tmp_path_factory.mktemp("searched") / "out"
+    return out, _report(photo_map, out, Comparing(photo_map), _CARS)
+
+
 def test_a_detector_that_sees_all_gives_high_chances_and_the_files_agree(
-    site: Path, tmp_path: Path
+    searched: tuple[Path, dict[str, Any]],
 ) -> None:
-    settings = SearchSettings(plants=20, classes=("car",), sun_deg=(215, 48))
-    report = _report(site, tmp_path / "out", Comparing(site), settings)
+    out, report = searched
     row = report["classes"]["car"]
     planted = report["flights"][0]["classes"]["car"]
     assert planted["planted"] >= 8 and planted["found"] >= 0.75 * planted["planted"]
-    with rasterio.open(tmp_path / "out" / "pod.tif") as file:
+    with rasterio.open(out / "pod.tif") as file:
         assert file.descriptions == ("car: pod", "car: low", "car: high")
         pod, low, high = file.read()
         seen = np.isfinite(pod)
         assert (low[seen] <= pod[seen] + 1e-6).all() and (pod[seen] <= high[seen] + 1e-6).all()
         assert file.crs is not None and np.isnan(file.nodata)
         assert seen.sum() * file.res[0] ** 2 >= row["seen_m2"] - 1
-    features = json.loads((tmp_path / "out" / "pod.geojson").read_text())["features"]
+    features = json.loads((out / "pod.geojson").read_text())["features"]
     area_m2 = sum(
         each["properties"]["area_m2"] for each in features if each["properties"]["kind"] == "pod"
     )
     assert area_m2 == pytest.approx(row["seen_m2"], rel=0.02)
-    assert "probability of detection" in (tmp_path / "out" / "search.html").read_text()
+    assert "probability of detection" in (out / "search.html").read_text()
     assert report["headline"]["text"].startswith("probability of detection of a car")
 
 
@@ -170,13 +180,11 @@ def test_ground_beyond_the_flight_is_a_hole_not_seen_and_is_flown_again(
     assert (tmp_path / "holes.kml").stat().st_size > 300 and (tmp_path / "holes.plan").is_file()
 
 
-def test_a_sweep_width_is_the_flights_and_not_the_areas(site: Path, tmp_path: Path) -> None:
+def test_a_sweep_width_is_the_flights_and_not_the_areas(
+    site: Path, searched: tuple[Path, dict[str, Any]], tmp_path: Path
+) -> None:
     """Over a corner of what was flown it is as wide as over all; and nothing to fly is stated, old waypoints go."""
-    settings, old = (
-        SearchSettings(plants=20, classes=("car",), sun_deg=(215, 48)),
-        tmp_path / "old.kml",
-    )
-    whole = _report(site, tmp_path / "out", Comparing(site), settings)
+    (out, whole), old = searched, tmp_path / "old.kml"
     with Archive.open(site, write=False) as archive:
         origin = archive.site().origin
     west, south = origin.longitude_deg, origin.latitude_deg
@@ -184,14 +192,13 @@ def test_a_sweep_width_is_the_flights_and_not_the_areas(site: Path, tmp_path: Pa
     area = tmp_path / "area.geojson"
     area.write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
     old.write_text("of an earlier search")
-    part = _report(site, tmp_path / "part", Comparing(site), settings, area=area, refly=(old,))
+    part = _report(site, tmp_path / "part", Comparing(site), _CARS, area=area, refly=(old,))
     one, other = whole["classes"]["car"], part["classes"]["car"]
     assert other["area_m2"] < 0.05 * one["area_m2"]
     assert other["sweep_width_m"] == pytest.approx(one["sweep_width_m"], rel=0.3)
     assert not old.exists() and "no waypoints were written" in part["warnings"][0]
     assert (
-        str(old) in part["warnings"][0]
-        and "Found over stated" in (tmp_path / "out" / "search.html").read_text()
+        str(old) in part["warnings"][0] and "Found over stated" in (out / "search.html").read_text()
     )
 
 

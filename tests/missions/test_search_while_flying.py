@@ -71,8 +71,11 @@ def test_frame_by_frame_comes_to_what_the_whole_flight_comes_to(site: Path) -> N
         at_once = _returned(measuring)
     assert (np.diff(planted, axis=0) >= 0).all()
     assert planted[-1][0] >= 4 and planted[-1][1] >= 2 * planted[0][1] > 8
-    for label in ("car", "person"):
-        assert _chance(flight, label) == pytest.approx(_chance(at_once, label), abs=0.15)
+    for measured in flight.classes:  # of a few plants one more that is found moves the chance
+        near = max(0.15, 1.5 / len(measured.outcomes))
+        assert _chance(flight, measured.label) == pytest.approx(
+            _chance(at_once, measured.label), abs=near
+        )
 
 
 def test_a_blind_detector_is_known_as_such_while_it_flies(site: Path) -> None:
@@ -291,7 +294,6 @@ def test_a_flight_that_an_earlier_search_measured_counts_once_it_was_looked_at(
 
 
 @pytest.mark.usefixtures("threads")
-@pytest.mark.long
 @pytest.mark.long
 def test_a_flight_that_is_stopped_leaves_no_waypoints(
     photographed: Path, site: Path, tmp_path: Path

@@ -76,12 +76,21 @@ def test_several_looks_must_agree_and_a_mission_that_ended_is_left_alone(folder:
     assert reasons == []
 
 
+OFTEN = """
+import sys
+from pathlib import Path
+from sorvolo.station import run_process
+run_process.ended_when_orphaned.__wrapped__.__kwdefaults__["every_s"] = 0.2  # else five seconds
+sys.exit(run_process.main(Path(sys.argv[1])))
+"""
+
+
 def test_a_process_without_a_record_states_why_it_ended(folder: Path) -> None:
     """Its station was killed before it had noted the run: no next one would find it."""
     forget(folder)
     with (folder / "log.txt").open("wb") as log:
         process = subprocess.Popen(
-            [sys.executable, "-m", "sorvolo.station.run_process", str(folder)],
+            [sys.executable, "-c", OFTEN, str(folder)],
             stderr=log,
             start_new_session=True,
         )

@@ -432,9 +432,7 @@ def test_from_a_flying_drone_to_the_place_of_a_person_in_three_taps(
     browser: Any, served: Served, tmp_path: Path
 ) -> None:
     """On a phone: the start page shows the drone; the map stays free of video and card; the place is handed on."""
-    context = context_of(
-        browser, viewport={"width": 390, "height": 844}, has_touch=True
-    )
+    context = context_of(browser, viewport={"width": 390, "height": 844}, has_touch=True)
     context.grant_permissions(["clipboard-read", "clipboard-write", "geolocation"])
     watched = Watched(context, served.url)
     page = watched.page

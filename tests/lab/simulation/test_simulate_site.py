@@ -36,7 +36,7 @@ from sorvolo.lab.simulation.site import simulate_site
 SMALL = SimulationSettings(
     seed=7,
     scene=SceneSettings("dirt", people=2, cars=1, small_objects=3),
-    path=PathSettings(height_m=12, speed_m_s=4, length_m=12, strips=1),
+    path=PathSettings(height_m=12, speed_m_s=4, length_m=8, strips=1),
     imaging=ImagingSettings(320, 240, fps=5),
     sensor=SensorSettings(bad_checksums=2),
     later=LaterSettings(removed=1, moved=1),
@@ -79,7 +79,7 @@ with video_writer(Path(sys.argv[1]), (320, 180), 10.0, 0, 20) as write:
 
 def test_a_video_does_not_depend_on_what_lay_in_memory_before(tmp_path):
     written = []
-    for filling in ("1", "85", "170"):  # glibc fills new memory with it; elsewhere it does nothing
+    for filling in ("1", "170"):  # glibc fills new memory with it; elsewhere it does nothing
         path = tmp_path / f"{filling}.mp4"
         subprocess.run(
             [sys.executable, "-c", WRITE_A_VIDEO, str(path)],
@@ -88,16 +88,16 @@ def test_a_video_does_not_depend_on_what_lay_in_memory_before(tmp_path):
             env={**os.environ, "MALLOC_PERTURB_": filling},
         )
         written.append(path.read_bytes())
-    assert written[1:] == written[:1] * 2
+    assert written[0] == written[1]
 
 
 def test_one_seed_gives_the_same_bytes(site, tmp_path):
     again = tmp_path / "again"
     run(again, SMALL)
     assert hashes(again) == hashes(site)
-    run(
-        again, replace(SMALL, seed=8, flights=1, output=OutputSettings("csv"))
-    )  # replaces the first one
+    another = replace(SMALL, seed=8, flights=1, output=OutputSettings("csv"))
+    short = replace(SMALL.path, length_m=2)
+    run(again, replace(another, path=short))  # replaces the first one
     other = hashes(again)
     assert "flight2/flight2.mp4" not in other
     assert other["flight1/flight1.mp4"] != hashes(site)["flight1/flight1.mp4"]
@@ -248,7 +248,12 @@ def test_boxes_hold_objects_and_masks_hold_changes(site):
 
 
 def test_photos_carry_place_and_attitude(tmp_path):
-    settings = replace(SMALL, flights=1, output=OutputSettings("csv", photos=True))
+    settings = replace(
+        SMALL,
+        flights=1,
+        path=replace(SMALL.path, length_m=5),
+        output=OutputSettings("csv", photos=True),
+    )
     run(tmp_path / "photos", settings)
     photos = sorted((tmp_path / "photos/flight1/photos").iterdir())
     flight = next(simulate_flights(settings))
@@ -276,7 +281,8 @@ def test_an_interrupted_run_leaves_no_half_folder_and_can_be_repeated(tmp_path):
             break
     steps.close()
     assert not folder.exists()
-    run(folder, replace(SMALL, flights=1, output=OutputSettings("none")))
+    short = replace(SMALL, flights=1, path=replace(SMALL.path, length_m=2))
+    run(folder, replace(short, output=OutputSettings("none")))
     assert (folder / "simulation.json").exists()
     assert not (tmp_path / ".site.partial").exists()
 

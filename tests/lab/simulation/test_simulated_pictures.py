@@ -31,7 +31,7 @@ def test_a_picture_follows_from_seed_and_index_alone():
 
 def test_boxes_lie_in_the_picture_and_cars_have_a_car_s_size():
     cars_m = []
-    for index in range(8):
+    for index in range(4):
         picture = simulate_picture(replace(SETTINGS, tilt_deg=0.0), index)
         height, width = picture.image.shape[:2]
         for box in picture.boxes:
@@ -41,7 +41,7 @@ def test_boxes_lie_in_the_picture_and_cars_have_a_car_s_size():
             inside = x > 0 and y > 0 and x + w < width and y + h < height
             if box["category_id"] == 2 and inside and box["visibility"] == 1:
                 cars_m.append(max(w, h) * picture.m_per_px)
-    assert len(cars_m) >= 4
+    assert len(cars_m) >= 2
     assert (
         min(cars_m) > 2.6 and max(cars_m) < 6.8
     )  # 4.0 to 5.2 m long, seen at any heading, some from the side
@@ -55,7 +55,6 @@ def test_heights_and_ground_sampling_distances_keep_their_bounds():
         assert 15 <= picture.site_from_camera.translation_m[2] <= 60
 
 
-@pytest.mark.long
 @pytest.mark.long
 def test_people_stand_out_in_thermal_pictures_which_are_grey():
     settings = replace(SETTINGS, thermal_share=1.0)
@@ -87,11 +86,11 @@ def test_an_orthophoto_is_cut_and_one_too_small_is_refused():
 
 def test_the_folder_is_coco_and_only_a_simulation_is_replaced(tmp_path):
     folder = tmp_path / "labelled"
-    steps = list(simulate_pictures(folder, replace(SETTINGS, pictures=3)))
-    assert [step.pictures_done for step in steps] == [1, 2, 3]
+    steps = list(simulate_pictures(folder, replace(SETTINGS, pictures=2)))
+    assert [step.pictures_done for step in steps] == [1, 2]
     truth = json.loads((folder / "boxes.json").read_text())
     assert [path.suffix for path in folder.iterdir() if path.is_file()] == [".json"]
-    assert len({image["flight"] for image in truth["images"]}) == 3
+    assert len({image["flight"] for image in truth["images"]}) == 2
     ids = [row["id"] for row in truth["annotations"]]
     assert ids == list(range(1, len(ids) + 1))
     assert {row["image_id"] for row in truth["annotations"]} <= {
