@@ -101,6 +101,13 @@ def test_one_strip_straight_on_a_spot_names_no_person(
         focus(near[:1], lambda _: pictures[52], _LATTICE, -9.0, 7.0)
 
 
+def test_water_which_shows_nothing_twice_has_no_floor(views: list[View]) -> None:
+    draw = np.random.default_rng(3)
+    waves = [levelled(np.clip(draw.normal(90, 4, (512, 512)), 0, 255)) for _ in views]
+    with pytest.raises(InputError, match="shows nothing \\(water\\)"):
+        focus(views, waves.__getitem__, _LATTICE, -9.0, 7.0)
+
+
 def test_ground_that_too_few_views_show_is_not_called_empty() -> None:
     bare = make_forest(5, 60, 0.0, _PEOPLE_M, _FLOOR_M)
     views = fly(bare, np.arange(-12, 13, 6.0), np.arange(-12, 13, 8.0))

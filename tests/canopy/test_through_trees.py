@@ -51,6 +51,11 @@ def test_the_people_are_named_with_the_chance_that_one_is_found(
     assert report["headline"]["text"].startswith("2 possible people under trees on ")
     assert 0.5 < report["detection"]["pod"] <= 1 and 0.3 < report["detection"]["free_share"] < 1
     assert code == (0 if report["headline"]["complete"] else 3)
+    page = (out / "under_trees.html").read_text()
+    assert (
+        page.count("<img") == 1 + len(_PEOPLE_M)
+        and f"{report['people'][0]['latitude_deg']:.6f}" in page
+    )
     with rasterio.open(out / "under_trees.tif") as opened:
         assert opened.descriptions[:3] == ("mean", "anomaly, sigmas", "views")
         assert opened.read(3).max() > 24

@@ -239,7 +239,7 @@ def focus(
     if not len(level_tops):
         raise InputError(
             f"no height between {low_m:.0f} and {high_m:.0f} m brings a floor into focus: the cameras are not known "
-            "well enough, or the strips see it from one side; fly strips side by side"
+            "well enough, the strips see it from one side, or it shows nothing (water); fly strips side by side"
         )
     near = round(_NEAR_LEVEL_M / _FOCUS_STEP_M)
     first = max(0, level_tops[0] - near)

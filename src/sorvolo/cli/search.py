@@ -183,7 +183,11 @@ def _show_under_trees(report: Mapping[str, Any], folder: Path, console: Console)
         pictures = escape(", ".join(row["pictures"]))
         console.print(f"  {where}  {row['anomaly']:.0f} sigmas, see {pictures}", highlight=False)
     show_notices_and_warnings(report, console)
-    for name, file in (("GeoTIFF", "under_trees.tif"), ("places", "under_trees.geojson")):
+    for name, file in (
+        ("page", "under_trees.html"),
+        ("GeoTIFF", "under_trees.tif"),
+        ("places", "under_trees.geojson"),
+    ):
         show_path(name, folder / file, console)
 
 

@@ -13,7 +13,7 @@ from sorvolo.canopy.finds import Find, Finds, average, look_under_trees
 from sorvolo.canopy.integral import LEAST_VIEWS, Floor, Picture, UnderTrees, lay, levelled
 from sorvolo.canopy.planting import PlantedFloor, free_share, plant_on_floor
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Floats32, Numbers
+from sorvolo.geometry.arrays import Floats32, ImageRGBA, Numbers
 from sorvolo.heights.cameras import Cameras3D, find_tracks, solve_tracks
 from sorvolo.heights.field import HeightField
 from sorvolo.heights.lattice import Lattice
@@ -32,6 +32,7 @@ from sorvolo.store.atomic import atomic_write_bytes, make_folder
 from sorvolo.store.exports.places import place_deg
 from sorvolo.store.exports.plain import feature, feature_collection, geojson_bytes, json_bytes
 from sorvolo.store.images import BytesCache, jpeg_from_image
+from sorvolo.store.pages.search import under_trees_page
 from sorvolo.store.rasters.height_model import read_height_cog, write_height_cog
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import StoredKeyframe
@@ -47,6 +48,7 @@ _FLOOR_M = -30.0, 5.0  # where the floor is looked for, above the map's level gr
 _ATTITUDE_SIGMA_DEG = 0.5  # of the map's attitudes where points alone do not hold the cameras
 _MOST_STRETCH = 0.06  # of the focal length, three sigmas of what it may be off
 _POD = "pod", "pod_low", "pod_high"
+_RING_M = 2.0  # around a find
 _CROP_M, _CROP_CELL_M = 8.0, 0.04
 
 
@@ -66,8 +68,8 @@ def search_under_trees(
     """Put a flight's pictures together on the floor below the trees, yielding progress and last the report.
 
     `plants` bodies are planted on the floor of thermal pictures for the probability of detection.
-    Files in `folder`: under_trees.tif (mean, anomaly, number of views, free share, floor's height), under_trees.geojson and
-    under_trees.json; the finds become objects of the flight. Raises InputError for a flight without GPS, with too few
+    Files in `folder`: under_trees.tif (mean, anomaly, number of views, free share, floor's height), under_trees.html,
+    under_trees.geojson and under_trees.json; the finds become objects of the flight. Raises InputError for a flight without GPS, with too few
     pictures or without a floor in focus.
     """
     folder = Path(folder)
@@ -114,11 +116,14 @@ def search_under_trees(
             yield UnderTreesUpdate(name, "planted bodies", 2)
             planted = plant_on_floor(under, views, picture, finds.people, plants)
         free = free_share(under, views, picture)
-        archive.keep_under_trees(name, _objects(name, finds, views, keyframes, picture))
+        found = _objects(name, finds, views, keyframes, picture)
+        archive.keep_under_trees(name, found)
         report = _report(name, site, under, floor, finds, planted)
         report |= {"pictures": len(views), "warnings": [warning] if warning else []}
         report |= {"run": run_of(keyframes), "cell_m": cell_m}
         report["headline"]["complete"] = not warning
+        if warning:
+            report["headline"]["text"] += "; the cameras may be off, and people missed"
         report["notices"] = [asdict(each) for each in archive.notices]
     make_folder(folder)
     zero_m = site.origin.height_m
@@ -134,6 +139,8 @@ def search_under_trees(
     collection = feature_collection("under_trees", features, is_local=False)
     atomic_write_bytes(folder / "under_trees.geojson", geojson_bytes(collection))
     atomic_write_bytes(folder / "under_trees.json", json_bytes(report))
+    page = under_trees_page(report, _ringed(under, finds), [each.crop_jpeg for each in found])
+    atomic_write_bytes(folder / "under_trees.html", page.encode())
     yield report
 
 
@@ -289,6 +296,16 @@ def _crop(find: Find, views: Sequence[View], picture: Picture) -> Any:
     numbers = {view.name: number for number, view in enumerate(views)}
     shown = [laid[numbers[find.pictures[0]]], average(np.stack(laid))]
     return np.hstack([_stretched(each) for each in shown])
+
+
+def _ringed(under: UnderTrees, finds: Finds) -> ImageRGBA:
+    """(H, W, 4) the integral with a ring around each find."""
+    picture = _stretched(under.mean[..., None])
+    lattice = under.lattice
+    for find in finds.people:
+        x, y = np.round(lattice.cells_from_site(find.place_m[None, :2])[0]).astype(int).tolist()
+        cv2.circle(picture, (x, y), round(_RING_M / lattice.cell_m), (255, 60, 60), 2, cv2.LINE_AA)
+    return np.dstack([picture, np.isfinite(under.mean).astype(np.uint8) * 255])
 
 
 def _stretched(levels: Numbers) -> Any:

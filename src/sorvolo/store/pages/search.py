@@ -1,6 +1,6 @@
-"""What a search would have found, as one page of HTML that needs no other file, no network and no script."""
+"""What a search would have found, and what is under trees, as pages of HTML that need no other file, no network and no script."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from sorvolo.geometry.arrays import ImageRGBA
@@ -8,6 +8,7 @@ from sorvolo.store.pages.plots import colour_class, stated_and_found
 from sorvolo.store.pages.words import (
     area_words,
     at,
+    jpeg_uri,
     known,
     number_at,
     picture_uri,
@@ -70,6 +71,33 @@ def waiting_page(*, is_over: bool) -> str:
     return str(
         render("search_waiting.html", title="What a search would have found", is_over=is_over)
     )
+
+
+def under_trees_page(report: Mapping[str, Any], floor: ImageRGBA, crops: Sequence[bytes]) -> str:
+    """under_trees.html of under_trees.json's content, the floor's picture and a JPEG of each find. Text is escaped."""
+    headline = report["headline"]["text"]
+    page = render(
+        "under_trees.html",
+        title=f"{report['flight']} - under the trees",
+        flight=report["flight"],
+        headline=headline[:1].upper() + headline[1:],
+        warning_lines=report["warnings"],
+        floor=picture_uri(floor),
+        pictures=report["pictures"],
+        rows=[
+            [
+                str(number),
+                f"{row['latitude_deg']:.6f}, {row['longitude_deg']:.6f}",
+                f"{row['anomaly']:.0f}",
+                "{:.1f} x {:.1f} m".format(*row["size_m"]),
+                str(row["views"]),
+                ", ".join(row["pictures"]),
+            ]
+            for number, row in enumerate(report["people"], start=1)
+        ],
+        crops=[jpeg_uri(each) for each in crops],
+    )
+    return str(page)
 
 
 def _figures(row: Mapping[str, Any]) -> list[tuple[str, str, str]]:
