@@ -1,6 +1,8 @@
 """`sorvolo search --through-trees` from the map of a flight to files, finds of the site and its exit code."""
 
 import json
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 from shutil import copytree
 
@@ -34,16 +36,19 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def searched(site: Path) -> tuple[Path, int]:
+def searched(site: Path) -> tuple[Path, int, str]:
     words = ["search", str(site), "--through-trees", "--plants", "10"]
     out = site.parent / "out"
-    return out, main([*words, "--out", str(out)])
+    with redirect_stdout(StringIO()) as printed:
+        code = main([*words, "--out", str(out)])
+    return out, code, printed.getvalue()
 
 
 def test_the_people_are_named_with_the_chance_that_one_is_found(
-    searched: tuple[Path, int], site: Path
+    searched: tuple[Path, int, str], site: Path
 ) -> None:
-    out, code = searched
+    out, code, printed = searched
+    assert printed.count("PERSON FOUND") == len(_PEOPLE_M)
     report = json.loads((out / "under_trees.json").read_text())
     places_m = np.array([each["place_m"][:2] for each in report["people"]])
     away_m = np.linalg.norm(places_m[:, None] - _PEOPLE_M, axis=2)
@@ -61,7 +66,9 @@ def test_the_people_are_named_with_the_chance_that_one_is_found(
         assert opened.read(3).max() > 24
 
 
-def test_the_finds_are_findings_of_the_site(searched: tuple[Path, int], site: Path) -> None:
+def test_the_finds_are_findings_of_the_site(
+    searched: tuple[Path, int, str], site: Path
+) -> None:
     with Archive.open(site, write=True) as archive:
         kept = archive.objects()
         findings = archive.register().findings

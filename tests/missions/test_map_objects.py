@@ -19,6 +19,8 @@ from truth_detector import Knowing
 
 from small_flights import simulate_into, small_flight
 from sorvolo.cli.printing import announce_people
+from sorvolo.cli.search import _map_all
+from sorvolo.cli.sites import OpenedSite
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.camera import Camera
@@ -33,6 +35,7 @@ from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.flight.threads import made_at_low_priority
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.mission import flight_outcome
+from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.findings import Change, ChangeKind, Patch
 from sorvolo.survey.flight import CameraPrior, Frame, PosedFrame
@@ -162,6 +165,16 @@ def test_the_headline_counts_what_was_looked_at_and_people_are_events(
     announce_people(objects, mapped, Console(force_terminal=True, width=200))
     shown = capsys.readouterr().out
     assert shown.count("\a") == shown.count("PERSON FOUND") == len(people)
+
+
+def test_a_search_that_maps_a_flight_tells_of_its_people(
+    simulated: Path, mapped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place, outputs = OpenedSite(mapped, str(mapped)), SearchOutputs(tmp_path)
+    flight = str(simulated / "flight1/flight1.mp4")
+    _map_all([flight], place, SearchSettings(), outputs, None, "", 1.0)
+    people = report_of(mapped, "flight1")["objects"]["classes"]["person"]
+    assert capsys.readouterr().err.count("PERSON FOUND") == people > 0
 
 
 def test_compare_names_changes(simulated: Path, compared: Path) -> None:

@@ -23,7 +23,15 @@ from sorvolo.cli.options import (
     Telemetry,
     wanted_classes,
 )
-from sorvolo.cli.printing import TO_CHECK, print_json, show_notices_and_warnings, show_path
+from sorvolo.cli.printing import (
+    TO_CHECK,
+    announce_people,
+    announce_person,
+    print_json,
+    read_json,
+    show_notices_and_warnings,
+    show_path,
+)
 from sorvolo.cli.progress import ProgressReport, show_progress
 from sorvolo.cli.sites import ended_by_signal, opened_site, run_on_site
 from sorvolo.errors import SettingsError
@@ -180,8 +188,8 @@ def _show_under_trees(report: Mapping[str, Any], folder: Path, console: Console)
     console.print(escape(report["headline"]["text"]), style="bold", highlight=False, soft_wrap=True)
     for row in report["people"]:
         where = f"{row['latitude_deg']:.6f}, {row['longitude_deg']:.6f}"
-        pictures = escape(", ".join(row["pictures"]))
-        console.print(f"  {where}  {row['anomaly']:.0f} sigmas, see {pictures}", highlight=False)
+        pictures = ", ".join(row["pictures"])
+        announce_person(f"{where}  {row['anomaly']:.0f} sigmas, see {pictures}", console)
     show_notices_and_warnings(report, console)
     for name, file in (
         ("page", "under_trees.html"),
@@ -232,7 +240,9 @@ def _map_all(
             until=until,
             search=flying,
         )
-        run_on_site(mapping, place, lambda updates: show_progress(updates, console), "mapped")
+        mapped = run_on_site(mapping, place, lambda rows: show_progress(rows, console), "mapped")
+    for folder in mapped:
+        announce_people(read_json(folder / "report.json")["objects"], place.folder, console)
 
 
 def _map_of(inputs: Sequence[str]) -> str:
