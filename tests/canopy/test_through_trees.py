@@ -66,9 +66,7 @@ def test_the_people_are_named_with_the_chance_that_one_is_found(
         assert opened.read(3).max() > 24
 
 
-def test_the_finds_are_findings_of_the_site(
-    searched: tuple[Path, int, str], site: Path
-) -> None:
+def test_the_finds_are_findings_of_the_site(searched: tuple[Path, int, str], site: Path) -> None:
     with Archive.open(site, write=True) as archive:
         kept = archive.objects()
         findings = archive.register().findings

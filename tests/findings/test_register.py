@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from sorvolo.findings.importance import between, grouped, in_short, ordered
 from sorvolo.findings.register import (
+    GroundFinding,
     KnownBy,
     MissionSighting,
-    Presence,
     Register,
     SearchedDate,
     associate,
@@ -83,7 +83,6 @@ def test_all_missions_of_two_dates_see_each_thing_once() -> None:
         assert (labels.count("car"), labels.count("person")) == (count, 1)
     gone = [each for each in register.findings if each.gone]
     assert [(each.label, each.gone) for each in gone] == [("car", "flight1"), ("person", "flight1")]
-    assert gone[0].presence("flight1") is Presence.GONE
     assert len(register.present) == 4
     assert between(register, "flight0", "flight1") == "1 person came, 1 left; 1 car left"
     unsearched = associate([], [look(0)])
@@ -95,8 +94,8 @@ def test_silence_is_no_absence() -> None:
     """A date whose flight did not look there states nothing; one whose comparison saw it leave does."""
     seen = [sighting(0, "map", 0.0), sighting(1, "map", 60.0)]
     (first, _) = associate(seen).findings
-    assert first.presence("flight1") is Presence.NOT_LOOKED and not first.gone
-    left = sighting(0, "left", 0.1, gone="flight1", origin=KnownBy.CHANGED)
+    assert not first.gone
+    left = sighting(0, "left", 0.1, order=1.0, gone="flight1", origin=KnownBy.CHANGED)
     (first, _) = associate([*seen, left]).findings
     assert first.gone == "flight1" and len(first.sightings) == 2
 
@@ -117,6 +116,23 @@ def test_a_look_in_no_frame_is_none() -> None:
     unseen = SearchedDate("flight1", 1, SearchedFrames(np.zeros((0, 4, 2)), {}))
     words = between(associate([sighting(0, "map", 0.0)], [look(0), unseen]), "flight0", "flight1")
     assert words.endswith("no objects were searched for on flight1")
+
+
+def test_changes_that_nobody_named_are_things_too() -> None:
+    """A heap came, which one look has a name for, and left; what stood in its place before is another."""
+    unnamed = {"label": "", "origin": KnownBy.CHANGED, "length_m": 3.0}
+    seen = [
+        sighting(0, "left", 0.0, order=1.0, gone="flight1", **unnamed),
+        sighting(1, "left", 0.1, **unnamed),
+        sighting(1, "map", 0.2, label="truck", length_m=4.0),
+        sighting(1, "leaves", 0.3, order=2.0, gone="flight2", **unnamed),
+    ]
+    register = associate(seen, [look(0), look(1), look(3)])
+    assert shown(register)[0][1:] == ("", ("flight0",), "flight1", 1)
+    assert shown(register)[1][1:] == ("truck", ("flight1",), "flight2", 3)
+    assert between(register, "flight0", "flight1") == "1 truck came; 1 thing left"
+    (lasting,) = associate(seen[1:2], [look(1), look(2)]).findings
+    assert not lasting.gone  # nobody looks for it
 
 
 def test_what_comes_after_it_was_gone_is_another() -> None:
@@ -208,6 +224,25 @@ def test_laws(missions: list[tuple[int, str, list[int]]], random: object) -> Non
         assert len(set(names)) == len(names)
     ids = [each.id for each in whole.findings]
     assert len(set(ids)) == len(ids)
+
+
+@settings(max_examples=60, deadline=None)
+@given(MISSIONS, st.integers(0, 3))
+def test_a_flight_more_is_associated_with_what_stands_near_it(
+    missions: list[tuple[int, str, list[int]]], last: int
+) -> None:
+    """One date after another, each with what still stands, comes to what all at once come to."""
+    seen = [sighting(day, name, 3.0 * at) for day, name, places in missions for at in places]
+    looks = [look(day) for day in range(4) if day != last]
+    gone: list[GroundFinding] = []
+    stands: list[GroundFinding] = []
+    for day in range(4):
+        own = [each for each in seen if each.order == day]
+        found = associate(own, [each for each in looks if each.order == day], stands).findings
+        gone += [each for each in found if each.gone]
+        stands = [each for each in found if not each.gone]
+    whole = associate(seen, looks)
+    assert sorted(shown(Register((*gone, *stands)))) == sorted(shown(whole))
 
 
 def test_two_hundred_flights_are_quick() -> None:

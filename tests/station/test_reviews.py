@@ -111,13 +111,16 @@ def test_a_new_site_has_no_verdicts_of_a_deleted_one_of_its_name(
 
 
 def test_of_many_at_once_all_are_kept(client: TestClient) -> None:
-    """Each is the next revision."""
+    """Each is the next revision; one that is sent again is one."""
     codes: list[int] = []
     threads = [
         threading.Thread(
-            target=lambda: codes.append(verdict(client, "b-2", "confirmed").status_code)
+            target=lambda label: codes.append(
+                verdict(client, "b-2", "confirmed", label=label).status_code
+            ),
+            args=(str(number),),
         )
-        for _ in range(6)
+        for number in range(6)
     ]
     for each in threads:
         each.start()
@@ -126,6 +129,8 @@ def test_of_many_at_once_all_are_kept(client: TestClient) -> None:
     assert codes == [201] * 6
     given = client.get(REVIEWS, params={"id": "b-2"}).json()
     assert [each["revision"] for each in given] == [6, 5, 4, 3, 2, 1]
+    again = verdict(client, "b-2", "confirmed", label=given[0]["label"]).json()
+    assert again["revision"] == 6 and len(client.get(REVIEWS, params={"id": "b-2"}).json()) == 6
 
 
 def test_while_a_mission_writes_verdicts_wait_for_its_end(client: TestClient, root: Path) -> None:
@@ -204,7 +209,8 @@ def test_what_a_watch_found_is_reviewed_as_all_findings_are(client: TestClient) 
     """One list; a vote on a sighting is one on its finding."""
     watch_run(client.app.state.station, "run-1")
     items = "/api/sites/field/collections/findings/items"
-    person, car = client.get(items).json()["features"]
+    person, car, *things = client.get(items).json()["features"]
+    assert {each["properties"]["class"] for each in things} == {"thing"}  # of unnamed changes
     assert person["properties"]["class"] == "person" and "path" not in person["properties"]
     assert person["properties"]["sightings"] == ["run-1:1"]
     assert client.get(person["properties"]["crops"][0]).content == PICTURE
@@ -236,11 +242,11 @@ def test_a_watch_needs_no_site_and_others_see_nothing_of_it(client: TestClient) 
     wish = {"kind": "object", "id": "run-2:2", "verdict": "rejected"}
     assert client.post("/api/sites/nowhere-yet/reviews", json=wish).status_code == 201
     assert client.get(items).json()["features"][1]["properties"]["review"] == "rejected"
-    assert client.get("/api/sites/field/collections/findings/items").json()["features"] == []
+    assert client.get("/api/sites/field/collections/objects/items").json()["features"] == []
     assert client.get("/api/sites/field/crops/finding/run-2:1/0.jpg").status_code == 404
     assert client.get("/api/sites/nothing/collections/findings/items").status_code == 404
     (results / "tracks.geojson").write_text("broken")
-    assert client.get("/api/sites/field/collections/findings/items").json()["features"] == []
+    assert client.get("/api/sites/field/collections/objects/items").json()["features"] == []
 
 
 def test_a_vote_on_what_a_watch_found_stays_when_the_flight_is_mapped(

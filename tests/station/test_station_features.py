@@ -44,7 +44,7 @@ def test_a_client_finds_its_way_from_the_landing_page(client: TestClient) -> Non
         "frames": 8,
         "objects": 0,
         "changes": 4,
-        "findings": 0,
+        "findings": 4,
         "coverage": 0,
         "pod": 0,
         "track": 2,

@@ -10,7 +10,7 @@ import shapely
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from sorvolo.findings.register import GroundFinding, Register, begun_and_ended
+from sorvolo.findings.register import UNNAMED, GroundFinding, Register, begun_and_ended
 from sorvolo.survey.findings import ChangeFacts, ChangeKind
 from sorvolo.survey.objects import PERSON
 from sorvolo.survey.wording import counted, plural
@@ -44,7 +44,7 @@ def between(register: Register, before: str, after: str) -> str:
     parts = []
     for label in dict.fromkeys(each.label for each in ordered(register.findings)):
         came, left = (counts[label, kind] for kind in (ChangeKind.APPEARED, ChangeKind.DISAPPEARED))
-        parts += [_came_and_left(label, came, left)] if came or left else []
+        parts += [_came_and_left(label or UNNAMED, came, left)] if came or left else []
     unsearched = [date for date in (before, after) if date not in known]
     if not parts and unsearched:
         return f"no telling what came or left: no objects were searched for on {' and '.join(unsearched)}"

@@ -3,7 +3,7 @@
 import hashlib
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
 from itertools import groupby
@@ -30,6 +30,9 @@ _LIKE_SIZE = 2.5  # lengths further apart than this ratio are two things, where 
 _LIKE_CLASS = 0.1  # classes' shares that agree less are two classes
 _FAR = 1e3  # the cost of a pair that cannot be one thing: more than all that can
 
+UNNAMED = "thing"
+"""What one is called whose class nobody named."""
+
 
 class KnownBy(StrEnum):
     """How a thing came to be known."""
@@ -40,22 +43,14 @@ class KnownBy(StrEnum):
     UNDER_TREES = "under trees"  # no look from above shows whether it is there
 
 
-class Presence(StrEnum):
-    """What a date's flight says of a thing."""
-
-    SEEN = "seen"
-    GONE = "gone"  # looked for and not found
-    NOT_LOOKED = "not looked"
-
-
 @dataclass(frozen=True, eq=False)
 class MissionSighting:
     """One thing as one mission saw it, in all of the mission's frames.
 
     `date` is the flight's name and `order` its rank among the site's; several missions may read one flight. `id` is the
     mission's own. `position_m` (2,) east, north in the site frame, of what moves where it was at `last_ns`. `sigma_m`
-    is per axis. `class_scores` gives each class's share. `gone` is the later date whose comparison saw that it had
-    left, "" where none did.
+    is per axis. `label` is "" where nobody named it. `class_scores` gives each class's share. `gone` is the later date
+    whose comparison saw that it had left, "" where none did; then `order` is that date's.
     """
 
     date: str
@@ -93,14 +88,15 @@ class GroundFinding:
     """One thing on the ground, by all its sightings in order of date.
 
     `id` follows from the first sighting's content. `gone` is the first date that looked there and did not find it, ""
-    where none did. `position_m` (2,) and `sigma_m` are those of the newest date that saw it. `class_sums` are the
-    scores by class, summed over all sightings.
+    where none did. `position_m` (2,) and `sigma_m` are those of the newest date that saw it; `known_m` (2,) is that
+    place with its missions' common errors taken off. `class_sums` are the scores by class, summed over all sightings.
     """
 
     id: str
     sightings: tuple[MissionSighting, ...]
     position_m: Floats
     sigma_m: float
+    known_m: Floats
     class_sums: Mapping[str, float]
     gone: str = ""
 
@@ -111,8 +107,8 @@ class GroundFinding:
 
     @property
     def label(self) -> str:
-        """The likeliest class."""
-        return next(iter(self.class_scores))
+        """The likeliest class; "" where nobody named it."""
+        return next(iter(self.class_scores), "")
 
     @property
     def newest(self) -> MissionSighting:
@@ -138,12 +134,6 @@ class GroundFinding:
         """When it was last seen."""
         return max(each.last_ns for each in self.sightings)
 
-    def presence(self, date: str) -> Presence:
-        """What a date says of it. Absence needs a look: no mission's silence is one."""
-        if date in self.dates:
-            return Presence.SEEN
-        return Presence.GONE if date == self.gone else Presence.NOT_LOOKED
-
 
 @dataclass(frozen=True, eq=False)
 class Register:
@@ -158,21 +148,31 @@ class Register:
         return [each for each in self.findings if not each.gone]
 
 
-def associate(sightings: Sequence[MissionSighting], looks: Sequence[SearchedDate] = ()) -> Register:
+def associate(
+    sightings: Sequence[MissionSighting],
+    looks: Sequence[SearchedDate] = (),
+    known: Sequence[GroundFinding] = (),
+) -> Register:
     """What missions saw, each thing one finding; the same whatever their order.
 
     Dates are taken in order of time, and a date's missions by name. Two sightings of one mission are never one finding.
-    What a date looked at and did not find is gone; the next thing there is another finding.
+    What a date looked at and did not find is gone; the next thing there is another finding. `known` are findings of
+    dates before all of these that still stand; those within `reach_m` of the places seen and looked at are enough.
     """
     steps: list[MissionSighting | SearchedDate] = [*sightings, *looks]
-    working = _Working(len(sightings))
-    for date, of_date in groupby(sorted(steps, key=_order), key=lambda each: each.date):
+    working = _Working(known, len(sightings))
+    for (_, date), of_date in groupby(sorted(steps, key=_date_of), key=_date_of):
         taken = list(of_date)
         seen = [each for each in taken if isinstance(each, MissionSighting)]
-        for _, mission in groupby(seen, key=lambda each: each.mission):
+        for _, mission in groupby(sorted(seen, key=_order), key=_mission_of):
             working.take(list(mission))
         working.end(date, [each.frames for each in taken if isinstance(each, SearchedDate)])
     return Register(tuple(each.finding() for each in working.things), tuple(looks))
+
+
+def reach_m(places_m: PointsM) -> tuple[Floats, Floats]:
+    """The box, (2,) each, around places (N, 2), N >= 1, out of which no finding is theirs."""
+    return places_m.min(axis=0) - _MOST_WALK_M, places_m.max(axis=0) + _MOST_WALK_M
 
 
 def begun_and_ended(
@@ -180,16 +180,12 @@ def begun_and_ended(
 ) -> Iterator[tuple[ChangeKind, GroundFinding]]:
     """What came to be there, or left, between dates that both looked for it: appeared or disappeared."""
     searches = [each.frames for each in register.looks if each.date in before]
-    new = [
-        each
-        for each in register.findings
-        if each.dates[0] == after and _is_in_the_open(each.sightings)
-    ]
+    new = [each for each in register.findings if each.dates[0] == after]
     places_m = np.array([each.position_m for each in new]).reshape(-1, 2)
     was_looked_for = looked_at(places_m, [each.label for each in new], searches)
     for found, is_known in zip(new, was_looked_for):
         # or its own comparison saw it come
-        if is_known or any(
+        if (is_known and _can_be_missed(found.sightings)) or any(
             each.origin is KnownBy.CHANGED and not each.gone for each in found.sightings
         ):
             yield ChangeKind.APPEARED, found
@@ -198,37 +194,62 @@ def begun_and_ended(
             yield ChangeKind.DISAPPEARED, found
 
 
-def _is_in_the_open(sightings: Sequence[MissionSighting]) -> bool:
-    """Whether a look from above can miss it; what only looks below crowns saw it cannot."""
-    return any(each.origin is not KnownBy.UNDER_TREES for each in sightings)
+def _can_be_missed(sightings: Sequence[MissionSighting]) -> bool:
+    """Whether a detector that looks from above and is silent states that it is gone: only where one may know it."""
+    return any(
+        each.label and each.origin in (KnownBy.DETECTED, KnownBy.CHANGED) for each in sightings
+    )
 
 
-def _order(each: MissionSighting | SearchedDate) -> tuple[float, str, str, int, str]:
-    if isinstance(each, SearchedDate):
-        return each.order, each.date, "", -1, ""
-    return each.order, each.date, each.mission, each.first_ns, each.id
+def _date_of(each: MissionSighting | SearchedDate) -> tuple[float, str]:
+    gone = each.gone if isinstance(each, MissionSighting) else ""
+    return each.order, gone or each.date
+
+
+def _mission_of(each: MissionSighting) -> tuple[bool, str]:
+    return not each.gone, each.mission  # what left is no other's place
+
+
+def _order(each: MissionSighting) -> tuple[bool, str, int, str]:
+    return *_mission_of(each), each.first_ns, each.id
 
 
 class _Thing:
-    """A finding while missions are added. `known_m` is its place with its missions' common errors taken off."""
+    """A finding while missions are added. `left` is its sighting by the comparison that saw that it had left, None
+    where it was seen since."""
 
     def __init__(self, id_: str) -> None:
         self.id, self.gone = id_, ""
+        self.left: MissionSighting | None = None
         self.sightings: list[MissionSighting] = []
         self.of_date: list[MissionSighting] = []
         self.sums: dict[str, float] = {}
         self._off_m: list[Floats] = []
 
+    @classmethod
+    def of(cls, found: GroundFinding) -> "_Thing":
+        """One that an earlier date left standing."""
+        thing = cls(found.id)
+        thing.sightings, thing.sums = list(found.sightings), dict(found.class_sums)
+        thing.of_date = [each for each in found.sightings if each.date == found.dates[-1]]
+        thing.place_m, thing.known_m, thing.sigma_m = found.position_m, found.known_m, found.sigma_m
+        return thing
+
     def add(self, sighting: MissionSighting, off_m: Floats) -> None:
         """Take a sighting of a mission that is off by (2,) as a whole; of a date's places, the mean by their errors
         counts."""
+        for name, share in _odds(sighting).items():
+            self.sums[name] = self.sums.get(name, 0.0) + share * sighting.score
+        self.left = sighting if sighting.gone else None
+        if sighting.gone and self.of_date:  # it left from where it was seen last
+            last = self.of_date[-1]
+            self.sightings.append(replace(sighting, date=last.date, order=last.order))
+            return
         if self.of_date and self.of_date[0].date != sighting.date:
             self.of_date, self._off_m = [], []
         self.of_date.append(sighting)
         self._off_m.append(off_m)
         self.sightings.append(sighting)
-        for name, share in _odds(sighting).items():
-            self.sums[name] = self.sums.get(name, 0.0) + share * sighting.score
         weights = [max(_known(each.sigma_m, 10.0), 0.01) ** -2 for each in self.of_date]
         self.sigma_m = max(weights) ** -0.5  # missions of one flight err in common
         places_m = np.array([each.position_m for each in self.of_date])
@@ -239,31 +260,32 @@ class _Thing:
         )
         self.known_m = self.place_m - off_m
 
-    @property
-    def left(self) -> str:
-        """The date whose comparison saw that it had left; "" where it was seen since."""
-        return next((each.gone for each in self.of_date if each.gone), "")
-
     def finding(self) -> GroundFinding:
         return GroundFinding(
             self.id,
             tuple(self.sightings),
             frozen(self.place_m),
             self.sigma_m,
+            frozen(self.known_m),
             self.sums,
-            self.gone or self.left,
+            self.gone,
         )
 
 
 class _Working:
     """The findings while missions are added, one after another, with the places of those that still stand."""
 
-    def __init__(self, most: int) -> None:
-        self.things: list[_Thing] = []
-        self._ids: set[str] = set()
-        self._places_m = np.zeros((most, 2))
-        self._stands = np.zeros(most, bool)
+    def __init__(self, known: Sequence[GroundFinding], most: int) -> None:
+        """`most` findings may come to those that are known."""
+        self.things = [_Thing.of(each) for each in known]
+        self._ids = {each.id for each in known}
+        self._places_m = np.zeros((len(known) + most, 2))
+        self._stands = np.zeros(len(self._places_m), bool)
+        self._stands[: len(known)] = True
+        for number, each in enumerate(known):
+            self._places_m[number] = each.known_m
         self._seen: set[int] = set()  # on the date that is added
+        self._left: set[int] = set()
 
     def take(self, mission: Sequence[MissionSighting]) -> None:
         """Add all sightings of one mission, each to a finding of its own."""
@@ -277,7 +299,7 @@ class _Working:
                 number = len(self.things)
                 self.things.append(_Thing(self._id(sighting)))
                 self._stands[number] = True
-            self._seen.add(number)
+            (self._left if sighting.gone else self._seen).add(number)
             self.things[number].add(sighting, off_m)
             self._places_m[number] = self.things[number].known_m
 
@@ -297,17 +319,16 @@ class _Working:
         return [each for each in pairs if each is not None]
 
     def end(self, date: str, searches: Sequence[SearchedFrames]) -> None:
-        """Conclude a date: what it looked at and did not see is gone, and what had left before it."""
-        for number, thing in enumerate(self.things):
-            if self._stands[number] and thing.left and number not in self._seen:
-                thing.gone = thing.left
-                self._stands[number] = False
+        """Conclude a date: what it looked at and did not see is gone, and what its comparison saw leave."""
+        for number in self._left - self._seen:
+            self.things[number].gone = date
+            self._stands[number] = False
         if outlines_m := [each.outlines_m.reshape(-1, 2) for each in searches]:
             near = self._standing_near(np.concatenate(outlines_m))
             unseen = [
                 number
                 for number in near.tolist()
-                if number not in self._seen and _is_in_the_open(self.things[number].sightings)
+                if number not in self._seen and _can_be_missed(self.things[number].sightings)
             ]
             things = [self.things[number] for number in unseen]
             labels = [next(iter(_shares(each.sums))) for each in things]
@@ -316,12 +337,13 @@ class _Working:
             for thing in (things[row] for row in np.flatnonzero(is_gone)):
                 thing.gone = date
         self._seen.clear()
+        self._left.clear()
 
     def _standing_near(self, places_m: PointsM) -> Rows:
         """Numbers of what stands within reach of the box around places (N, 2)."""
         if not len(places_m):
             return np.zeros(0, np.int64)
-        low_m, high_m = places_m.min(axis=0) - _MOST_WALK_M, places_m.max(axis=0) + _MOST_WALK_M
+        low_m, high_m = reach_m(places_m)
         own_m = self._places_m[: len(self.things)]
         is_near = self._stands[: len(own_m)] & ((own_m >= low_m) & (own_m <= high_m)).all(axis=1)
         return np.flatnonzero(is_near)
@@ -343,7 +365,7 @@ def id_by(first: MissionSighting, attempt: int = 0) -> str:
 
 
 def _odds(sighting: MissionSighting) -> Mapping[str, float]:
-    return sighting.class_scores or {sighting.label: 1.0}
+    return sighting.class_scores or ({sighting.label: 1.0} if sighting.label else {})
 
 
 def _shares(sums: Mapping[str, float]) -> dict[str, float]:
@@ -375,6 +397,8 @@ def _pair(row: int, sighting: MissionSighting, number: int, thing: _Thing) -> _P
     is_same_date = last.date == sighting.date
     if is_same_date and any(each.mission == sighting.mission for each in thing.of_date):
         return None
+    if thing.left is not None and thing.left.mission == sighting.mission:
+        return None  # what came in its place
     moves = sighting.moving or last.moving
     if moves and not is_same_date:
         return None
@@ -382,7 +406,8 @@ def _pair(row: int, sighting: MissionSighting, number: int, thing: _Thing) -> _P
     shared = sum(min(share, own.get(name, 0.0)) for name, share in odds.items())
     if shared < _LIKE_CLASS:
         shorter_m, longer_m = sorted((float(sighting.length_m), float(last.length_m)))
-        if not is_same_date or not longer_m <= _LIKE_SIZE * shorter_m:
+        may_differ = is_same_date or (sighting.gone and not (odds and own))
+        if not may_differ or not longer_m <= _LIKE_SIZE * shorter_m:
             return None
     length_m = max(_known(sighting.length_m), _known(last.length_m))
     between_s = (sighting.last_ns - last.last_ns) / 1e9 if moves else 0.0

@@ -13,6 +13,7 @@ from shapely.errors import ShapelyError
 from shapely.geometry import shape
 from shapely.geometry.base import BaseGeometry
 
+from sorvolo.findings.register import UNNAMED
 from sorvolo.station.found import Feature, Track, found_features, on_earth
 from sorvolo.station.problems import Problem
 from sorvolo.station.sites import SiteShelf
@@ -250,7 +251,8 @@ class SiteCollections:
             if name == FINDINGS:
                 return found_features(archive if archive and archive.has_site else None, tracks)
             found = self._found(site_id, FINDINGS).features
-            return [each for each in found if not each["properties"]["gone"]]
+            names = ((each, each["properties"]) for each in found)
+            return [each for each, own in names if not own["gone"] and own["class"] != UNNAMED]
 
         return self._made((site_id, name), (archive and _content(archive), tracks), make)
 

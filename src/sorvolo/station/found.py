@@ -9,6 +9,7 @@ import numpy as np
 
 from sorvolo.findings.importance import ordered
 from sorvolo.findings.register import (
+    UNNAMED,
     GroundFinding,
     KnownBy,
     MissionSighting,
@@ -131,7 +132,7 @@ def _feature(
     begun = found.sightings[0].id
     values = values | {
         "id": found.id,
-        "class": found.label,
+        "class": found.label or UNNAMED,
         "class_scores": {name: rounded(share, 4) for name, share in found.class_scores.items()},
         "latitude": rounded(latitude_deg, 8),
         "longitude": rounded(longitude_deg, 8),

@@ -109,7 +109,7 @@ class Reviews:
         return [each for each in votes if thing_id in ("", each.id) or each.id == ids.get(thing_id)]
 
     def give(self, site_id: str, wish: ReviewWish, who: str) -> Review:
-        """Add a vote; how all stand then. Raises Problem (404) for an unknown thing."""
+        """Add a vote, once where it is sent again; how all stand then. Raises Problem (404) for an unknown thing."""
         thing = self._ids(site_id, wish.kind).get(wish.id)
         if thing is None:
             raise Problem(404, f"the site has no {wish.kind} {wish.id[:80]!r}; load the list again")
@@ -126,6 +126,8 @@ class Reviews:
             who,
             utc_now(),
         )
+        if votes and replace(made, revision=votes[-1].revision, at=votes[-1].at) == votes[-1]:
+            return _standing(thing, votes)
         standing = _standing(thing, [*votes, made])
         key, kept = self._key(site_id), self._kept_as(site_id, made)
         event = NewEvent("review.changed", asdict(standing), site_id)

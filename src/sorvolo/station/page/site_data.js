@@ -53,6 +53,7 @@ export class SiteData extends EventTarget {
     }
     if (name === "objects") { // of the versions that are compared, else of the newest look at each place
       const dates = (this.detail.versions ?? []).filter(({ n }) => this.versions?.includes(n)).map(({ flight }) => flight);
+      list = list.filter(({ properties }) => properties.class !== "thing"); // it is among the changes
       list = list.filter(({ properties: { flights, gone } }) => !flights || (this.versions ? flights.some((each) => dates.includes(each)) : !gone));
     }
     return name === "objects" || name === "changes" ? passing(list, this.filters) : list;

@@ -16,7 +16,7 @@ from sqlalchemy import Connection
 
 from sorvolo.errors import InputError, NotFoundError, SettingsError, SorvoloWarning, StoreError
 from sorvolo.findings.importance import ordered
-from sorvolo.findings.register import MissionSighting, Register, SearchedDate
+from sorvolo.findings.register import UNNAMED, MissionSighting, Register, SearchedDate
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.paths import AnyPath
@@ -274,7 +274,7 @@ class Archive:
                     {"type": "Point", "coordinates": [round(x, 8) for x in place]},
                     {
                         "id": each.id,
-                        "class": each.label,
+                        "class": each.label or UNNAMED,
                         "score": rounded(each.newest.score, 4),
                         "sigma_m": rounded(each.sigma_m, 3),
                         "length_m": rounded(each.newest.length_m, 2),

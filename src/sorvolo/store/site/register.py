@@ -1,6 +1,6 @@
 """The register of a site, from the records that its missions keep: objects, searched ground, changes, watches' tracks."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 from sqlalchemy import Connection, select
 
@@ -17,6 +17,9 @@ from sorvolo.store.site.change_records import (
 )
 from sorvolo.survey.findings import ChangeKind, Verdict
 from sorvolo.survey.map_objects import MapObject
+
+_CAME = (ChangeKind.APPEARED, ChangeKind.REPLACED, ChangeKind.AREA)
+_LEFT = (ChangeKind.DISAPPEARED, ChangeKind.REPLACED)
 
 
 def site_register(
@@ -96,26 +99,19 @@ def sighting_of(thing: MapObject, flight_id: str, rank: float) -> MissionSightin
 
 def _of_change(
     change: StoredChange, before: str, dates: Mapping[str, tuple[float, list[int]]]
-) -> list[MissionSighting]:
-    """What a change shows of things with a class: one that stands after it, one that left with it."""
-    sightings = []
-    for date, label, kinds, gone in (
-        (change.flight_id, change.class_after, (ChangeKind.APPEARED, ChangeKind.REPLACED), ""),
-        (
-            before,
-            change.class_before,
-            (ChangeKind.DISAPPEARED, ChangeKind.REPLACED),
-            change.flight_id,
-        ),
-    ):
-        if not label or date not in dates or change.kind not in kinds:
-            continue
-        rank, flown_ns = dates[date]
-        seen_ns = flown_ns if gone else (change.first_seen_ns, change.last_seen_ns)
-        sightings.append(
-            MissionSighting(
+) -> Iterator[MissionSighting]:
+    """What a change shows: what stands after it, and what left with it; its class where it has one."""
+    if change.flight_id not in dates:
+        return
+    came = change.flight_id, change.class_after, _CAME, ""
+    left = before, change.class_before, _LEFT, change.flight_id
+    for date, label, kinds, gone in (came, left):
+        if date in dates and change.kind in kinds:
+            seen_ns = (change.first_seen_ns, change.last_seen_ns)
+            first_ns, last_ns = dates[date][1] if gone else seen_ns
+            yield MissionSighting(
                 date,
-                rank,
+                dates[change.flight_id][0],
                 f"{change.flight_id} changes",
                 change.id,
                 KnownBy.CHANGED,
@@ -124,12 +120,10 @@ def _of_change(
                 change.centre_m,
                 change.sigma_m,
                 change.length_m,
-                seen_ns[0],
-                seen_ns[1],
+                first_ns,
+                last_ns,
                 gone=gone,
             )
-        )
-    return sightings
 
 
 def _is_of(flight: str, flights: Collection[str] | None) -> bool:
