@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import sys
 import threading
 import time
@@ -170,11 +171,12 @@ def test_the_headline_counts_what_was_looked_at_and_people_are_events(
 def test_a_search_that_maps_a_flight_tells_of_its_people(
     simulated: Path, mapped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    place, outputs = OpenedSite(mapped, str(mapped)), SearchOutputs(tmp_path)
-    flight = str(simulated / "flight1/flight1.mp4")
-    _map_all([flight], place, SearchSettings(), outputs, None, "", 1.0)
-    people = report_of(mapped, "flight1")["objects"]["classes"]["person"]
-    assert capsys.readouterr().err.count("PERSON FOUND") == people > 0
+    site = shutil.copytree(mapped, tmp_path / "site")
+    place, flight = OpenedSite(site, str(site)), str(simulated / "flight1/flight1.mp4")
+    _map_all([flight], place, SearchSettings(), SearchOutputs(tmp_path / "out"), None, "", 1.0)
+    people = report_of(site, "flight1")["objects"]["classes"]["person"]
+    told = capsys.readouterr().err
+    assert told.count("PERSON FOUND") == people > 0
 
 
 def test_compare_names_changes(simulated: Path, compared: Path) -> None:

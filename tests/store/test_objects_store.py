@@ -104,6 +104,33 @@ def test_files_of_a_flight_and_of_the_site(tmp_path: Path) -> None:
         assert image_from_jpeg(crop.read_bytes(), "crop").shape == (54, 96, 3)
 
 
+def test_the_register_that_is_kept_is_what_all_flights_state_at_once(tmp_path: Path) -> None:
+    """Flights beside and over each other; one mapped again, which changes what came after it."""
+    places_m = np.random.default_rng(2).uniform(-200, 200, (60, 2))
+    shown = []
+    for number, name in enumerate("abcdebf"):
+        west_m = 90.0 * (number % 3) - 180
+        near = np.flatnonzero(np.abs(places_m[:, 0] - west_m - 60) < 60)
+        own = [
+            thing(f"{name}-o{k}", *(places_m[k] + 0.1 * number), first_seen_ns=number + 1)
+            for k in near
+            if (k + number) % 4
+        ]
+        commit(tmp_path, name, search(tuple(own), west_m, west_m + 120))
+        with Archive.open(tmp_path, write=False) as archive:
+            kept, whole = archive.register(), archive.register(flights=set("abcdef"))
+        for register in (kept, whole):
+            shown.append(
+                [
+                    [each.id, each.gone, each.class_sums, *each.position_m, *each.known_m]
+                    + [(one.id, one.date, one.origin) for one in each.sightings]
+                    for each in register.findings
+                ]
+            )
+        assert shown[-1] == shown[-2]
+    assert {each[1] for each in shown[-1]} > {"", "f"}
+
+
 @pytest.mark.usefixtures("kind")
 def test_a_later_flight_replaces_what_it_looked_at(tmp_path: Path) -> None:
     """Gone where two of its frames looked and found nothing, kept where none looked, older where it still stands."""

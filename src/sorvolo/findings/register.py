@@ -2,7 +2,7 @@
 
 import hashlib
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
@@ -160,7 +160,7 @@ def associate(
     dates before all of these that still stand; those within `reach_m` of the places seen and looked at are enough.
     """
     steps: list[MissionSighting | SearchedDate] = [*sightings, *looks]
-    working = _Working(known, len(sightings))
+    working = _Working(in_order(known), len(sightings))
     for (_, date), of_date in groupby(sorted(steps, key=_date_of), key=_date_of):
         taken = list(of_date)
         seen = [each for each in taken if isinstance(each, MissionSighting)]
@@ -168,6 +168,14 @@ def associate(
             working.take(list(mission))
         working.end(date, [each.frames for each in taken if isinstance(each, SearchedDate)])
     return Register(tuple(each.finding() for each in working.things), tuple(looks))
+
+
+def in_order(findings: Iterable[GroundFinding]) -> list[GroundFinding]:
+    """Findings in the order in which their missions brought them."""
+    first = ((each.sightings[0], each) for each in findings)
+    return [
+        each for _, each in sorted(first, key=lambda pair: (_date_of(pair[0]), _order(pair[0])))
+    ]
 
 
 def reach_m(places_m: PointsM) -> tuple[Floats, Floats]:

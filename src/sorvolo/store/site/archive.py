@@ -60,7 +60,12 @@ from sorvolo.store.site.files import (
 )
 from sorvolo.store.site.flight_writer import FlightWriter
 from sorvolo.store.site.journal import RunJournal
-from sorvolo.store.site.register import flown_flights, present_objects, site_register
+from sorvolo.store.site.register import (
+    flown_flights,
+    present_objects,
+    register_anew,
+    site_register,
+)
 from sorvolo.store.site.tiles import GrowingTiles, TileBlobs, TileView
 from sorvolo.store.site.upkeep import (
     forget_journals,
@@ -239,6 +244,7 @@ class Archive:
         self._require_writable()
         with self.catalogue.changing() as connection:
             change_records.put_under_trees(connection, flight_id, found)
+            register_anew(connection)
         write_object_files(self, flight_id, object_crops(found))
 
     def searches(self) -> list[StoredSearch]:
@@ -303,7 +309,7 @@ class Archive:
 
     def newest_objects(self, flights: Collection[str] | None = None) -> list[StoredObject]:
         """What stands on the site by the newest look at each piece of ground; as far as these flights know."""
-        return present_objects(self.catalogue_rows(site_register, flights), self.objects())
+        return present_objects(self.register(flights=flights), self.objects())
 
     def review(self, change_ids: str | Iterable[str], verdict: Verdict, note: str = "") -> None:
         """Record a person's verdict on one change, or on several; the flights' change files follow.
@@ -332,6 +338,7 @@ class Archive:
                     f"{self.folder} has no change {', '.join(unknown)}; `sorvolo review {self.folder}` lists them"
                 )
             change(connection, found)
+            register_anew(connection)
             records.owe_documents(connection, {each.flight_id for each in found})
         repair(self)
 

@@ -436,8 +436,8 @@ def complete_run(
     notes: Sequence[str],
     export_crs: str,
     flown_ns: tuple[int, int] | None,
-) -> None:
-    """Switch a flight from its former run to this one, and the map to this version."""
+) -> bool:
+    """Switch a flight from its former run to this one, and the map to this version; whether there was one."""
     this_run = schema.runs.c.id == run_id
     flight_id = connection.execute(select(schema.runs.c.flight_id).where(this_run)).scalar_one()
     former = (schema.runs.c.flight_id == flight_id, schema.runs.c.id != run_id)
@@ -450,7 +450,7 @@ def complete_run(
             .where(*former)
         ).scalars()
     } - documents.keys()
-    connection.execute(delete(schema.runs).where(*former))
+    is_again = connection.execute(delete(schema.runs).where(*former)).rowcount > 0
     if gone:
         connection.execute(
             insert(schema.leftovers), [{"run_id": run_id, "name": name} for name in sorted(gone)]
@@ -480,6 +480,7 @@ def complete_run(
                 for name, content in documents.items()
             ],
         )
+    return is_again
 
 
 def drop_unfinished(connection: Connection) -> None:

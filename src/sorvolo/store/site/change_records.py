@@ -359,9 +359,9 @@ def _add_objects(
     schema.add_rows(connection, schema.objects, rows)
 
 
-def load_searches(connection: Connection) -> list[StoredSearch]:
-    """The searches of complete runs, by flight rank."""
-    query = schema.of_complete_runs(schema.searches)
+def load_searches(connection: Connection, flight_id: str | None = None) -> list[StoredSearch]:
+    """The searches of complete runs, by flight rank; of one flight if its id is given."""
+    query = schema.of_complete_runs(schema.searches, flight_id)
     return [
         StoredSearch(
             row.flight_id,

@@ -1,12 +1,26 @@
 """The register of a site, from the records that its missions keep: objects, searched ground, changes, watches' tracks."""
 
+import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import fields
+from typing import Any
 
-from sqlalchemy import Connection, select
+import numpy as np
+from sqlalchemy import Connection, Row, delete, select
 
-from sorvolo.findings.register import KnownBy, MissionSighting, Register, SearchedDate, associate
+from sorvolo.findings.register import (
+    GroundFinding,
+    KnownBy,
+    MissionSighting,
+    Register,
+    SearchedDate,
+    associate,
+    in_order,
+    reach_m,
+)
+from sorvolo.geometry.arrays import Floats, frozen
+from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.site import schema
-from sorvolo.store.site.catalogue import list_versions
 from sorvolo.store.site.change_records import (
     StoredChange,
     StoredObject,
@@ -29,21 +43,53 @@ def site_register(
     their_looks: Sequence[SearchedDate] = (),
 ) -> Register:
     """What all complete runs found, each thing once; as far as these flights know. `others` are of no run of the site."""
-    searches = [each for each in load_searches(connection) if _is_of(each.flight_id, flights)]
-    sightings = [
-        sighting_of(each.thing, each.flight_id, float(each.rank))
-        for each in load_objects(connection)
-        if _is_of(each.flight_id, flights)
-    ]
-    versions = list_versions(connection)
-    flight_of = {each.id: each.flight_id for each in versions}
-    before = {each.flight_id: flight_of.get(each.parent_id, "") for each in versions}
-    dates = {name: (float(rank), span) for name, rank, *span in flown_flights(connection)}
-    for change in load_changes(connection):
-        if _is_of(change.flight_id, flights) and change.verdict is not Verdict.REJECTED:
-            sightings += _of_change(change, before.get(change.flight_id, ""), dates)
-    looks = [SearchedDate(each.flight_id, float(each.rank), each.frames) for each in searches]
+    if flights is None and not others and not their_looks:  # as commits put it together
+        return Register(tuple(in_order(load_findings(connection))), tuple(_looks(connection)))
+    sightings, looks = _seen(connection, flights)
     return associate([*sightings, *others], [*looks, *their_looks])
+
+
+def load_findings(
+    connection: Connection, low_m: Floats | None = None, high_m: Floats | None = None
+) -> list[GroundFinding]:
+    """All findings; or what still stands in a box (2,), (2,), site metres."""
+    table = schema.findings
+    query = select(table)
+    if low_m is not None and high_m is not None:
+        query = query.where(
+            table.c.gone == "",
+            table.c.east_m.between(float(low_m[0]), float(high_m[0])),
+            table.c.north_m.between(float(low_m[1]), float(high_m[1])),
+        )
+    return [_finding_of(row) for row in schema.checked_rows(connection, table, query)]
+
+
+def register_flight(connection: Connection, flight_id: str) -> None:
+    """Take a new flight whose run was just completed into the register: it changes what stands near it."""
+    sightings, looks = _seen(connection, {flight_id})
+    places_m = [each.position_m.reshape(1, 2) for each in sightings]
+    places_m += [each.frames.outlines_m.reshape(-1, 2) for each in looks]
+    if not sum(map(len, places_m)):
+        return
+    low_m, high_m = reach_m(np.concatenate(places_m))
+    near = load_findings(connection, low_m, high_m)
+    known = {each.id: ("", len(each.sightings)) for each in near}
+    found = associate(sightings, looks, near).findings
+    changed = [each for each in found if known.get(each.id) != (each.gone, len(each.sightings))]
+    table = schema.findings
+    for each in changed:
+        dropped = connection.execute(delete(table).where(table.c.id == each.id)).rowcount
+        if dropped and each.id not in known:  # one far away has its id
+            register_anew(connection)
+            return
+    schema.add_rows(connection, table, [_row_of(each) for each in changed])
+
+
+def register_anew(connection: Connection) -> None:
+    """Make the register of all complete runs: what one states has changed."""
+    connection.execute(delete(schema.findings))
+    found = associate(*_seen(connection)).findings
+    schema.add_rows(connection, schema.findings, [_row_of(each) for each in found])
 
 
 def flown_flights(connection: Connection) -> list[tuple[str, int, int, int]]:
@@ -126,5 +172,75 @@ def _of_change(
             )
 
 
-def _is_of(flight: str, flights: Collection[str] | None) -> bool:
-    return flights is None or flight in flights
+def _looks(connection: Connection, flights: Collection[str] | None = None) -> list[SearchedDate]:
+    return [
+        SearchedDate(each.flight_id, float(each.rank), each.frames)
+        for each in load_searches(connection, _only(flights))
+        if flights is None or each.flight_id in flights
+    ]
+
+
+def _seen(
+    connection: Connection, flights: Collection[str] | None = None
+) -> tuple[list[MissionSighting], list[SearchedDate]]:
+    """What the runs of these flights saw, and where they looked; of all."""
+    sightings = [
+        sighting_of(each.thing, each.flight_id, float(each.rank))
+        for each in load_objects(connection, _only(flights))
+        if flights is None or each.flight_id in flights
+    ]
+    versions, parents = schema.versions, schema.versions.alias()
+    query = (
+        select(versions.c.flight_id, parents.c.flight_id.label("before"))
+        .join(parents, parents.c.id == versions.c.parent_id)
+        .where(versions.c.complete)
+        .order_by(versions.c.id)
+    )
+    before = {row.flight_id: row.before for row in connection.execute(query)}
+    dates = {name: (float(rank), span) for name, rank, *span in flown_flights(connection)}
+    for change in load_changes(connection, _only(flights)):
+        is_known = flights is None or change.flight_id in flights
+        if is_known and change.verdict is not Verdict.REJECTED:
+            sightings += _of_change(change, before.get(change.flight_id, ""), dates)
+    return sightings, _looks(connection, flights)
+
+
+def _only(flights: Collection[str] | None) -> str | None:
+    return next(iter(flights)) if flights is not None and len(flights) == 1 else None
+
+
+def _row_of(found: GroundFinding) -> dict[str, Any]:
+    kept = (found.position_m, found.sigma_m, found.class_sums)
+    seen = [[getattr(each, field.name) for field in fields(each)] for each in found.sightings]
+    east_m, north_m = found.known_m.tolist()
+    return {
+        "id": found.id,
+        "east_m": east_m,
+        "north_m": north_m,
+        "gone": found.gone,
+        "properties": plain_json({"kept": kept, "sightings": seen}),
+    }
+
+
+def _finding_of(row: Row[Any]) -> GroundFinding:
+    position_m, sigma_m, class_sums = row.properties["kept"]
+    return GroundFinding(
+        row.id,
+        tuple(_sighting_of(each) for each in row.properties["sightings"]),
+        frozen(position_m),
+        _number(sigma_m),
+        frozen([row.east_m, row.north_m]),
+        class_sums,
+        row.gone,
+    )
+
+
+def _sighting_of(values: Sequence[Any]) -> MissionSighting:
+    named = dict(zip((each.name for each in fields(MissionSighting)), values, strict=True))
+    named |= {name: _number(named[name]) for name in ("sigma_m", "length_m")}
+    named |= {"origin": KnownBy(named["origin"]), "velocity_m_s": tuple(named["velocity_m_s"])}
+    return MissionSighting(**named)
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value

@@ -26,7 +26,7 @@ from sqlalchemy import (
 )
 from sqlalchemy import String as AnyString
 
-FORMAT = 2
+FORMAT = 3
 """A catalogue of another format is refused."""
 
 # ordered by bytes, as SQLite does
@@ -207,6 +207,17 @@ objects = Table(
     known("properties", JSON),
     sealed(),
 )
+findings = Table(
+    "findings",
+    metadata,  # the register: a row a thing, by all that the runs' records state of it
+    Column("id", String, primary_key=True),
+    known("east_m", Float),  # of its place with its missions' common errors taken off
+    known("north_m", Float),
+    text("gone"),  # the flight that did not find it; "": it stands
+    known("properties", JSON),
+    sealed(),
+)
+Index("findings_by_place", findings.c.gone, findings.c.east_m, findings.c.north_m)
 flown = Table(
     "flown",
     metadata,  # when the flight was flown that made a version; kept when its run is replaced
