@@ -188,7 +188,7 @@ def test_compare_names_changes(simulated: Path, compared: Path) -> None:
     assert measured.classes.unnamed <= 1
     with Archive.open(compared, write=False) as archive:
         newest, searches = archive.newest_objects(), archive.searches()
-    assert {each.flight_id for each in searches} == {"flight1", "flight2"}
+    assert {each.date for each in searches} == {"flight1", "flight2"}
     assert sum(each.flight_id == "flight2" for each in newest) >= 4
     assert any(each.finding.dates == ("flight1", "flight2") for each in newest)
     assert "is now" in (compared / "flights/flight2/changes.html").read_text()

@@ -152,7 +152,7 @@ def test_a_later_flight_replaces_what_it_looked_at(tmp_path: Path) -> None:
     assert site["b-o1"]["id"] == first_id, "a later flight leaves a finding's id as it is"
     with Archive.open(tmp_path, write=False) as archive:
         assert [each.thing.id for each in archive.newest_objects({"a"})] == ["a-o1", "a-o2", "a-o3"]
-        assert [each.flight_id for each in archive.searches()] == ["a", "b"]
+        assert [each.date for each in archive.searches()] == ["a", "b"]
 
 
 def test_one_frame_does_not_take_away(tmp_path: Path) -> None:

@@ -42,7 +42,7 @@ from sorvolo.store.site.catalogue import (
     VersionEntry,
 )
 from sorvolo.store.site.catalogue_place import Catalogues, is_site
-from sorvolo.store.site.change_records import StoredChange, StoredObject, StoredReview, StoredSearch
+from sorvolo.store.site.change_records import StoredChange, StoredObject, StoredReview
 from sorvolo.store.site.files import (
     JOURNAL,
     LIVE_COVERAGE,
@@ -230,11 +230,6 @@ class Archive:
         """All reviews of changes, oldest first, also of changes that were replaced since."""
         return self.catalogue_rows(change_records.load_reviews)
 
-    @property
-    def is_searched(self) -> bool:
-        """Whether any flight's frames were searched for objects."""
-        return bool(self.searches())
-
     def objects(self, flight_id: str | None = None) -> list[StoredObject]:
         """The objects that complete runs found, by flight rank and number; of one flight."""
         return self.catalogue_rows(change_records.load_objects, self._known(flight_id))
@@ -247,7 +242,7 @@ class Archive:
             register_anew(connection)
         write_object_files(self, flight_id, object_crops(found))
 
-    def searches(self) -> list[StoredSearch]:
+    def searches(self) -> list[SearchedDate]:
         """Which ground each complete run searched for objects, by flight rank."""
         return self.catalogue_rows(change_records.load_searches)
 

@@ -10,7 +10,7 @@ from sqlalchemy import Connection, Row, delete, func, select
 
 from sorvolo.errors import StoreError
 from sorvolo.findings.importance import grouped
-from sorvolo.findings.register import GroundFinding
+from sorvolo.findings.register import GroundFinding, SearchedDate
 from sorvolo.geometry.arrays import Floats, PointsM, frozen
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.site import schema
@@ -282,16 +282,6 @@ def _outline(rows: Any) -> PointsM:
 
 
 @dataclass(frozen=True, eq=False)
-class StoredSearch:
-    """A complete run's search: its flight and rank, the model, and the frames looked at."""
-
-    flight_id: str
-    rank: int
-    model: str
-    frames: SearchedFrames
-
-
-@dataclass(frozen=True, eq=False)
 class StoredObject:
     """An object of a flight's complete run; its crop is `objects/<id>.jpg` in the flight's folder.
 
@@ -359,16 +349,11 @@ def _add_objects(
     schema.add_rows(connection, schema.objects, rows)
 
 
-def load_searches(connection: Connection, flight_id: str | None = None) -> list[StoredSearch]:
-    """The searches of complete runs, by flight rank; of one flight if its id is given."""
+def load_searches(connection: Connection, flight_id: str | None = None) -> list[SearchedDate]:
+    """The frames that complete runs searched, by flight rank; of one flight if its id is given."""
     query = schema.of_complete_runs(schema.searches, flight_id)
     return [
-        StoredSearch(
-            row.flight_id,
-            row.rank,
-            row.model,
-            _frames_of(row.outlines_m, row.searched_for),
-        )
+        SearchedDate(row.flight_id, float(row.rank), _frames_of(row.outlines_m, row.searched_for))
         for row in schema.checked_rows(connection, schema.searches, query)
     ]
 

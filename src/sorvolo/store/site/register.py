@@ -44,7 +44,9 @@ def site_register(
 ) -> Register:
     """What all complete runs found, each thing once; as far as these flights know. `others` are of no run of the site."""
     if flights is None and not others and not their_looks:  # as commits put it together
-        return Register(tuple(in_order(load_findings(connection))), tuple(_looks(connection)))
+        return Register(
+            tuple(in_order(load_findings(connection))), tuple(load_searches(connection))
+        )
     sightings, looks = _seen(connection, flights)
     return associate([*sightings, *others], [*looks, *their_looks])
 
@@ -172,14 +174,6 @@ def _of_change(
             )
 
 
-def _looks(connection: Connection, flights: Collection[str] | None = None) -> list[SearchedDate]:
-    return [
-        SearchedDate(each.flight_id, float(each.rank), each.frames)
-        for each in load_searches(connection, _only(flights))
-        if flights is None or each.flight_id in flights
-    ]
-
-
 def _seen(
     connection: Connection, flights: Collection[str] | None = None
 ) -> tuple[list[MissionSighting], list[SearchedDate]]:
@@ -202,7 +196,8 @@ def _seen(
         is_known = flights is None or change.flight_id in flights
         if is_known and change.verdict is not Verdict.REJECTED:
             sightings += _of_change(change, before.get(change.flight_id, ""), dates)
-    return sightings, _looks(connection, flights)
+    looks = load_searches(connection, _only(flights))
+    return sightings, [each for each in looks if flights is None or each.date in flights]
 
 
 def _only(flights: Collection[str] | None) -> str | None:

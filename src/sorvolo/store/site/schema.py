@@ -26,7 +26,7 @@ from sqlalchemy import (
 )
 from sqlalchemy import String as AnyString
 
-FORMAT = 3
+FORMAT = 6
 """A catalogue of another format is refused."""
 
 # ordered by bytes, as SQLite does
