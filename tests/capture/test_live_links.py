@@ -1,5 +1,6 @@
 """A receiver's sentences by UDP, TCP, serial port and a growing log, beside a live stream."""
 
+import math
 import os
 import socket
 import threading
@@ -13,7 +14,7 @@ from pathlib import Path
 import pytest
 from live_sender import EPOCH_NS, RATE, free_port, sending, udp_url
 
-from sorvolo.capture.live.links import NmeaLink
+from sorvolo.capture.live.links import TelemetryLink
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.stream import LiveStream
 from sorvolo.capture.source import open_sources
@@ -91,8 +92,8 @@ class Ear:
         )
 
 
-def heard_from(address: str, ear: Ear) -> NmeaLink:
-    link = NmeaLink(address, SETTINGS, ear)
+def heard_from(address: str, ear: Ear) -> TelemetryLink:
+    link = TelemetryLink(address, SETTINGS, ear)
     link.start()
     return link
 
@@ -155,9 +156,51 @@ def test_a_serial_port() -> None:
     assert ear.is_right()
 
 
+def packets(utc_ns: int, boot_ms: int, *, states_time: bool, system: int = 1) -> list[bytes]:
+    """An autopilot's position and attitude, and its clock; what another vehicle and noise add."""
+    mavlink = pytest.importorskip("pymavlink.dialects.v20.ardupilotmega")
+    vehicle = mavlink.MAVLink(None, srcSystem=system)
+    place = (528_000_000, 132_000_000, 160_000, 55_000, 400, 300, 0, 9000)
+    messages = [
+        vehicle.attitude_encode(boot_ms, 0.1, -0.2, 0.5 * math.pi, 0.0, 0.0, 0.0),
+        vehicle.global_position_int_encode(boot_ms, *place),
+    ]
+    if states_time:
+        messages.insert(0, vehicle.system_time_encode(utc_ns // 1000, boot_ms))
+    return [each.pack(vehicle) for each in messages]
+
+
+@pytest.mark.parametrize("states_time", [True, False])
+def test_an_autopilot_s_packets(*, states_time: bool) -> None:
+    port, ear = free_port(), Ear()
+    link = heard_from(f"mavlink:udp://:{port}", ear)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        while not ear.wait(1, 0.2):  # the first position decides whose packets count
+            for each in packets(time.time_ns(), 5000, states_time=states_time):
+                sender.sendto(each, ("127.0.0.1", port))
+        for number in range(5):
+            heard, now_ns, boot_ms = len(ear.epochs), time.time_ns(), 5100 + 100 * number
+            sent = packets(now_ns, boot_ms, states_time=states_time)
+            if number == 3:
+                sent.append(sent[-1][:20] + b"?" + sent[-1][21:])  # a bit that fell over
+            sent += packets(now_ns, boot_ms, states_time=False, system=7)  # another vehicle
+            for each in sent:
+                sender.sendto(each, ("127.0.0.1", port))
+            assert ear.wait(heard + 1)
+    link.close()
+    for arrived_ns, epoch in ear.epochs[-5:]:
+        assert 0 <= arrived_ns - epoch.time_ns < 2 * S
+        assert epoch.values["latitude_deg"] == pytest.approx(52.8)
+        assert epoch.values["orthometric_height_m"] == 160.0
+        assert epoch.values["speed_m_s"] == pytest.approx(5.0)
+        assert epoch.values["body_yaw_deg"] == pytest.approx(90.0, abs=1e-4)
+    assert [each.count for each in link.notices() if each.code == "bad_packet"] == [1]
+
+
 @pytest.mark.parametrize(
     ("address", "words"),
     [
+        ("mavlink:tcp://:5", "no link; give serial:"),
         ("tcp://:5", "no link; give serial:"),
         ("udp://host", "no link"),
         ("follow:/no/such", "no such file"),
@@ -170,7 +213,7 @@ def test_links_that_cannot_be(address: str, words: str) -> None:
     if address.startswith("serial"):
         pytest.importorskip("serial", reason="pyserial is not installed")
     with pytest.raises((InputError, SettingsError), match=words):
-        NmeaLink(address, SETTINGS, lambda *_: None)
+        TelemetryLink(address, SETTINGS, lambda *_: None)
 
 
 @pytest.mark.parametrize("has_metadata", [False, True])

@@ -21,7 +21,7 @@ from sorvolo.capture.live.addresses import (
 )
 from sorvolo.capture.live.klv import LocalSet, local_sets
 from sorvolo.capture.live.klv_telemetry import columns_of, klv_streams
-from sorvolo.capture.live.links import LINK_FORMS, NmeaLink, is_link
+from sorvolo.capture.live.links import LINK_FORMS, TelemetryLink, is_link
 from sorvolo.capture.live.reader import REFUSALS
 from sorvolo.capture.live.reconnect import Backoff, LiveSettings, Outages
 from sorvolo.capture.source import Source, open_sources, safe_name
@@ -238,7 +238,7 @@ class LiveFootage:
         self._link = (
             None
             if link is None
-            else NmeaLink(
+            else TelemetryLink(
                 link, settings, lambda arrived_ns, epoch: self._fixes.append((arrived_ns, epoch))
             )
         )

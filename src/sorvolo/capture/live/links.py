@@ -1,4 +1,4 @@
-"""NMEA 0183 from a receiver that is on: by serial port, TCP, UDP, or a log that is being written."""
+"""NMEA 0183 from a receiver that is on, or MAVLink from an autopilot: by serial port, TCP, UDP, or a growing log."""
 
 import select
 import socket
@@ -12,14 +12,19 @@ from typing import Any, Protocol
 from urllib.parse import parse_qsl, urlsplit
 
 from sorvolo.capture.live.reconnect import Backoff, LiveSettings, Outages
+from sorvolo.capture.telemetry.autopilot_logs import MavlinkBuffer
 from sorvolo.capture.telemetry.cleaning import notice
 from sorvolo.capture.telemetry.nmea import Epoch, epochs_of, messages_in, nearest_ns
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.survey.flight import Notice
 
-LINK_FORMS = "serial:/dev/ttyUSB0?baud=9600, tcp://HOST:PORT, udp://:PORT or follow:LOG"
+LINK_FORMS = (
+    "serial:/dev/ttyUSB0?baud=9600, tcp://HOST:PORT, udp://:PORT or follow:LOG for NMEA; "
+    "mavlink:udp://:14550 and the like for MAVLink"
+)
 """What a link looks like, for messages."""
 
+_MAVLINK = "mavlink:"
 _DEFAULT_BAUD = 9600  # of many receivers; NMEA 0183 itself has 4800
 _POLL_S = 0.1  # a sentence that nothing follows for so long ends its moment
 _CALL_S = 3.0  # for a connection to be made; by choice
@@ -36,8 +41,8 @@ class Wire(Protocol):
         """Let go of it."""
 
 
-class NmeaLink:
-    """A receiver's sentences, read in a thread of their own and given on moment by moment.
+class TelemetryLink:
+    """A receiver's sentences or an autopilot's packets, read in a thread of their own, given on moment by moment.
 
     `heard(arrived_utc_ns, epoch)` is called in that thread; the epoch's time is UTC, its day the one nearest to this
     computer's clock. A link that is silent for `silent_s` is reported, and one that breaks is opened anew.
@@ -51,6 +56,7 @@ class NmeaLink:
         self.outages = Outages(address)
         self.failure = ""
         self._counts: Counter[str] = Counter()
+        self._buffer()  # what it needs is missed at once
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"reading {address}", daemon=True)
 
@@ -77,6 +83,7 @@ class NmeaLink:
                 "unreadable_line", counts["unreadable_line"], "{} sentences dropped: not readable"
             ),
             *notice("no_time", counts["no_time"], "{} sentences dropped: no readable time"),
+            *notice("bad_packet", counts["bad_packet"], "{} packets dropped: damaged"),
             *self.outages.notices("telemetry_outage"),
         ]
 
@@ -94,9 +101,14 @@ class NmeaLink:
                 self.outages.lost(heard_s, self.failure)
                 self._stop.wait(backoff.next_s())
 
+    def _buffer(self) -> "SentenceBuffer | MavlinkBuffer":
+        if self._address.startswith(_MAVLINK):
+            return MavlinkBuffer(self._counts)
+        return SentenceBuffer(self._counts)
+
     def _listen(self, wire: Wire, backoff: Backoff) -> float:
         """Read until the wire ends; when something came last (monotonic clock)."""
-        sentences = SentenceBuffer(self._counts)
+        buffer = self._buffer()
         heard_s, arrived_ns = time.monotonic(), time.time_ns()
         while not self._stop.is_set() and (data := wire.read()) is not None:
             if data:
@@ -105,7 +117,7 @@ class NmeaLink:
                 backoff.reset()
             elif time.monotonic() - heard_s > self._settings.silent_s:
                 self.outages.lost(heard_s, f"silent for {time.monotonic() - heard_s:.1f} s")
-            for epoch in sentences.take(data, arrived_ns):
+            for epoch in buffer.take(data, arrived_ns):
                 self._heard(arrived_ns, epoch)
         return heard_s
 
@@ -143,7 +155,18 @@ class SentenceBuffer:
 
 def is_link(text: str) -> bool:
     """Whether `--telemetry` names a link rather than a file."""
-    return text.partition(":")[0] in ("serial", "tcp", "udp", "follow") and ":" in text
+    scheme, colon, _ = text.removeprefix(_MAVLINK).partition(":")
+    schemes = (
+        ("serial", "tcp", "udp")
+        if text.startswith(_MAVLINK)
+        else ("serial", "tcp", "udp", "follow")
+    )
+    return bool(colon) and scheme in schemes
+
+
+def link_format(text: str) -> str:
+    """What a link sends, as `Telemetry.format` names it."""
+    return "mavlink" if text.startswith(_MAVLINK) else "nmea"
 
 
 # ---- inside: the wires ----------------------------------------------------------------------------------------
@@ -151,7 +174,8 @@ def is_link(text: str) -> bool:
 
 def _opener(address: str) -> Callable[[], Wire]:
     """How to open a link; the address is checked at once."""
-    scheme, _, rest = address.partition(":")
+    wire = address.removeprefix(_MAVLINK)
+    scheme, _, rest = wire.partition(":")
     if scheme == "serial":
         device, _, query = rest.partition("?")
         return _serial_opener(device, dict(parse_qsl(query)))
@@ -163,7 +187,7 @@ def _opener(address: str) -> Callable[[], Wire]:
             )
         return lambda: _FollowedLog(path)
     try:
-        parts = urlsplit(address)
+        parts = urlsplit(wire)
         host, port = parts.hostname or "", parts.port
     except ValueError as error:
         raise InputError(
@@ -172,8 +196,9 @@ def _opener(address: str) -> Callable[[], Wire]:
     if port is None or scheme not in ("tcp", "udp") or (scheme == "tcp" and not host):
         raise InputError(f"--telemetry {address}: no link; give {LINK_FORMS}")
     if scheme == "udp":
-        return lambda: _Socket(_bound(host, port), is_stream=False)
-    return lambda: _Socket(socket.create_connection((host, port), timeout=_CALL_S), is_stream=True)
+        end = b"" if wire is not address else b"\r\n"  # which a datagram of sentences may lack
+        return lambda: _Socket(_bound(host, port), end)
+    return lambda: _Socket(socket.create_connection((host, port), timeout=_CALL_S))
 
 
 def _serial_opener(device: str, options: Mapping[str, str]) -> Callable[[], Wire]:
@@ -210,17 +235,16 @@ def _bound(host: str, port: int) -> socket.socket:
 
 
 class _Socket:
-    def __init__(self, wire: socket.socket, *, is_stream: bool) -> None:
-        self._wire, self._is_stream = wire, is_stream
+    def __init__(self, wire: socket.socket, datagram_end: bytes | None = None) -> None:
+        self._wire, self._end = wire, datagram_end
 
     def read(self) -> bytes | None:
         if not select.select([self._wire], [], [], _POLL_S)[0]:
             return b""
         data = self._wire.recv(65_536)
         if not data:
-            return None if self._is_stream else b""
-        # a datagram may hold sentences without a line's end
-        return data if self._is_stream or data.endswith(b"\n") else data + b"\r\n"
+            return None if self._end is None else b""
+        return data + (self._end or b"")
 
     def close(self) -> None:
         self._wire.close()

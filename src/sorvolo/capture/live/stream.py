@@ -27,7 +27,7 @@ from sorvolo.capture.live.klv_telemetry import (
     ground_elevation_m,
     klv_notices,
 )
-from sorvolo.capture.live.links import NmeaLink
+from sorvolo.capture.live.links import TelemetryLink, link_format
 from sorvolo.capture.live.reader import StreamFacts, StreamReader
 from sorvolo.capture.live.reconnect import LiveSettings, Outages
 from sorvolo.capture.live.segments import FlightSoFar, segment_notices
@@ -308,8 +308,8 @@ class LiveStream:
         most_bytes = settings.most_bytes_of_file if self._is_file else settings.most_bytes
         self._queue = FrameQueue(most_bytes=most_bytes, blocks=self._is_file)
         self._clock = StreamClock()
-        self._log = TelemetryLog("nmea" if link else FORMAT, link or address.shown)
-        self._link = NmeaLink(link, settings, self._fix) if link else None
+        self._log = TelemetryLog(link_format(link) if link else FORMAT, link or address.shown)
+        self._link = TelemetryLink(link, settings, self._fix) if link else None
         self._is_whole = False  # a file that is read from its beginning
 
         def opened(outages: Outages) -> GrowingFile:

@@ -1,9 +1,10 @@
-"""Logs of autopilots: PX4's .ulg (pyulog), ArduPilot's .bin and a ground station's .tlog (pymavlink)."""
+"""Logs of autopilots: PX4's .ulg (pyulog), ArduPilot's .bin, a ground station's .tlog and MAVLink live (pymavlink)."""
 
 import contextlib
 import io
 import struct
 import tempfile
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import ModuleType
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from sorvolo.capture.telemetry.cleaning import clean, notice, sigma_from_hdop_m
+from sorvolo.capture.telemetry.nmea import Epoch
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats
 from sorvolo.survey.flight import Notice, Telemetry
@@ -251,28 +253,77 @@ class TlogReader:
             elif message.get_srcSystem() != vehicle:
                 others |= {message.get_srcSystem()} if vehicle is not None else set()
             elif kind == "GLOBAL_POSITION_INT":
-                fixes.add(
-                    message.time_boot_ms / 1e3,
-                    **{
-                        "latitude_deg": message.lat * 1e-7 or float("nan"),
-                        "longitude_deg": message.lon * 1e-7 or float("nan"),
-                        "orthometric_height_m": message.alt * 1e-3,
-                        "height_above_takeoff_m": message.relative_alt * 1e-3,
-                        "speed_m_s": float(np.hypot(message.vx, message.vy)) * 1e-2,
-                    },
-                )
+                fixes.add(message.time_boot_ms / 1e3, **_position(message))
             elif kind == "ATTITUDE":
-                angles = np.degrees([message.yaw, message.pitch, message.roll])
-                attitude.add(
-                    message.time_boot_ms / 1e3,
-                    **dict(zip(("body_yaw_deg", "body_pitch_deg", "body_roll_deg"), angles)),
-                )
+                attitude.add(message.time_boot_ms / 1e3, **_attitude(message))
         zero_s = float(np.median(ahead_s)) if ahead_s else 0.0
         for rows in (fixes, attitude):
             rows.time_s = [each + zero_s for each in rows.time_s]
         words = "other vehicles in the log, not used: {}"
         more = notice("other_vehicle", len(others), words)
         return _telemetry("tlog", name, fixes, attitude, dated=bool(ahead_s), notices=more)
+
+
+def _position(message: Any) -> dict[str, float]:
+    """The columns of a GLOBAL_POSITION_INT."""
+    return {
+        "latitude_deg": message.lat * 1e-7 or float("nan"),
+        "longitude_deg": message.lon * 1e-7 or float("nan"),
+        "orthometric_height_m": message.alt * 1e-3,
+        "height_above_takeoff_m": message.relative_alt * 1e-3,
+        "speed_m_s": float(np.hypot(message.vx, message.vy)) * 1e-2,
+    }
+
+
+def _attitude(message: Any) -> dict[str, float]:
+    """The columns of an ATTITUDE."""
+    angles = np.degrees([message.yaw, message.pitch, message.roll]).tolist()
+    return dict(zip(("body_yaw_deg", "body_pitch_deg", "body_roll_deg"), angles))
+
+
+class MavlinkBuffer:
+    """A vehicle's MAVLink as it comes, to moments. `take` changes it; what is damaged is counted in `counts`.
+
+    The first vehicle that states a position is the one; a moment without SYSTEM_TIME has the time at which it came.
+    """
+
+    def __init__(self, counts: Counter[str]) -> None:
+        try:
+            from pymavlink.dialects.v20 import ardupilotmega
+        except ImportError as error:
+            raise _needed("mavlink:...", "a MAVLink link") from error
+        self._counts, self._link = counts, ardupilotmega.MAVLink(None)
+        self._link.robust_parsing = True
+        self._vehicle: int | None = None
+        self._zero_ns: int | None = None  # UTC of the vehicle's start
+        self._attitude: tuple[int, dict[str, float]] = (-(10**6), {})  # ms of the vehicle
+
+    def take(self, data: bytes, utc_ns: int) -> list[Epoch]:
+        """The positions in the bytes that came at about `utc_ns`, each with the attitude beside it."""
+        epochs: list[Epoch] = []
+        for message in self._link.parse_buffer(data) or ():
+            kind = message.get_type()
+            if kind == "BAD_DATA":
+                self._counts["bad_packet"] += 1
+                continue
+            if kind == "GLOBAL_POSITION_INT" and self._vehicle is None and message.lat:
+                self._vehicle = message.get_srcSystem()
+            if message.get_srcSystem() != self._vehicle:
+                continue
+            if kind == "SYSTEM_TIME" and message.time_unix_usec > _DATED_US[0]:
+                self._zero_ns = message.time_unix_usec * 1000 - message.time_boot_ms * 10**6
+            elif kind == "ATTITUDE":
+                self._attitude = message.time_boot_ms, _attitude(message)
+            elif kind == "GLOBAL_POSITION_INT":
+                at_ms, angles = self._attitude
+                is_near = abs(message.time_boot_ms - at_ms) <= _NEAR_S * 1e3
+                time_ns = (
+                    utc_ns
+                    if self._zero_ns is None
+                    else self._zero_ns + message.time_boot_ms * 10**6
+                )
+                epochs.append(Epoch(time_ns, _position(message) | (angles if is_near else {})))
+        return epochs
 
 
 def _packets(data: bytes, limit: int | None = None) -> Iterator[tuple[int, int, int]]:
