@@ -105,7 +105,9 @@ def test_a_search_counts_the_floor_that_was_seen_below_what_hides_it(
         "flown", 36, SearchedPlants(0, 0, 0.0, ()), False, True, True, 0.0, tuple(classes)
     )
     assert floor is not None
-    person, car = (each.chances for each in flight.with_floor(floor, cells).classes)
+    measured = flight.with_floor(floor, cells)
+    assert measured.floor is not None and measured.floor["area_m2"] == 1.0
+    person, car = (each.chances for each in measured.classes)
     assert person.mean[rows].tolist() == [report["detection"]["pod"], 0.0]
     assert person.low[rows[0]] == report["detection"]["pod_low"]
     assert (np.delete(person.mean, rows) == 0.8).all() and not car.mean[rows].any()

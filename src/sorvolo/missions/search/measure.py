@@ -70,7 +70,10 @@ class MeasuredClass:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredFlight:
-    """One flight as it was measured; `is_earlier`: what was planted was searched for by an earlier run."""
+    """One flight as it was measured; `is_earlier`: what was planted was searched for by an earlier run.
+
+    `floor` has `pod`, `pod_low`, `pod_high` and `area_m2` of the floor that a look through the trees adds.
+    """
 
     name: str
     frames: int
@@ -81,7 +84,7 @@ class MeasuredFlight:
     blur_px: float
     classes: tuple[MeasuredClass, ...]
     is_earlier: bool = False
-    floor: "FloorBelow | None" = None
+    floor: Mapping[str, float] | None = None
 
     def with_floor(self, floor: "SeenFloor", cells: Cells) -> "MeasuredFlight":
         """The flight with a person's chance on the floor below what hides the ground from single pictures."""
@@ -94,29 +97,21 @@ class MeasuredFlight:
                 below = shown & (own.seen.under_trees | own.seen.roofs)
                 area_m2 = float((below & cells.wanted).sum()) * cells.cell_m**2
                 before = own.chances.mean, own.chances.low, own.chances.high
-                chances = (np.where(below, new, old) for new, old in zip(floor.pod, before))
+                chances = (
+                    np.where(below, new, old) for new, old in zip(floor.pod.values(), before)
+                )
                 own = replace(own, chances=Chances(*chances))
             classes.append(own)
-        return replace(self, classes=tuple(classes), floor=FloorBelow(*floor.pod, area_m2))
+        return replace(self, classes=tuple(classes), floor=floor.pod | {"area_m2": area_m2})
 
 
 @dataclass(frozen=True, eq=False)
 class SeenFloor:
-    """A look through a flight's trees: the chance of a person on the floor with a 90 % interval, (mean, low, high), and
-    how many views show the floor (`up_m`) and the share of them that crowns leave free (`sigma_m`)."""
+    """A look through a flight's trees: the chance of a person on the floor with a 90 % interval (`pod`, `pod_low`,
+    `pod_high`), and how many views show the floor (`up_m`) and the share of them that crowns leave free (`sigma_m`)."""
 
-    pod: tuple[float, float, float]
+    pod: dict[str, float]
     shows: HeightField
-
-
-@dataclass(frozen=True)
-class FloorBelow:
-    """What a look through the trees adds to a search: a person's chance on so much floor of the area."""
-
-    pod: float
-    pod_low: float
-    pod_high: float
-    area_m2: float
 
 
 @dataclass(frozen=True)

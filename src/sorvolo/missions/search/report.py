@@ -244,7 +244,7 @@ def _flight_row(flight: MeasuredFlight) -> dict[str, Any]:
         "heights": flight.has_heights,
         "thermal": flight.is_thermal,
         "blur_px": round(flight.blur_px, 2),
-        "under_trees": None if flight.floor is None else asdict(flight.floor),
+        "under_trees": flight.floor,
         "classes": classes,
     }
 
@@ -331,8 +331,8 @@ def _warnings(searched: Searched, settings: SearchSettings, *, is_over: bool) ->
     for flight in searched.flights:
         if flight.floor is not None:
             warnings.append(
-                f"{flight.name}: {flight.floor.area_m2:,.0f} m2 below crowns count by its look through the trees: "
-                f"{flight.floor.pod:.2f} (90 % interval {flight.floor.pod_low:.2f} to {flight.floor.pod_high:.2f})"
+                "{}: {area_m2:,.0f} m2 below crowns count by its look through the trees: {pod:.2f} (90 % interval "
+                "{pod_low:.2f} to {pod_high:.2f})".format(flight.name, **flight.floor)
             )
     if settings.through_crowns == 0 and any(each.floor is None for each in searched.flights):
         warnings.append(

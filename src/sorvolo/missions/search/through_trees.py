@@ -158,8 +158,8 @@ def seen_floor(folder: Path, archive: Archive, flight: str) -> SeenFloor | None:
         read = read_height_cog(folder / "under_trees.tif", grid.grid)
         _, _, views, free, _ = read.bands
         lattice = Lattice.at(grid, read.first, views.shape[1], views.shape[0])
-        mean, low, high = (float(report["detection"][name]) for name in _POD)
-        return SeenFloor((mean, low, high), HeightField(lattice, views, free))
+        pod = {name: float(report["detection"][name]) for name in _POD}
+        return SeenFloor(pod, HeightField(lattice, views, free))
     except (OSError, ValueError, KeyError, TypeError, InputError):  # damaged: it counts as unseen
         return None
 
