@@ -33,6 +33,26 @@ def test_drawings_are_kept_with_a_revision_and_announced(client: TestClient) -> 
     assert types.count("drawings.changed") == 1
 
 
+def test_what_a_person_marks_as_found_is_a_finding(client: TestClient) -> None:
+    """Of the newest flight before it, named by who saw it; a detector's silence does not end it."""
+    items = "/api/sites/field/collections/objects/items"
+    mark = zone("seen", purpose="found")
+    mark["geometry"] = {"type": "Point", "coordinates": [13.2501, 46.5001]}
+    dog = {**mark, "id": "dog", "properties": {**mark["properties"], "label": "dog"}}
+    dog["geometry"] = {"type": "Point", "coordinates": [13.2502, 46.5001]}
+    assert client.put(URL, json={"revision": 0, "features": [mark, dog]}).status_code == 200
+    person, other = client.get(items).json()["features"]
+    assert (person["properties"]["class"], other["properties"]["class"]) == ("person", "dog")
+    assert person["properties"]["origins"] == ["marked"]
+    assert person["properties"]["flights"] == ["b"] and person["properties"]["crops"] == []
+    assert person["geometry"]["coordinates"] == [13.2501, 46.5001]
+    vote = {"kind": "object", "id": "seen", "verdict": "confirmed"}
+    reviews = "/api/sites/field/reviews"
+    assert client.post(reviews, json=vote).json()["id"] == person["id"]
+    assert client.put(URL, json={"revision": 1, "features": []}).status_code == 200
+    assert client.get(items).json()["features"] == []
+
+
 def test_what_somebody_drew_meanwhile_is_not_overwritten(client: TestClient) -> None:
     client.put(URL, json={"revision": 0, "features": [zone("a")]})
     answer = client.put(URL, json={"revision": 0, "features": [zone("b")]})

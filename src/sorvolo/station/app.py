@@ -74,6 +74,7 @@ class Station:
     events: EventLog
     collections: SiteCollections
     reviews: Reviews
+    drawings: Drawings
     ingest: Ingest
     uploads: Uploads
     inputs: Inputs
@@ -100,7 +101,8 @@ class Station:
         events, tiles = EventLog(state), WebTiles(shelf)
         uploads = Uploads(settings, events)
         findings = Findings(state, settings.state_folder / RUNS_FOLDER)
-        collections = SiteCollections(shelf, findings)
+        drawings = Drawings(settings, shelf, events)
+        collections = SiteCollections(shelf, findings, drawings.found)
         reviews = Reviews(state, shelf, events, collections)
         limits = IngestLimits(
             streams=settings.limits.most_streams, free_bytes=round(settings.free_floor_gb * 1e9)
@@ -115,6 +117,7 @@ class Station:
             events,
             collections,
             reviews,
+            drawings,
             ingest,
             uploads,
             inputs,
@@ -147,12 +150,11 @@ def station_app(
     station = Station.open(settings)
     outward = Outward(receivers, station.events, station.ingest, settings.state_folder)
     door = CameraDoor(door_path(settings), station.ingest)
-    drawings = Drawings(settings, station.shelf, station.events)
     deletion = SiteDeletion(
         station.shelf,
         station.runs,
         station.reviews,
-        drawings,
+        station.drawings,
         settings.state_folder / DELETED_FOLDER,
     )
     metrics = StationMetrics(
@@ -199,7 +201,7 @@ def station_app(
             station.shelf, station.collections, station.reviews, station.videos, station.place_index
         ),
         video_routes(station.shelf, station.collections, station.videos),
-        drawing_routes(drawings),
+        drawing_routes(station.drawings),
         site_deletion_routes(deletion),
         export_routes(station.shelf, station.collections),
         wmts_routes(station.shelf),

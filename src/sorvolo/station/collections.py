@@ -167,8 +167,11 @@ class SiteCollections:
     A flight that is being mapped changes the site's catalogue twice a second, and none of its collections.
     """
 
-    def __init__(self, shelf: SiteShelf, findings: Findings) -> None:
-        self._shelf, self._findings = shelf, findings
+    def __init__(
+        self, shelf: SiteShelf, findings: Findings, marks: Callable[[str], list[Track]]
+    ) -> None:
+        """`marks` has what people marked as found on a site."""
+        self._shelf, self._findings, self._marks = shelf, findings, marks
         self._kept: dict[tuple[str, str], _Kept] = {}
         self._flights: dict[
             tuple[str, str, str], tuple[int, FlightFrames]
@@ -246,15 +249,17 @@ class SiteCollections:
             if not tracks:
                 raise
             archive = None
+        marks = self._marks(site_id) if archive else []
 
         def make() -> Sequence[Feature]:
             if name == FINDINGS:
-                return found_features(archive if archive and archive.has_site else None, tracks)
+                known = archive if archive and archive.has_site else None
+                return found_features(known, tracks, marks)
             found = self._found(site_id, FINDINGS).features
             names = ((each, each["properties"]) for each in found)
             return [each for each, own in names if not own["gone"] and own["class"] != UNNAMED]
 
-        return self._made((site_id, name), (archive and _content(archive), tracks), make)
+        return self._made((site_id, name), (archive and _content(archive), tracks, marks), make)
 
 
 def _frames(archive: Archive) -> list[Feature]:

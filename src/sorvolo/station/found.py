@@ -1,6 +1,6 @@
 """The register as features on Earth: what missions of a site and its watches found, each thing once."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
 from typing import Any
@@ -23,6 +23,7 @@ from sorvolo.store.exports.plain import feature, rounded, utc_text
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.change_records import StoredObject
 from sorvolo.survey.flight import Site
+from sorvolo.survey.objects import PERSON
 
 Feature = dict[str, Any]
 Track = dict[str, Any]
@@ -35,9 +36,11 @@ def on_earth(site: Site) -> Site:
     return replace(site, is_local=False)
 
 
-def found_features(archive: Archive | None, tracks: Sequence[Track]) -> list[Feature]:
+def found_features(
+    archive: Archive | None, tracks: Sequence[Track], marks: Sequence[Track] = ()
+) -> list[Feature]:
     """All findings, what a person wants first in front; `tracks` of a site's watches belong to the flights whose time
-    is theirs. Without a site there are the watches' alone."""
+    is theirs, people's `marks` to the newest flight before them. Without a site there are the watches' alone."""
     if archive is None:
         longitude_deg, latitude_deg = tracks[0]["lonlat"][:2] if tracks else (0.0, 0.0)
         site = Site("watched", Geodetic(latitude_deg, longitude_deg, 0.0), "", 1.0)
@@ -45,7 +48,10 @@ def found_features(archive: Archive | None, tracks: Sequence[Track]) -> list[Fea
         stored: list[StoredObject] = []
     else:
         site = on_earth(archive.site())
-        register = archive.register(_sightings_of(tracks, site, archive.flown()))
+        flown = archive.flown()
+        register = archive.register(
+            [*_sightings_of(tracks, site, flown), *_marked(marks, site, flown)]
+        )
         stored = archive.objects()
     objects, watched = (
         {each.thing.id: each for each in stored},
@@ -88,6 +94,30 @@ def _sightings_of(
     ]
 
 
+def _marked(
+    marks: Sequence[Track], site: Site, flown: Sequence[tuple[str, int, int, int]]
+) -> Iterator[MissionSighting]:
+    for each in marks:
+        at_ns = _ns(each["at"])
+        before = [(name, float(rank)) for name, rank, first_ns, _ in flown if first_ns <= at_ns]
+        date, rank = before[-1] if before else (str(each["id"]), -0.5)
+        (place_m,) = np.asarray(site.frame.ground_from_lonlat([tuple(each["lonlat"][:2])]))
+        yield MissionSighting(
+            date,
+            rank,
+            f"marked by {each['by']}",
+            each["id"],
+            KnownBy.MARKED,
+            each["label"] or PERSON,
+            1.0,
+            place_m[:2],
+            _UNKNOWN_SIGMA_M,
+            np.nan,
+            at_ns,
+            at_ns,
+        )
+
+
 def _date_of(
     run: str, span: tuple[int, int], flown: Sequence[tuple[str, int, int, int]]
 ) -> tuple[str, float]:
@@ -120,7 +150,8 @@ def _feature(
     of_watch = next((watched[each] for each in ids if each in watched), None)
     newest = found.newest
     values: dict[str, Any] = {"score": newest.score, "length_m": rounded(newest.length_m, 2)}
-    crop: tuple[str, str] | None = ("change", ids[0])
+    changed = [each.id for each in found.sightings if each.origin is KnownBy.CHANGED]
+    crop = ("change", changed[-1]) if changed else None
     if of_map is not None:
         (shown,) = objects_geojson([of_map], site, crops_from_site=True)["features"]
         values, crop = shown["properties"], ("object", of_map.thing.id)

@@ -311,10 +311,12 @@ class _Polygon(BaseModel):
 class _Properties(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
-    purpose: Literal["interest", "alert", "waypoint", "measure"]
+    purpose: Literal["interest", "alert", "waypoint", "measure", "found"]
     name: str = Field("", max_length=80)
     planned: bool = False
+    label: str = Field("", max_length=100)  # of what was found; "" is a person
     by: str = Field("", max_length=200)  # who drew it first, as the station knows it
+    at: str = Field("", max_length=40)  # and when
 
 
 class Drawing(BaseModel):
@@ -349,6 +351,14 @@ class Drawings:
             "features": kept.get("features", []),
         }
 
+    def found(self, site_id: str) -> list[dict[str, Any]]:
+        """What people marked as found. Raises Problem (404)."""
+        return [
+            {"id": each["id"], "lonlat": each["geometry"]["coordinates"], **each["properties"]}
+            for each in self.get(site_id)["features"]
+            if each["properties"]["purpose"] == "found" and each["geometry"]["type"] == "Point"
+        ]
+
     def put(self, site_id: str, wish: DrawingsWish, who: str) -> dict[str, Any]:
         """Keep a site's drawings; new ones as drawn by `who`. Raises Problem (404; 409 where somebody drew meanwhile), StoreError."""
         with self._lock:
@@ -361,11 +371,10 @@ class Drawings:
                     "somebody drew meanwhile; load the drawings again and add yours",
                     revision=now,
                 )
-            authors = {
-                each["id"]: each["properties"].get("by", "") for each in there.get("features", [])
-            }
+            drawn = {each["id"]: each["properties"] for each in there.get("features", [])}
             for each in wish.features:
-                each.properties.by = authors.get(each.id, who)
+                first = drawn.get(each.id, {"by": who, "at": utc_now()})
+                each.properties.by, each.properties.at = first["by"], first["at"]
             kept = {"revision": now + 1, "features": [each.model_dump() for each in wish.features]}
             path = self._path(site_id)
             make_folder(path.parent)

@@ -12,7 +12,7 @@ const TOOLS = {
   profile: ["Height profile", "line", "Tap points along the line. It needs a map with heights (a flight mapped with heights, or “sorvolo heights”)."],
   interest: ["Area of interest", "ring", "Tap the corners; filters and exports can be kept to it."],
   alert: ["Alert zone", "ring", "Tap the corners; what is found in it raises an alert on every open page."],
-  waypoint: ["Waypoint", "point", "Tap the place to fly to."],
+  waypoint: ["Waypoint", "point", "Tap the place to fly to."], found: ["Person seen", "point", "Tap where somebody is: a finding of the site."],
 };
 
 /** Load a site's shared drawings. */
@@ -54,7 +54,7 @@ class Draw {
     this.list = el("div", {});
     this.may = screen.station.status.role !== "view";
     this.buttons = Object.entries(TOOLS).map(([tool, [name]]) => el("button", { type: "button", data: { tool }, "aria-pressed": "false",
-      hidden: !this.may && ["interest", "alert", "waypoint"].includes(tool), on: { click: () => this.take(tool) } }, name));
+      hidden: !this.may && ["interest", "alert", "waypoint", "found"].includes(tool), on: { click: () => this.take(tool) } }, name));
     fill(body, el("div", { class: "tools", role: "group", "aria-label": "Tools" }, this.buttons), this.live, this.list,
       this.may ? el("details", {}, el("summary", {}, "Re-fly gaps"), el("p", { class: "note" }, "A route over ground that a measured search saw badly; without one, over ground without pictures."),
         button("Plan a route", () => this.plan())) : null);
@@ -139,6 +139,7 @@ class Draw {
     this.take(null);
     await saveDrawings(this.screen, (list) => [...list, feature]);
     this.showList();
+    if (purpose === "found") await this.screen.data.load(["objects"]);
     if (purpose === "measure") fill(this.live, el("p", { class: "size" }, name));
   }
 

@@ -63,7 +63,7 @@ function flightLayers() {
 }
 
 function drawnLayers() {
-  const colour = ["match", ["get", "purpose"], "alert", "#ff6b6b", "measure", "#ffffff", "interest", "#4dabf7", "waypoint", "#ffe066", "#ffffff"];
+  const colour = ["match", ["get", "purpose"], "alert", "#ff6b6b", "measure", "#ffffff", "interest", "#4dabf7", "waypoint", "#ffe066", "found", "#ff6b6b", "#ffffff"];
   const isArea = ["==", ["geometry-type"], "Polygon"];
   const isPoint = ["==", ["geometry-type"], "Point"];
   return ["drawings", "sketch"].flatMap((source) => [
