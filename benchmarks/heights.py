@@ -40,7 +40,6 @@ from sorvolo.lab.simulation.settings import (
     SimulationSettings,
 )
 from sorvolo.lab.simulation.site import simulate_site
-from sorvolo.lab.simulation.truth import ground_heights, surface_heights
 from sorvolo.lab.simulation.world import Relief, orthophoto
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.heights.measure import read_field
@@ -50,6 +49,9 @@ from sorvolo.search.drawing.objects import ThingLabel
 from sorvolo.search.drawing.view import map_view
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.files import HeightFile
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "lab" / "simulation"))
+from true_heights import ground_heights, surface_heights
 
 RESULTS = Path(__file__).parent / "results" / "heights.json"
 _M_PER_PX = 0.05  # of the truth

@@ -2,11 +2,9 @@
 
 python benchmarks/thesis_tables.py [SEED...] [--length 24] [--videos 1] [--train-steps 150] [--work DIR] [--output FILE]
 
-What `sorvolo reproduce --simulated` does, with the provenance of a benchmark: Tables 4.1, 4.3 to 4.6, sections 4.1.1
-and 4.2.2, Figure 3.12. The videos of the thesis are not public; each seed simulates a dataset in their layout,
-`--videos` paths of each environment with telemetry and one without, cut to `--length` metres. Without seeds, one is
-drawn from the commit's hash. `--work` keeps datasets, maps and pages, and a run that was stopped goes on there with the
-same seeds. The numbers are not comparable with the thesis's: other ground, other changes, and another computer.
+What `sorvolo reproduce --simulated` does, with the provenance of a benchmark. Each seed simulates a dataset in UMCD's
+layout, `--videos` paths of each environment with telemetry and one without, cut to `--length` metres. `--work` keeps
+datasets, maps and pages; a run that was stopped goes on there with the same seeds, which the commit's hash else draws.
 """
 
 import argparse
@@ -47,8 +45,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=RESULTS)
     options = parser.parse_args()
     seeds = seeds_or_drawn("thesis_tables", options.seeds, 1)
-    size = SimulatedSize(options.length)
-    steps = options.train_steps
+    size, steps = SimulatedSize(options.length), options.train_steps
     training = TrainSettings(rpn="standard", steps=steps, patience=0) if steps else None
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as scratch:
@@ -56,21 +53,19 @@ def main() -> None:
         for seed in seeds:
             settings = ReproductionSettings(options.videos, seed=seed, training=training)
             rows += reproduced(work / str(seed), settings, size)
-    scoring = note_scoring(f"thesis_tables, seeds {' '.join(map(str, seeds))}")
     tables = plain_json(tables_of(rows))
     result = {
         "benchmark": "thesis_tables",
         "machine": machine(),
         "load_1_min": os.getloadavg()[0],
         "commit": commit(),
-        **scoring,
+        **note_scoring(f"thesis_tables, seeds {' '.join(map(str, seeds))}"),
         "seeds": seeds,
         "simulated": asdict(size),
         "videos": options.videos,
         "tables": tables,
         "missing": [{"id": row.id, "reason": row.missing} for row in rows if row.missing],
     }
-    options.output.parent.mkdir(exist_ok=True)
     options.output.write_text(json.dumps(result, indent=1) + "\n")
     for sheet in reproduction_sheets(tables):
         Console().print(sheet.markdown, markup=False, soft_wrap=True, highlight=False)

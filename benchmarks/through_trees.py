@@ -6,6 +6,7 @@ probability of planted bodies (canopy.planting), found are the hidden people. Wr
 
 import argparse
 import json
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,9 @@ from sorvolo.canopy.integral import LEAST_VIEWS, levelled
 from sorvolo.canopy.planting import plant_on_floor
 from sorvolo.geometry.summary import wilson
 from sorvolo.heights.lattice import Lattice
-from sorvolo.lab.simulation.forest import fly, hidden_share, make_forest, photograph
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "canopy"))
+from thermal_forest import fly, hidden_share, make_forest, photograph
 
 RESULTS = Path(__file__).parent / "results" / "through_trees.json"
 LEAVES_PER_M2 = 3.0, 6.0  # hide about half and two thirds of the floor

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from thermal_forest import Forest, fly, make_forest, photograph
 
 from sorvolo.canopy.finds import Finds, find_people, look_under_trees
 from sorvolo.canopy.integral import (
@@ -18,7 +19,6 @@ from sorvolo.canopy.integral import (
 from sorvolo.errors import InputError
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.views import View
-from sorvolo.lab.simulation.forest import Forest, fly, make_forest, photograph
 
 _CELL_M = 0.12
 _SIDE = 250

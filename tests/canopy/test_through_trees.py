@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import rasterio
 from forest_site import forest_site
+from thermal_forest import fly, make_forest, photograph
 
 from sorvolo.cli.main import main
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
-from sorvolo.lab.simulation.forest import fly, make_forest, photograph
 from sorvolo.missions.search.measure import MeasuredClass, MeasuredFlight, SearchedPlants
 from sorvolo.missions.search.through_trees import seen_floor
 from sorvolo.search.cells import Cells

@@ -432,9 +432,7 @@ def test_a_guessed_camera_names_one_that_was_given_for_pictures_of_its_size(site
 
 
 def test_the_thesis_method_compares_too_and_shows_its_steps(flown, site, tmp_path):
-    settings = CompareSettings(
-        ThesisComparison(ThesisSettings(gray_threshold=None), threads=2), model="none"
-    )
+    settings = CompareSettings(ThesisComparison(ThesisSettings(gray_threshold=None)), model="none")
     updates = list(
         compare_flights(
             [flown / "flight2"],
@@ -445,7 +443,6 @@ def test_the_thesis_method_compares_too_and_shows_its_steps(flown, site, tmp_pat
         )
     )
     assert report(site)["comparison"]["method"] == "thesis"
-    assert report(site)["settings"]["method"]["threads"] == 2
     assert report(site)["settings"]["method"]["settings"]["gray_threshold"] is None
     pictures = list((tmp_path / "steps").rglob("*.png"))
     assert len(pictures) >= 7 * len(updates)

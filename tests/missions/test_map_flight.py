@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 import rasterio
+from PIL import Image
 from pyproj import Transformer
 
 from sorvolo.capture.source import open_sources
@@ -407,12 +408,20 @@ def test_frames_outside_the_area_are_not_used(photographed: Path, tmp_path: Path
 
 
 @pytest.mark.parametrize(
-    "transform", ["similarity", pytest.param("homography", marks=pytest.mark.long)]
+    ("transform", "drifts"),
+    [("similarity", True), pytest.param("homography", False, marks=pytest.mark.long)],
 )
 def test_the_thesis_method(
-    photographed: Path, tmp_path: Path, transform: Literal["similarity", "homography"]
+    photographed: Path,
+    tmp_path: Path,
+    transform: Literal["similarity", "homography"],
+    drifts: bool,
 ) -> None:
     photos = _some_photos(photographed, tmp_path / "few", 0, 7)
+    for photo in sorted(photos.iterdir())[4:] if drifts else []:
+        with Image.open(photo) as taken:
+            darker = taken.point(lambda level: level * 0.6)
+            darker.save(photo, exif=taken.getexif(), xmp=taken.info.get("xmp", b""))
     site = tmp_path / "site"
     stitching = RoiStitchingSettings(transform=transform, max_features=3000)
     settings = MapSettings(ThesisMapping(stitching), model="none", live_s=0)
@@ -424,6 +433,7 @@ def test_the_thesis_method(
         and report["settings"]["method"]["stitching"]["transform"] == transform
     )
     assert report["frames"]["vision"] == 7
+    assert ("brightness_drifts" in {each["code"] for each in report["notices"]}) == drifts
     assert corner_errors_m(site, "few", photographed / "truth")[1] < 1.0  # metres: its own ceiling
 
 

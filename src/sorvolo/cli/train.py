@@ -58,9 +58,6 @@ def train(
     batch: Annotated[int, typer.Option(help="Samples per batch.")] = 4,
     side: Annotated[int, typer.Option(help="Side of the samples cut from the pictures, px.")] = 416,
     seed: Seed = 1,
-    synthetic: Annotated[
-        float, typer.Option(help="Share of the samples that are simulated pictures, 0 to 1.")
-    ] = 0.0,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the run in --out.")] = False,
     classes: LabelClasses = None,
     ignore: IgnoredClasses = "",
@@ -76,7 +73,7 @@ def train(
 
     Example, the packaged model tuned to your own pictures: sorvolo train my-labels --out tuned --weights default
 
-    Example: sorvolo train a b --val c --synthetic 0.2
+    Example: sorvolo train a b --val c
 
     Example: sorvolo train my-labels --out my-model --resume
     """
@@ -90,7 +87,6 @@ def train(
         batch=batch,
         side_px=side,
         seed=1 if seed is None else seed,
-        synthetic=synthetic,
     )
     try:
         from sorvolo.lab.training.detector import CHECKPOINT, train_detector

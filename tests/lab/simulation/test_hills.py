@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from true_heights import ground_heights, surface_heights
 
 from sorvolo.errors import SettingsError
 from sorvolo.lab.simulation.flight import SimulatedFlight, simulate_flight
@@ -16,7 +17,7 @@ from sorvolo.lab.simulation.settings import (
     SceneSettings,
     SimulationSettings,
 )
-from sorvolo.lab.simulation.truth import frame_features, ground_heights, surface_heights
+from sorvolo.lab.simulation.truth import frame_features
 from sorvolo.lab.simulation.world import LEVEL, Relief
 from sorvolo.search.drawing.view import map_view
 

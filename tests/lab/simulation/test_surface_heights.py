@@ -1,8 +1,8 @@
 """The true heights of a simulated day, seen from above."""
 
 import numpy as np
+from true_heights import surface_heights
 
-from sorvolo.lab.simulation.truth import surface_heights
 from sorvolo.search.drawing.bodies import build_body
 from sorvolo.search.drawing.objects import Light, Thing, ThingLabel
 from sorvolo.search.drawing.view import map_view

@@ -1,24 +1,14 @@
 """Thresholds that follow the light."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 
-from sorvolo.errors import SettingsError
 from sorvolo.lab.thesis.changes import (
-    ThesisComparison,
     ThesisSettings,
     light_difference,
     prepare_reference,
     thesis_steps,
 )
-
-
-@pytest.mark.parametrize("threads", [0, 257, 1.5, True])
-def test_a_number_of_threads_that_no_machine_has_is_refused(threads: Any) -> None:
-    with pytest.raises(SettingsError, match="1 to 256"):
-        ThesisComparison(threads=threads)
 
 
 def test_thresholds_rise_with_the_difference_of_light() -> None:

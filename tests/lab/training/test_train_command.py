@@ -18,14 +18,13 @@ from square_pictures import labelled_squares
 from sorvolo.cli.main import main
 from sorvolo.detection.detector import Detector
 from sorvolo.errors import InputError, SettingsError
+from sorvolo.lab.simulation.pictures import PictureSettings, simulate_pictures
 from sorvolo.lab.training.detector import TrainingUpdate, train_detector
 from sorvolo.lab.training.page import training_page
 from sorvolo.lab.training.progress import read_checkpoint
 from sorvolo.lab.training.sets import (
     DataOptions,
     TrainingSets,
-    read_labels,
-    simulate_samples,
     training_sets,
 )
 from sorvolo.lab.training.settings import TrainSettings
@@ -216,8 +215,7 @@ def test_damaged_pictures_are_passed_over_and_reported(tmp_path: Path) -> None:
 
 
 def _sets(*places: Path, val: str = "0.25", **options: object) -> TrainingSets:
-    labels = read_labels(places, DataOptions(val, **options), synthetic=0.0, seed=1)  # type: ignore[arg-type]
-    return training_sets(labels, synthetic=0.0, simulated=Path("none"))
+    return training_sets(places, DataOptions(val, **options), seed=1)  # type: ignore[arg-type]
 
 
 def test_whole_videos_are_held_out(data: Path) -> None:
@@ -311,32 +309,14 @@ def test_classes_that_a_set_knows_nothing_of_are_unlabelled_there(
     assert _sets(people, classes={"car": "small object"}).classes == ("small object",)
 
 
-def test_simulated_pictures_are_mixed_in(data: Path, tmp_path: Path) -> None:
-    assert (
-        list(simulate_samples(tmp_path / "simulated", 1, seed=1))[-1]
-        == "simulating pictures: 4 of 4"
-    )
-    assert not list(
-        simulate_samples(tmp_path / "simulated", 1, seed=1)
-    )  # kept for a run that goes on
-    labels = read_labels([data], DataOptions(), synthetic=0.4, seed=1)
-    sets = training_sets(labels, synthetic=0.4, simulated=tmp_path / "simulated")
+def test_simulated_pictures_are_one_more_set(data: Path, tmp_path: Path) -> None:
+    wanted = PictureSettings(pictures=5, seed=1, thermal_share=0.4)
+    *_, _ = simulate_pictures(tmp_path / "simulated", wanted)
+    sets = _sets(data, tmp_path / "simulated", val="0")
     assert sets.classes == ("person", "car", "small object")
     weights = {share.labelled.name: share.weight for share in sets.shares}
-    assert weights.pop("squares") == pytest.approx(0.6)
-    assert weights and all(name.startswith("simulated") for name in weights)
-    assert sum(weights.values()) == pytest.approx(0.4)
-
-
-def test_labels_are_checked_before_anything_is_simulated(data: Path, tmp_path: Path) -> None:
-    options = DataOptions(classes={"Boat": "boat"})
-    with pytest.raises(InputError, match="none of its class names"):
-        list(
-            train_detector(
-                [data], tmp_path / "out", _settings(synthetic=0.5), options, device="cpu"
-            )
-        )
-    assert not (tmp_path / "out" / "simulated").exists()
+    assert weights.pop("squares") > 5 and sum(weights.values()) == 5
+    assert all(name.startswith("simulated") for name in weights)
 
 
 def test_bad_input_is_reported(

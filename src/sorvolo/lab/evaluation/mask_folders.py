@@ -51,7 +51,6 @@ class MaskScores:
     compared: int
     only_found: int
     only_true: int
-    least_px: int
 
 
 @dataclass(frozen=True)
@@ -64,18 +63,16 @@ class ComparedMask:
     frame: Counts
 
 
-def compare_mask_folders(found: Path, truth: Path, least_px: int = 1) -> MaskScores:
+def compare_mask_folders(found: Path, truth: Path) -> MaskScores:
     """Compare the masks that both folders have, together; as `compared_masks`."""
     mine, true = _masks(found), _masks(truth)
     pixels, frames, compared = Counts(), Counts(), 0
-    for each in compared_masks(found, truth, least_px):
+    for each in compared_masks(found, truth):
         pixels, frames, compared = pixels + each.pixels, frames + each.frame, compared + 1
-    return MaskScores(
-        pixels, frames, compared, len(mine) - compared, len(true) - compared, least_px
-    )
+    return MaskScores(pixels, frames, compared, len(mine) - compared, len(true) - compared)
 
 
-def compared_masks(found: Path, truth: Path, least_px: int = 1) -> Iterator[ComparedMask]:
+def compared_masks(found: Path, truth: Path) -> Iterator[ComparedMask]:
     """Compare the masks that both folders have, paired by their names without ending, numbers by their value.
 
     A pixel is changed when any of its colours is nonzero; in lossy formats, from 128 on. A found mask that holds 0, 128
@@ -101,7 +98,7 @@ def compared_masks(found: Path, truth: Path, least_px: int = 1) -> Iterator[Comp
             name,
             mine[name],
             pixel_counts(changed, there, unknown),
-            frame_counts(changed, there, unknown, least_px),
+            frame_counts(changed, there, unknown),
         )
 
 

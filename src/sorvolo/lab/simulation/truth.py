@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, ImageRGBA, PointsM
+from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGBA, PointsM
 from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.geometry.level_ground import footprint
@@ -17,9 +17,8 @@ from sorvolo.geometry.pose import Pose, gimbal_angles_from_rotation
 from sorvolo.lab.simulation.flight import SimulatedFlight, has_changed
 from sorvolo.lab.simulation.ground_painting import GroundRaster
 from sorvolo.lab.simulation.rendering import Labels, render_labels
-from sorvolo.lab.simulation.world import LEVEL, Relief, World
+from sorvolo.lab.simulation.world import World
 from sorvolo.search.drawing.objects import Body, Thing, ThingLabel
-from sorvolo.search.drawing.view import DrawnView, sample_patches
 
 CATEGORIES = (ThingLabel.PERSON, ThingLabel.CAR, ThingLabel.SMALL)
 """The COCO categories; their ids count from 1."""
@@ -260,44 +259,6 @@ def polygon_geometry(outline_m: PointsM, site: LocalFrame) -> dict[str, Any] | N
         "type": "Polygon",
         "coordinates": [[[round(float(c), DEGREE_DECIMALS) for c in p] for p in closed]],
     }
-
-
-def surface_heights(
-    things: Sequence[Thing], bodies: Mapping[int, Body], view: DrawnView, relief: Relief = LEVEL
-) -> Floats32:
-    """(H, W) the height of the topmost surface at each pixel of a map view, m; that of level ground is 0.
-
-    What looks like a leaf (crowns, silhouettes) counts where it is opaque.
-    """
-    heights = ground_heights(view, relief)
-    for thing in things:
-        for patch in bodies[thing.id].placed(thing.turn, thing.place_m(0.0), view.eye_m):
-            corners = patch.corners_m
-            normal = np.cross(corners[1] - corners[0], corners[3] - corners[0])
-            if abs(normal[2]) < 1e-3 * np.linalg.norm(normal):
-                continue  # a wall has no ground of its own
-            for (x0, y0, x1, y1), rgba in sample_patches(view, [patch]):
-                rays = view.rays_in((x0, y0, x1, y1))
-                east, north = (
-                    rays[..., 0] - view.ray_from_site[0, 3],
-                    view.ray_from_site[1, 3] - rays[..., 1],
-                )
-                slope = (
-                    normal[0] * (east - corners[0, 0]) + normal[1] * (north - corners[0, 1])
-                ) / normal[2]
-                up = np.clip(corners[0, 2] - slope, corners[:, 2].min(), corners[:, 2].max())
-                here = heights[y0:y1, x0:x1]
-                np.maximum(here, up, out=here, where=rgba[..., 3] > 127, casting="same_kind")
-    return heights
-
-
-def ground_heights(view: DrawnView, relief: Relief) -> Floats32:
-    """(H, W) the bare ground's height at each pixel of a map view, m."""
-    if relief.is_level:
-        return np.zeros((view.camera.height_px, view.camera.width_px), np.float32)
-    rays = view.rays_in((0, 0, view.camera.width_px, view.camera.height_px))
-    east, north = rays[..., 0] - view.ray_from_site[0, 3], view.ray_from_site[1, 3] - rays[..., 1]
-    return relief.up_m(np.dstack([east, north])).astype(np.float32)
 
 
 VIEW_STEP_S = 0.2

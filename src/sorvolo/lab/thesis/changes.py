@@ -20,8 +20,6 @@ from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 
 _TABLE_LEVEL, _TABLE_SHARE = 40, 0.3  # T_gray and T_H of Table 4.2
 
-_MOST_THREADS = 256  # a bound for typing errors, beyond any machine that this runs on
-
 Picture = NDArray[np.uint8]
 """(height, width, 3) uint8, red green blue."""
 
@@ -303,25 +301,18 @@ def _whole_share(share: float, count: int) -> int:
 
 @dataclass(frozen=True)
 class ThesisComparison:
-    """The method as `compare_flights` takes it: Table 4.2, and the threads of its three slow steps (section 4.2.2)."""
+    """The method as `compare_flights` takes it."""
 
     name: ClassVar[str] = "thesis"
 
     settings: ThesisSettings = field(default_factory=ThesisSettings)
-    threads: int = 1
-
-    def __post_init__(self) -> None:
-        if type(self.threads) is not int or not 1 <= self.threads <= _MOST_THREADS:
-            raise SettingsError(
-                f"threads is {self.threads!r}; give a whole number from 1 to {_MOST_THREADS}"
-            )
 
     def compare(self, reference: Picture, query: Picture, valid: Mask) -> Comparison:
         """The changes between two aligned RGB pictures (h, w, 3)."""
-        return compare_thesis(reference, query, valid, self.settings, self.threads)
+        return compare_thesis(reference, query, valid, self.settings)
 
     def steps(
         self, reference: Picture, query: Picture, valid: Mask
     ) -> Mapping[str, NDArray[np.uint8]]:
         """The pictures of Figure 3.14 by name."""
-        return thesis_steps(reference, query, valid, self.settings, self.threads).pictures()
+        return thesis_steps(reference, query, valid, self.settings).pictures()

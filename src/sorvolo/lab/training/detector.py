@@ -44,8 +44,6 @@ from sorvolo.lab.training.samples import Augmentation, TrainingSample, batches_f
 from sorvolo.lab.training.sets import (
     DataOptions,
     TrainingSets,
-    read_labels,
-    simulate_samples,
     training_sets,
 )
 from sorvolo.lab.training.settings import TrainSettings
@@ -66,8 +64,8 @@ from sorvolo.store.exports.plain import json_bytes, plain_json
 from sorvolo.survey.wording import counted
 
 MODEL, REPORT, PAGE = "model.onnx", "training.json", "training.html"
-CHECKPOINT, BEST, SIMULATED = "checkpoint.pt", "best.safetensors", "simulated"
-"""What a run leaves in its folder; the last only where simulated pictures were asked for."""
+CHECKPOINT, BEST = "checkpoint.pt", "best.safetensors"
+"""What a run leaves in its folder."""
 
 _CHECKS, _CHECK_STEPS = (
     20,
@@ -164,12 +162,7 @@ def _train(
     start = load_start(settings.weights, settings.preset)
     steps = settings.steps
     yield TrainingUpdate(0, steps, "reading the labels")
-    labels = read_labels(places, options, synthetic=settings.synthetic, seed=settings.seed)
-    if settings.synthetic > 0:
-        samples = round(steps * settings.batch * settings.synthetic)
-        for words in simulate_samples(out / SIMULATED, samples, settings.seed):
-            yield TrainingUpdate(0, steps, words)
-    sets = training_sets(labels, synthetic=settings.synthetic, simulated=out / SIMULATED)
+    sets = training_sets(places, options, seed=settings.seed)
     notices = sets.notices
     if isinstance(start, ExportedModel):
         notices += tuple(begin_notices(start, sets.classes))

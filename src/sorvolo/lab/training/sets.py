@@ -1,7 +1,7 @@
-"""What a training learns from and is checked on: labelled sets, split by video or flight, and simulated pictures."""
+"""What a training learns from and is checked on: labelled sets, split by video or flight."""
 
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -9,18 +9,14 @@ from typing import Any
 from sorvolo.capture.photos import read_picture
 from sorvolo.detection.light import is_thermal
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.lab.datasets import read_dataset, read_datasets
+from sorvolo.lab.datasets import read_datasets
 from sorvolo.lab.datasets.splits import hold_out, shared_groups, shuffled
-from sorvolo.lab.simulation.flight_files import PICTURES_MARK
-from sorvolo.lab.simulation.pictures import PictureSettings, simulate_pictures
 from sorvolo.lab.training.samples import Share
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES
 
 _LOOKED_AT = 40  # pictures of a set that decide whether it is thermal
 _SUBSTANTIAL = 0.1  # share of the samples from which on a light is learnt
-_SYNTHETIC_PICTURES = (4, 1200)  # made at least and at most
-_SYNTHETIC_THERMAL = 0.2  # share of simulated pictures, by choice
 
 
 @dataclass(frozen=True)
@@ -36,15 +32,6 @@ class DataOptions:
     ignore: tuple[str, ...] = ()
     unlabelled: tuple[str, ...] = ()
     group_pattern: str | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class ReadLabels:
-    """Sets `learnt` from and `held_out`, and what was remarked of them."""
-
-    learnt: tuple[LabelledSet, ...]
-    held_out: tuple[LabelledSet, ...]
-    notices: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,83 +86,49 @@ class TrainingSets:
         ]
 
 
-def read_labels(
-    places: Sequence[Path], options: DataOptions, *, synthetic: float, seed: int
-) -> ReadLabels:
-    """Read and split all sets.
+def training_sets(places: Sequence[Path], options: DataOptions, *, seed: int) -> TrainingSets:
+    """Read and split all sets: what is learnt from and checked on.
 
-    Raises InputError where there is nothing to learn from or a set cannot be read, SettingsError where `val` is neither
-    a data set nor a share.
+    A class that a set does not name is unlabelled there. Raises InputError where a set cannot be read or none holds an
+    object to learn, SettingsError where `val` is neither a data set nor a share.
     """
     share = _share_of(options.val)
-    if not places and synthetic < 1:
-        raise InputError(
-            "no data to learn from; give folders of labelled pictures, or --synthetic 1"
-        )
+    if not places:
+        raise InputError("no data to learn from; give folders of labelled pictures")
     checked = [Path(options.val)] if share is None else []
     labels: Any = {name: value for name, value in vars(options).items() if name != "val"}
     read = read_datasets([*places, *checked], **labels)
-    whole, apart = list(read[: len(places)]), list(read[len(places) :])
+    learnt, held_out = list(read[: len(places)]), list(read[len(places) :])
     notices = [f"{each.name}: {notice.text}" for each in read for notice in each.notices]
-    if share is not None:
-        # The sets with a share of each held out; `notices` and what is to be known of that
-        parts = [hold_out(each, share, seed) for each in whole]
-        return ReadLabels(
-            tuple(learnt for learnt, _, _ in parts),
-            tuple(held_out for _, held_out, _ in parts if len(held_out)),
-            (*notices, *(text for _, _, texts in parts for text in texts)),
-        )
-    notices += [notice.text for each in whole for notice in shared_groups(each, apart[0])]
-    return ReadLabels(tuple(whole), tuple(apart), tuple(notices))
-
-
-def training_sets(read: ReadLabels, *, synthetic: float, simulated: Path) -> TrainingSets:
-    """What is learnt from and checked on; `simulated` is the folder of `simulate_samples`, from which `synthetic` of
-    all samples come.
-
-    A class that a set does not name is unlabelled there. Raises InputError where no set holds an object to learn.
-    """
-    notices = list(read.notices)
-    shares = [share for each in read.learnt for share in _by_light(each)]
-    if synthetic > 0:
-        made = replace(read_dataset(simulated, form="coco"), name="simulated")
-        shares = _mixed(shares, _parted(made), synthetic)
+    if share is None:
+        notices += [notice.text for each in learnt for notice in shared_groups(each, held_out[0])]
+    else:
+        parts = [hold_out(each, share, seed) for each in learnt]
+        learnt = [part for part, _, _ in parts]
+        held_out = [part for _, part, _ in parts if len(part)]
+        notices += [text for _, _, texts in parts for text in texts]
+    shares = [share for each in learnt for share in _by_light(each)]
     classes = _in_order(name for each in shares for name in each.labelled.classes)
     shares = [replace(each, labelled=_honest(each.labelled, classes)) for each in shares]
-    # Raise InputError where no picture has an object to learn, with what was remarked of the sets
-    if not any(len(picture.labels) for each in shares for picture in each.labelled.pictures):
+    counts = dict.fromkeys(classes, 0)
+    for each in shares:
+        for picture in each.labelled.pictures:
+            for label in picture.labels:
+                counts[each.labelled.classes[label]] += 1
+    if not any(counts.values()):
         remarks = "; ".join(notices) or "all their label files are empty"
         raise InputError(
             f"none of the pictures to learn from has a labelled object that can be used ({remarks}); "
             "check the labels, their class names and what is held out with --val"
         )
-    counts = dict.fromkeys(classes, 0)
-    for share in shares:
-        for picture in share.labelled.pictures:
-            for label in picture.labels:
-                counts[share.labelled.classes[label]] += 1
     notices += [
         f"only {count} boxes of class {name} to learn from"
         for name, count in counts.items()
         if count < 50
     ]
     return TrainingSets(
-        tuple(shares),
-        tuple(_honest(each, classes) for each in read.held_out),
-        classes,
-        tuple(notices),
+        tuple(shares), tuple(_honest(each, classes) for each in held_out), classes, tuple(notices)
     )
-
-
-def simulate_samples(folder: Path, samples: int, seed: int) -> Iterator[str]:
-    """Make pictures for so many simulated samples, and report how far it is; a folder that has them already is kept."""
-    low, high = _SYNTHETIC_PICTURES
-    if not (folder / PICTURES_MARK).is_file():
-        settings = PictureSettings(
-            pictures=min(max(samples, low), high), seed=seed, thermal_share=_SYNTHETIC_THERMAL
-        )
-        for done in simulate_pictures(folder, settings):
-            yield f"simulating pictures: {done.pictures_done} of {done.pictures_total}"
 
 
 def _share_of(val: str) -> float | None:
@@ -206,20 +159,15 @@ def _by_light(labelled: LabelledSet) -> list[Share]:
     ratio = sum(known) / max(1, len(known))
     if not _SUBSTANTIAL <= ratio <= 1 - _SUBSTANTIAL:
         return [Share(labelled, float(len(labelled)), thermal=ratio > 0.5)]
-    by_day, thermal = _parted(labelled)
-    return [Share(by_day, float(len(by_day))), Share(thermal, float(len(thermal)), thermal=True)]
-
-
-def _parted(labelled: LabelledSet) -> tuple[LabelledSet, LabelledSet]:
-    """The set's pictures by day, damaged ones among them, and its thermal ones."""
     are_thermal = [_is_thermal(picture) for picture in labelled.pictures]
-    by_day = labelled.only(
-        [picture for picture, dark in zip(labelled.pictures, are_thermal) if not dark]
+    by_day, thermal = (
+        labelled.only(
+            [p for p, dark in zip(labelled.pictures, are_thermal) if bool(dark) == wanted]
+        )
+        for wanted in (False, True)
     )
-    thermal = labelled.only(
-        [picture for picture, dark in zip(labelled.pictures, are_thermal) if dark]
-    )
-    return by_day, replace(thermal, name=f"{labelled.name}, thermal")
+    thermal = replace(thermal, name=f"{labelled.name}, thermal")
+    return [Share(by_day, float(len(by_day))), Share(thermal, float(len(thermal)), thermal=True)]
 
 
 def _is_thermal(picture: LabelledPicture) -> bool | None:
@@ -228,18 +176,6 @@ def _is_thermal(picture: LabelledPicture) -> bool | None:
         return is_thermal(read_picture(Path(picture.path)))
     except (InputError, OSError):
         return None
-
-
-def _mixed(shares: Sequence[Share], made: Sequence[LabelledSet], ratio: float) -> list[Share]:
-    """Weights such that `ratio` of all samples are simulated."""
-    real = sum(share.weight for share in shares) or 1.0
-    pictures = sum(len(each) for each in made)
-    scaled = [replace(share, weight=share.weight / real * (1 - ratio)) for share in shares]
-    return [share for share in scaled if share.weight > 0] + [
-        Share(each, ratio * len(each) / pictures, thermal=index == 1)
-        for index, each in enumerate(made)
-        if len(each)
-    ]
 
 
 def _in_order(names: Iterable[str]) -> tuple[str, ...]:

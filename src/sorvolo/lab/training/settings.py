@@ -18,7 +18,6 @@ class TrainSettings:
     batch: int = 4  # samples a step
     side_px: int = 416  # of the square samples
     seed: int = 1
-    synthetic: float = 0.0  # share of the samples that come from simulated pictures
     patience: int = 8  # checks without a better AP50 before it stops; 0 never does
 
     def __post_init__(self) -> None:
@@ -47,7 +46,3 @@ class TrainSettings:
             raise SettingsError("the preset thesis has the rpn standard or extended")
         if self.side_px % 32:
             raise SettingsError(f"side_px must be a multiple of 32, got {self.side_px}")
-        if not 0 <= self.synthetic <= 1:
-            raise SettingsError(
-                f"the share of synthetic samples must lie in 0 to 1, got {self.synthetic}"
-            )
