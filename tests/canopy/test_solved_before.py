@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 from forest_site import forest_site
+from thermal_forest import fly, make_forest
 
-from sorvolo.lab.simulation.forest import fly, make_forest
 from sorvolo.missions.heights.run import flight_views, solved_before
 from sorvolo.store.site.archive import Archive
 
