@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
+from sorvolo.errors import SettingsError
 from sorvolo.lab.evaluation.change_metrics import (
     Counts,
     FoundEvent,
@@ -75,18 +76,22 @@ def test_rates_without_a_denominator_are_not_numbers():
 
 
 @pytest.mark.parametrize(
-    ("seen", "there", "expected"),
+    ("seen", "there", "least_px", "expected"),
     [
-        (1, 1, Counts(tp=1)),
-        (0, 1, Counts(fn=1)),
-        (1, 0, Counts(fp=1)),
-        (0, 0, Counts(tn=1)),
+        (1, 1, 1, Counts(tp=1)),
+        (0, 1, 1, Counts(fn=1)),
+        (1, 0, 1, Counts(fp=1)),
+        (0, 0, 1, Counts(tn=1)),
+        (5, 3, 4, Counts(unknown=1)),
+        (3, 0, 4, Counts(tn=1)),
+        (3, 5, 4, Counts(fn=1)),
+        (4, 4, 4, Counts(tp=1)),
     ],
 )
-def test_a_frame_is_positive_from_one_pixel_on(seen, there, expected):
+def test_a_frame_is_positive_from_so_many_pixels_on(seen, there, least_px, expected):
     masks = np.zeros((2, 30), bool)
     masks[0, :seen] = masks[1, :there] = True
-    assert frame_counts(masks[:1], masks[1:]) == expected
+    assert frame_counts(masks[:1], masks[1:], least_px=least_px) == expected
 
 
 def test_unknown_pixels_make_no_frame_positive():
@@ -95,6 +100,11 @@ def test_unknown_pixels_make_no_frame_positive():
     assert frame_counts(mask, np.zeros_like(mask), mask) == Counts(tn=1)
     assert frame_counts(mask, mask, mask) == Counts(tn=1)
     assert frame_counts(mask, mask, np.ones_like(mask)) == Counts(unknown=1)
+
+
+def test_masks_of_different_size_are_refused():
+    with pytest.raises(SettingsError):
+        frame_counts(np.zeros((3, 4), bool), np.zeros((3, 4), bool), least_px=0)
 
 
 def test_each_event_ends_in_exactly_one_place():

@@ -233,7 +233,8 @@ def _show_masks(console: Console, flight: str, masks: "MaskScores") -> None:
     console.print(table)
     console.print(
         f"{flight}: {counted(masks.compared, 'mask')} compared; without truth: {masks.only_found}; true "
-        f"masks without a found one: {masks.only_true}; a frame is positive from 1 changed pixel on",
+        f"masks without a found one: {masks.only_true}; a frame is positive from "
+        f"{counted(masks.least_px, 'changed pixel')} on",
         highlight=False,
     )
 

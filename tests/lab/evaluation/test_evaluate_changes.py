@@ -263,6 +263,8 @@ def test_mask_folders_of_any_form(tmp_path):
     assert abs(counts.tp - 150) <= 2 and abs(counts.fp - 50) <= 2 and abs(counts.fn - 50) <= 2
     assert (measured.masks.frames.tp, measured.masks.frames.tn) == (2, 1)
     assert (measured.masks.compared, measured.masks.only_true) == (3, 1)
+    (strict,) = evaluate_changes(found, true, least_px=150)
+    assert (strict.masks.frames.unknown, strict.masks.frames.tn) == (2, 1)
 
 
 def test_what_cannot_be_measured_names_the_reason(site, simulated, tmp_path):

@@ -10,6 +10,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, Mask, PointsM, TimesNs, frozen
 from sorvolo.geometry.polygons import gap, points_inside
 from sorvolo.survey.findings import ChangeKind
@@ -81,12 +82,23 @@ def pixel_counts(found: Mask, truth: Mask, unknown: Mask | None = None) -> Count
     )
 
 
-def frame_counts(found: Mask, truth: Mask, unknown: Mask | None = None) -> Counts:
-    """One frame as a whole: positive when any of its known pixels is changed; `unknown` where nothing of it is known."""
+def frame_counts(
+    found: Mask, truth: Mask, unknown: Mask | None = None, least_px: int = 1
+) -> Counts:
+    """One frame as a whole: positive when at least `least_px` of its known pixels are changed.
+
+    A frame whose true change has some pixels, but fewer than `least_px`, and a frame of which nothing is known, are
+    `unknown`. Raises SettingsError for `least_px` under 1.
+    """
+    if least_px < 1:
+        raise SettingsError(
+            f"a changed frame has at least 1 changed pixel, got a least of {least_px}"
+        )
     known = ~unknown if unknown is not None else np.ones(truth.shape, bool)
-    if not known.any():
+    there = int(np.count_nonzero(truth & known))
+    if 0 < there < least_px or not known.any():
         return Counts(unknown=1)
-    there, is_reported = bool((truth & known).any()), bool((found & known).any())
+    is_reported = int(np.count_nonzero(found & known)) >= least_px
     if there:
         return Counts(tp=1) if is_reported else Counts(fn=1)
     return Counts(fp=1) if is_reported else Counts(tn=1)

@@ -69,12 +69,13 @@ class MeasuredChanges:
 
 
 def evaluate_changes(
-    found: AnyPath, truth: AnyPath, *, flight: str | None = None
+    found: AnyPath, truth: AnyPath, *, flight: str | None = None, least_px: int = 1
 ) -> tuple[MeasuredChanges, ...]:
     """Measure the compared flights of a site folder, or a folder of masks, against the truth.
 
-    `truth` is a simulation's folder, the truth folder in it, or a folder of masks; `flight` one of the site's flights.
-    Raises InputError for folders that hold neither, or not the same frames.
+    `truth` is a simulation's folder, the truth folder in it, or a folder of masks; `flight` one of the site's flights;
+    `least_px` how many changed pixels make a frame positive. Raises InputError for folders that hold neither, or not
+    the same frames.
     """
     found = Path(found)
     truth = Path(truth)
@@ -83,11 +84,13 @@ def evaluate_changes(
     if not (found / "flights").is_dir():
         if not found.is_dir():
             raise InputError(f"{found}: no such folder; give a site folder, or a folder of masks")
-        return (_masks_alone(found.name, found, _true_masks(truth, true_flights, flight)),)
+        return (
+            _masks_alone(found.name, found, _true_masks(truth, true_flights, flight), least_px),
+        )
     names = _compared_flights(found, flight)
     if not true_flights:
         folders = [(name, _own_masks(found, name)) for name in names]
-        return tuple(_masks_alone(name, folder, truth) for name, folder in folders)
+        return tuple(_masks_alone(name, folder, truth, least_px) for name, folder in folders)
     # The site's compared flights, as far as the truth knows them
     with Archive.open(found, write=False) as archive:
         described = archive.site()
@@ -108,14 +111,16 @@ def evaluate_changes(
             "frame is in both; give the truth of these flights"
         )
     return tuple(
-        _evaluate(found, described, flights, name, true_flights[flights.true_name(name)])
+        _evaluate(found, described, flights, name, true_flights[flights.true_name(name)], least_px)
         for name in known
     )
 
 
-def _masks_alone(name: str, found: Path, true: Path) -> MeasuredChanges:
+def _masks_alone(name: str, found: Path, true: Path, least_px: int) -> MeasuredChanges:
     """A folder of masks against another."""
-    return MeasuredChanges(name, compare_mask_folders(found, true), None, None, math.nan, ())
+    return MeasuredChanges(
+        name, compare_mask_folders(found, true, least_px), None, None, math.nan, ()
+    )
 
 
 def as_json(measured: Sequence[MeasuredChanges]) -> list[dict[str, Any]]:
@@ -123,7 +128,7 @@ def as_json(measured: Sequence[MeasuredChanges]) -> list[dict[str, Any]]:
     written = []
     for each in measured:
         masks, events = each.masks, each.events
-        counted = ("compared", "only_found", "only_true")
+        counted = ("compared", "only_found", "only_true", "least_px")
         written.append(
             {
                 "flight": each.flight,
@@ -242,11 +247,12 @@ def _evaluate(
     flights: PairedFlights,
     flight: str,
     true_folder: Path,
+    least_px: int,
 ) -> MeasuredChanges:
     remarks = []
     masks = None
     if has_masks(site / "flights" / flight / "masks"):
-        masks = compare_mask_folders(_own_masks(site, flight), true_folder / "changes")
+        masks = compare_mask_folders(_own_masks(site, flight), true_folder / "changes", least_px)
     else:
         remarks.append(
             "no masks were written: frames and pixels are judged after `sorvolo compare` with --masks DIR"

@@ -51,6 +51,7 @@ class MaskScores:
     compared: int
     only_found: int
     only_true: int
+    least_px: int
 
 
 @dataclass(frozen=True)
@@ -63,16 +64,18 @@ class ComparedMask:
     frame: Counts
 
 
-def compare_mask_folders(found: Path, truth: Path) -> MaskScores:
+def compare_mask_folders(found: Path, truth: Path, least_px: int = 1) -> MaskScores:
     """Compare the masks that both folders have, together; as `compared_masks`."""
     mine, true = _masks(found), _masks(truth)
     pixels, frames, compared = Counts(), Counts(), 0
-    for each in compared_masks(found, truth):
+    for each in compared_masks(found, truth, least_px):
         pixels, frames, compared = pixels + each.pixels, frames + each.frame, compared + 1
-    return MaskScores(pixels, frames, compared, len(mine) - compared, len(true) - compared)
+    return MaskScores(
+        pixels, frames, compared, len(mine) - compared, len(true) - compared, least_px
+    )
 
 
-def compared_masks(found: Path, truth: Path) -> Iterator[ComparedMask]:
+def compared_masks(found: Path, truth: Path, least_px: int = 1) -> Iterator[ComparedMask]:
     """Compare the masks that both folders have, paired by their names without ending, numbers by their value.
 
     A pixel is changed when any of its colours is nonzero; in lossy formats, from 128 on. A found mask that holds 0, 128
@@ -98,7 +101,7 @@ def compared_masks(found: Path, truth: Path) -> Iterator[ComparedMask]:
             name,
             mine[name],
             pixel_counts(changed, there, unknown),
-            frame_counts(changed, there, unknown),
+            frame_counts(changed, there, unknown, least_px),
         )
 
 
