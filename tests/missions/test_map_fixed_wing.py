@@ -26,7 +26,7 @@ def test_a_small_survey_is_mapped_whole_and_in_one_piece(tmp_path: Path) -> None
     small = replace(
         wing,
         seed=7,
-        scene=replace(wing.scene, people=0, cars=0, small_objects=0),
+        scene=replace(wing.scene, people=0, cars=0, small_objects=0, has_scenery=False),
         path=replace(wing.path, length_m=110, strips=2),
         imaging=replace(wing.imaging, width_px=400, height_px=300),
     )

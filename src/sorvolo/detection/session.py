@@ -6,6 +6,7 @@ import os
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import get_args
 
@@ -144,8 +145,14 @@ class Session:
 
 def read_info(path: Path) -> ModelInfo:
     """What a model file states about itself, without making it ready to run. Raises InputError as Session does."""
-    model = read_model(path)
-    return (describe if _is_packaged(path) else described_confined)(model, str(path)).info
+    if _is_packaged(path):
+        return _packaged_info(path)
+    return described_confined(read_model(path), str(path)).info
+
+
+@cache
+def _packaged_info(path: Path) -> ModelInfo:
+    return describe(read_model(path), str(path)).info
 
 
 def read_model(path: Path) -> bytes:

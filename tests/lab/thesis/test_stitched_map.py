@@ -59,6 +59,7 @@ def test_a_flight_that_the_map_shows_is_tied_to_it_and_not_to_its_own_gps() -> N
     assert corner[:2] == pytest.approx([130.0, 50.0], abs=1e-6)
 
 
+@pytest.mark.long
 def test_the_map_keeps_the_detail_of_real_photos_and_burns_none_of_it(tmp_path: Path) -> None:
     photos = sorted(real_data("flights/brighton_beach").glob("*.JPG"))[-4:]
     (tmp_path / "photos").mkdir()
