@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from sorvolo.cli.compare import show_results
+from sorvolo.cli.compare import _class_words, show_results
 from sorvolo.cli.printing import announce_people
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.missions.compare.report import comparison_headline
@@ -27,6 +27,21 @@ COVERED = {
         "is_enough": True,
     },
 }
+
+
+@pytest.mark.parametrize(
+    ("kind", "before", "after", "words"),
+    [
+        ("appeared", None, "car", "car"),
+        ("replaced", "car", "person", "car to person"),
+        ("appeared", None, None, "unknown object"),
+        ("area", None, None, ""),
+    ],
+)
+def test_a_thing_of_no_known_class_is_called_an_unknown_object(
+    kind: str, before: str | None, after: str | None, words: str
+) -> None:
+    assert _class_words(kind, before, after) == words
 
 
 def test_withdrawn_changes_are_named(tmp_path: Path) -> None:
