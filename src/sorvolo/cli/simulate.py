@@ -119,6 +119,7 @@ def simulate(
         "--length": length,
         "--strips": strips,
         "--photos": photos,
+        "--ground-gsd": ground_gsd,
     }
     # 0 is a value that was given
     if given := [
@@ -131,12 +132,12 @@ def simulate(
         )
     from sorvolo.lab.simulation.pictures import PictureSettings, simulate_pictures
 
-    asked = PictureSettings(pictures, 1 if seed is None else seed, kind, thermal)
+    asked = PictureSettings(pictures, 1 if seed is None else seed, ground, thermal)
     if height is not None:
         asked = replace(asked, height_m=(height, height))
     last = None
     with ProgressReport(Console(stderr=True), stays=True) as progress:
-        for last in simulate_pictures(folder, asked, ground_file, ground_gsd):
+        for last in simulate_pictures(folder, asked):
             progress.show("simulating pictures", last.pictures_done, asked.pictures)
     if last is not None and as_json:
         typer.echo(json.dumps(asdict(last)))

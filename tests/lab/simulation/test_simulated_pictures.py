@@ -8,7 +8,6 @@ import pytest
 from PIL import Image
 
 from sorvolo.errors import SettingsError
-from sorvolo.lab.simulation.ground import orthophoto_ground
 from sorvolo.lab.simulation.pictures import (
     SMALLEST_PX,
     PictureSettings,
@@ -70,18 +69,6 @@ def test_people_stand_out_in_thermal_pictures_which_are_grey():
                 inside = np.median(grey[y + h // 3 : y + h - h // 3, x + w // 3 : x + w - w // 3])
                 found += abs(inside - np.median(grey)) > 1.5 * grey.std()
     assert found >= 4
-
-
-def test_an_orthophoto_is_cut_and_one_too_small_is_refused():
-    rng = np.random.default_rng(0)
-    large = orthophoto_ground(rng.integers(0, 255, (1600, 1600, 3), np.uint8), 0.1)
-    settings = replace(SETTINGS, ground="orthophoto")
-    assert simulate_picture(settings, 0, large).ground == "orthophoto"
-    with pytest.raises(SettingsError, match="orthophoto"):
-        simulate_picture(settings, 0)
-    small = orthophoto_ground(np.zeros((60, 60, 3), np.uint8), 0.1)
-    with pytest.raises(SettingsError, match="6 m of the orthophoto"):
-        simulate_picture(settings, 0, small)
 
 
 def test_the_folder_is_coco_and_only_a_simulation_is_replaced(tmp_path):

@@ -18,7 +18,6 @@ from sorvolo.geometry.pose import Pose, site_from_body_nadir_rotation
 from sorvolo.lab.simulation.flight import line_kernel
 from sorvolo.lab.simulation.flight_files import (
     PICTURES_MARK,
-    read_orthophoto,
     simulation_description,
     simulation_folder,
     write_json,
@@ -26,8 +25,6 @@ from sorvolo.lab.simulation.flight_files import (
 from sorvolo.lab.simulation.ground import (
     GroundKind,
     GroundLayout,
-    PaintedGround,
-    orthophoto_ground,
     paint_ground,
 )
 from sorvolo.lab.simulation.ground_painting import GroundArea, GroundRaster
@@ -35,7 +32,7 @@ from sorvolo.lab.simulation.rendering import render, render_labels
 from sorvolo.lab.simulation.settings import LaterSettings, SimulationSettings, WeatherSettings
 from sorvolo.lab.simulation.truth import box_rows, coco_categories
 from sorvolo.lab.simulation.world import Day, World, build_day, is_free, scenery
-from sorvolo.paths import AnyPath, as_path
+from sorvolo.paths import AnyPath
 from sorvolo.search.drawing.noise import layer
 from sorvolo.search.drawing.objects import (
     GROUND_LEVEL,
@@ -152,7 +149,7 @@ _STEEPEST_DEG = 72.0  # no ray is nearer to the horizon: there is no ground pain
 class PictureSettings:
     """What single pictures show. The same settings and seed give the same pictures, each whatever their number.
 
-    `ground` is a GroundKind's name, "orthophoto", or empty for all kinds in turn. `m_per_px` and `height_m` are the
+    `ground` is a GroundKind's name, or empty for all kinds in turn. `m_per_px` and `height_m` are the
     lowest and the highest ground sampling distance (drawn evenly in its logarithm) and height above ground;
     `tilt_deg` is how far the camera may look away from straight down.
     """
@@ -167,10 +164,8 @@ class PictureSettings:
     tilt_deg: float = 45.0
 
     def __post_init__(self) -> None:
-        if self.ground not in ("", *GroundKind, "orthophoto"):
-            raise SettingsError(
-                f"unknown ground {self.ground!r}; choose {', '.join(GroundKind)}, or an orthophoto's file"
-            )
+        if self.ground not in ("", *GroundKind):
+            raise SettingsError(f"unknown ground {self.ground!r}; choose {', '.join(GroundKind)}")
         for name, value, low, high in (
             ("pictures", self.pictures, 1, 10**6),
             ("seed", self.seed, 0, 2**62),
@@ -203,32 +198,19 @@ class SimulatedPicture:
     boxes: tuple[dict[str, Any], ...]
 
 
-def simulate_picture(
-    settings: PictureSettings, index: int, orthophoto: PaintedGround | None = None
-) -> SimulatedPicture:
-    """The picture of this index, counted from 0; its boxes' ids count from 1.
-
-    Raises SettingsError when the ground is an orthophoto that is missing or too small for any of the heights.
-    """
-    if (settings.ground == "orthophoto") != (orthophoto is not None):
-        raise SettingsError(
-            "an orthophoto was asked for but none given, or given but not asked for"
-        )
+def simulate_picture(settings: PictureSettings, index: int) -> SimulatedPicture:
+    """The picture of this index, counted from 0; its boxes' ids count from 1."""
     rng = np.random.default_rng([settings.seed, 20, index])
     is_thermal = bool(rng.uniform() < settings.thermal_share)
-    largest_m = None if orthophoto is None else min(orthophoto.raster.area.size_m)
-    camera, pose = _new_shot(settings, is_thermal, largest_m, rng)
+    camera, pose = _new_shot(settings, is_thermal, rng)
     middle = ground_from_pixels(camera, pose, np.array([[camera.cx_px, camera.cy_px]]))[0]
     m_per_px = float(np.linalg.norm(pose.translation_m - [*middle, 0.0])) / camera.fx_px
     area = _needed_area(camera, pose)
     ground = settings.ground or str(rng.choice(list(GroundKind), p=(0.25, 0.35, 0.3, 0.1)))
-    if orthophoto is not None:
-        painted = _cut(orthophoto, area, rng)
-    else:
-        width_m, height_m = area.size_m
-        fine_m = max(0.72 * m_per_px, float(np.sqrt(width_m * height_m / _LARGEST_GROUND_PX)))
-        painted = paint_ground(GroundKind(ground), area, fine_m, rng)
-    things = scenery(ground, painted.layout, rng) if ground != "orthophoto" else ()
+    width_m, height_m = area.size_m
+    fine_m = max(0.72 * m_per_px, float(np.sqrt(width_m * height_m / _LARGEST_GROUND_PX)))
+    painted = paint_ground(GroundKind(ground), area, fine_m, rng)
+    things = scenery(ground, painted.layout, rng)
     if rng.uniform() >= settings.empty_share:
         things += _targets(things, painted.layout, camera, pose, rng)
     # The site under a light of its own: mostly day, sometimes dusk, street lamps or snow
@@ -259,9 +241,9 @@ def _judged(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _new_shot(
-    settings: PictureSettings, is_thermal: bool, largest_m: float | None, rng: np.random.Generator
+    settings: PictureSettings, is_thermal: bool, rng: np.random.Generator
 ) -> tuple[Camera, Pose]:
-    """A camera without distortion somewhere above the site's origin; `largest_m` bounds the ground that it needs."""
+    """A camera without distortion somewhere above the site's origin."""
     for _ in range(2000):
         width_px, height_px = (
             _THERMAL_SIZE_PX if is_thermal else _SIZES_PX[rng.integers(len(_SIZES_PX))]
@@ -283,18 +265,11 @@ def _new_shot(
         lengths = np.linalg.norm(camera.rays_from_pixels(camera.corners_px), axis=1)
         if not settings.height_m[0] <= height_m <= settings.height_m[1]:
             continue
-        if (down / lengths).min() < np.cos(np.radians(_STEEPEST_DEG)):
-            continue
-        if largest_m is None or max(_needed_area(camera, pose).size_m) < largest_m:
+        if (down / lengths).min() >= np.cos(np.radians(_STEEPEST_DEG)):
             return camera, pose
-    bound = (
-        ""
-        if largest_m is None
-        else f", nor any that sees no more than {largest_m:.0f} m of the orthophoto"
-    )
     raise SettingsError(
         f"no camera sees the ground at {settings.m_per_px[0]:g} to {settings.m_per_px[1]:g} m per pixel from"
-        f" {settings.height_m[0]:g} to {settings.height_m[1]:g} m{bound}; widen one of them"
+        f" {settings.height_m[0]:g} to {settings.height_m[1]:g} m; widen one of them"
     )
 
 
@@ -302,19 +277,6 @@ def _needed_area(camera: Camera, pose: Pose) -> GroundArea:
     outline_m = footprint(camera, pose)
     low, high = outline_m.min(axis=0) - _MARGIN_M, outline_m.max(axis=0) + _MARGIN_M
     return GroundArea(float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-
-
-def _cut(orthophoto: PaintedGround, area: GroundArea, rng: np.random.Generator) -> PaintedGround:
-    """A random piece of an orthophoto laid where the area is."""
-    raster = orthophoto.raster
-    columns, rows = (round(size / step) for size, step in zip(area.size_m, raster.m_per_px))
-    left = int(rng.integers(max(1, raster.rgb.shape[1] - columns)))
-    top = int(rng.integers(max(1, raster.rgb.shape[0] - rows)))
-    window = slice(top, top + rows), slice(left, left + columns)
-    piece = GroundRaster(
-        raster.rgb[window], raster.vegetation[window], area.west_m, area.north_m, raster.m_per_px
-    )
-    return PaintedGround(piece, orthophoto.layout)
 
 
 def _targets(
@@ -407,26 +369,14 @@ class PicturesProgress:
     seconds: float
 
 
-def simulate_pictures(
-    folder: AnyPath,
-    settings: PictureSettings,
-    ground_file: AnyPath | None = None,
-    ground_m_per_px: float | None = None,
-) -> Iterator[PicturesProgress]:
+def simulate_pictures(folder: AnyPath, settings: PictureSettings) -> Iterator[PicturesProgress]:
     """Write `images/*.jpg` and `boxes.json` (COCO) to `folder`, which appears whole or not at all.
 
-    Each picture is a site of its own; its `flight` in the COCO file names it. `ground_file` is the orthophoto of
-    settings whose ground is "orthophoto". Raises SettingsError for a folder that holds anything but an earlier
-    simulation, InputError for an unreadable orthophoto and StoreError for a full disk.
+    Each picture is a site of its own; its `flight` in the COCO file names it. Raises SettingsError for a folder that
+    holds anything but an earlier simulation, and StoreError for a full disk.
     """
     folder = Path(folder)
-    ground_file = as_path(ground_file)
     started = time.monotonic()
-    ground = (
-        None
-        if ground_file is None
-        else orthophoto_ground(*read_orthophoto(ground_file, ground_m_per_px))
-    )
     info = simulation_description(asdict(settings))
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
@@ -435,7 +385,7 @@ def simulate_pictures(
         with writing(folder):
             (partial / "images").mkdir()
         pictures = in_order(
-            lambda index: simulate_picture(settings, index, ground),
+            lambda index: simulate_picture(settings, index),
             range(settings.pictures),
             most_threads=_MOST_THREADS,
         )
