@@ -69,16 +69,15 @@ def plant_on_floor(
         cell = int(column), int(row)
         up_m = float(under.floor_m[row, column])
         window = spot_window(under, cell)
-        near = [(views[k], picture(k)) for k in seeing(views, window, up_m)]
-        laid = np.stack([lay(*each, window, up_m)[..., 0] for each in near])
+        near = seeing(views, window, up_m)
+        laid = np.stack([lay(views[k], picture(k), window, up_m)[..., 0] for k in near])
         floor, shown, share = gaps(laid, window.cell_m)
         body = _body(window, draw)
         added = np.nan_to_num((floor + draw.uniform(*_WARMER) - laid) * shown * body)
         planted = [
-            image + _in_picture(view, more, window, up_m)
-            for (view, image), more in zip(near, added)
+            picture(k) + _in_picture(views[k], more, window, up_m) for k, more in zip(near, added)
         ]
-        verdict = judge(under, cell, [view for view, _ in near], planted)
+        verdict = judge(under, cell, [views[k] for k in near], planted)
         sigma = abs(under.contrast[row, column] / (under.anomaly[row, column] or np.nan))
         found.append(isinstance(verdict, Find) and verdict.contrast >= LEAST_ANOMALY * sigma)
         free.append(float(np.average(np.nan_to_num(share), weights=body)))

@@ -96,13 +96,15 @@ def search_under_trees(
         colours = pictures.colour(0).astype(np.int16)
         is_thermal = int(np.ptp(colours, axis=2).max()) <= _GRAY
 
+        stored = pictures.gray if is_thermal else pictures.colour
+
         def load(number: int) -> Any:
             size = views[number].camera.width_px, views[number].camera.height_px
             image = np.asarray(
-                cv2.resize(pictures.colour(number), size, interpolation=cv2.INTER_AREA), np.uint8
+                cv2.resize(stored(number), size, interpolation=cv2.INTER_AREA), np.uint8
             )
             # half levels take half the memory of floats: a median is at one
-            return (2 * levelled(image[..., 1] if is_thermal else image)).astype(np.int16)
+            return (2 * levelled(image)).astype(np.int16)
 
         kept = BytesCache[int, Any](_PICTURES_BYTES, lambda image: image.nbytes)
 
