@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, Row, delete, func, select
+from sqlalchemy import Connection, Row, delete, select
 
 from sorvolo.errors import StoreError
 from sorvolo.findings.importance import grouped
@@ -113,27 +113,16 @@ def add_comparison(
 
     Raises StoreError when another flight has a change of the same id.
     """
-    taken = known_ids(connection, [each.id for each in changes])
-    if taken:
-        raise StoreError(
-            f"another flight of this site has a change {min(taken)!r} already; ids must differ"
-        )
+    known = select(schema.changes.c.id)
+    for each in changes:
+        if connection.execute(known.where(schema.changes.c.id == each.id)).first() is not None:
+            raise StoreError(
+                f"another flight of this site has a change {each.id!r} already; ids must differ"
+            )
     kinds = {kind.value: sum(each.kind is kind for each in changes) for kind in ChangeKind}
     row = {"version_id": version_id, "run_id": run_id, "kinds": kinds}
     schema.add_rows(connection, schema.comparisons, [row])
     schema.add_rows(connection, schema.changes, [_row_of(each, run_id) for each in changes])
-
-
-def known_ids(connection: Connection, ids: Iterable[str]) -> set[str]:
-    """Those of these ids that a change has."""
-    wanted = sorted(set(ids))
-    return {
-        change_id
-        for start in range(0, len(wanted), 500)  # SQLite bounds the number of values in a query
-        for change_id in connection.execute(
-            select(schema.changes.c.id).where(schema.changes.c.id.in_(wanted[start : start + 500]))
-        ).scalars()
-    }
 
 
 def load_changes(connection: Connection, flight_id: str | None = None) -> list[StoredChange]:
@@ -202,25 +191,6 @@ def compared_versions(connection: Connection) -> dict[int, Mapping[str, int]]:
     }
 
 
-def is_compared(connection: Connection, run_id: int) -> bool:
-    """Whether the run compared its flight with the map."""
-    query = (
-        select(func.count())
-        .select_from(schema.comparisons)
-        .where(schema.comparisons.c.run_id == run_id)
-    )
-    return connection.execute(query).scalar_one() > 0
-
-
-def outlines_meet(one_m: PointsM, other_m: PointsM) -> bool:
-    """Whether the boxes around two outlines, (N, 2) each, have a point in common."""
-    return bool(
-        np.all(
-            (one_m.min(axis=0) <= other_m.max(axis=0)) & (other_m.min(axis=0) <= one_m.max(axis=0))
-        )
-    )
-
-
 def _centre(outline_m: PointsM) -> PointsM:
     return (outline_m.min(axis=0) + outline_m.max(axis=0)) / 2
 
@@ -258,7 +228,10 @@ def _change_of(row: Row[Any], review: StoredReview | None) -> StoredChange:
         raise ValueError("no outline, or a picture without a scale")
     sizes = ("area_m2", "length_m", "sigma_m", "sigma_in_map_m")
     risen = values["height_change"]
-    is_reviewed = review is not None and outlines_meet(outline_m, review.outline_m)
+    is_reviewed = review is not None and bool(
+        np.all(outline_m.min(axis=0) <= review.outline_m.max(axis=0))
+        and np.all(review.outline_m.min(axis=0) <= outline_m.max(axis=0))
+    )
     return StoredChange(
         **{
             **values,
@@ -319,7 +292,7 @@ def put_under_trees(connection: Connection, flight_id: str, found: Sequence[MapO
     connection.execute(
         delete(objects).where(objects.c.run_id == run_id, objects.c.number.in_(earlier))
     )
-    if not is_searched(connection, run_id):  # in no frame for no class: nothing is gone by it
+    if not load_searches(connection, flight_id):  # in no frame for no class: nothing is gone by it
         add_search(
             connection,
             run_id,
@@ -365,12 +338,6 @@ def load_objects(connection: Connection, flight_id: str | None = None) -> list[S
         StoredObject(row.flight_id, row.rank, _object_of(row.id, row.properties))
         for row in schema.checked_rows(connection, schema.objects, query)
     ]
-
-
-def is_searched(connection: Connection, run_id: int) -> bool:
-    """Whether the run's frames were searched for objects."""
-    query = select(schema.searches.c.run_id).where(schema.searches.c.run_id == run_id)
-    return connection.execute(query).first() is not None
 
 
 def _frames_of(outlines_m: Any, searched_for: Any) -> SearchedFrames:

@@ -159,9 +159,8 @@ def _write_flight_files(files: "Archive", owed: OwedFiles) -> None:
     contents = {name: content for name, content in owed.documents.items() if content}
     for name in (*contents, *owed.leftovers):
         files.document_path(owed.flight_id, name)  # refuses one that could lie elsewhere
-    with files.catalogue.reading() as connection:
-        is_compared = change_records.is_compared(connection, owed.run_id)
-        is_searched = change_records.is_searched(connection, owed.run_id)
+    compared = files.comparisons()
+    searches = files.catalogue_rows(change_records.load_searches, owed.flight_id)
     staged = folder / STAGED / str(owed.run_id)
     lists = (f"{name}{ending}" for name in ("changes", OBJECTS) for ending in LIST_ENDINGS)
     pictures = (name for name in STAGED_FOLDERS if (staged / name).is_dir())
@@ -174,10 +173,15 @@ def _write_flight_files(files: "Archive", owed: OwedFiles) -> None:
             (folder / name).unlink(missing_ok=True)
         take_staged(folder, owed.run_id)
         version = next(
-            (each for each in files.versions() if each.run_id == owed.run_id and is_compared), None
+            (
+                each
+                for each in files.versions()
+                if each.run_id == owed.run_id and each.id in compared
+            ),
+            None,
         )
         write_change_files(files, owed.flight_id, version)
-        _write_objects(files, folder, files.objects(owed.flight_id) if is_searched else None)
+        _write_objects(files, folder, files.objects(owed.flight_id) if searches else None)
 
 
 def _write_map_files(files: "Archive", version: VersionEntry) -> None:
