@@ -287,13 +287,26 @@ def test_changes_are_groups_what_matters_first_and_none_is_lost() -> None:
         ),
         change(13, -60, 1.0),
         change(14, -80, 1.0, north_m=9.0),
+        change(15, -60, 0.9, north_m=0.8),  # small beside small
+        change(16, -90, 6.0),
+        change(17, -90, 1.0, north_m=2.0),
+        change(18, -70, 5.0, north_m=60),
+        change(19, -90, 9.0, north_m=-60),
     ]
     groups = [[int(each.id[2:]) for each in group] for group in grouped(changes)]
-    assert groups == [[5], [6, 7, 8], [9, 10, 11, 12], [1, 2, 3, 4], [13, 14]]
+    assert groups == [
+        [5],
+        [6, 7, 8],
+        [9, 10, 11, 12],
+        [1, 2, 3, 4],
+        [19],
+        [16, 18, 17],
+        [13, 14, 15],
+    ]
     shuffled = [[int(each.id[2:]) for each in group] for group in grouped(changes[::-1])]
     assert shuffled == groups
     assert in_short(changes) == (
-        "1 person came; 1 truck came; 4 cars left; changed ground in 1 place, 40 m long; 7 small things that changed"
+        "1 person came; 1 truck came; 4 cars left; changed ground in 1 place, 40 m long; 3 large things that changed; 9 small things that changed"
     )
     assert "long" not in in_short(changes, is_local=True)
     assert grouped([]) == [] and in_short([]) == "nothing changed"

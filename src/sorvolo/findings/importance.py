@@ -20,6 +20,7 @@ _NEAR = 0.5  # of the shorter of two things: nearer, one carries the other, or i
 _IN_A_ROW = 1.5  # of the shorter of two like things: nearer, they are of one row
 _LIKE_LENGTHS = 1.6  # times the other's, at most
 _LARGE_M = 4.0  # a car
+_LORRY_M = 8.0
 
 VEHICLES = frozenset({"car", "truck", "bus", "van", "motorcycle", "bicycle", "boat", "tractor"})
 
@@ -58,8 +59,8 @@ def grouped(changes: Sequence[Seen]) -> list[list[Seen]]:
     """The changes of one flight as a person sees them: each in one group, what matters most first in and among them.
 
     A group is what lies in or against one thing or area, the largest first (a lorry, its load, its shadow), with the
-    rows of like things that it touches. What is small, alone and of no class is the last group. A person is alone:
-    nothing hides one.
+    rows of like things that it touches. What has no class and stands in no changed area is in the last two groups: what
+    is smaller than a lorry, and than a car. A person is alone: nothing hides one.
     """
     if not changes:
         return []
@@ -88,14 +89,15 @@ def grouped(changes: Sequence[Seen]) -> list[list[Seen]]:
             taken = taken[heads[taken] < 0]
             heads[taken] = head
             heads[(heads < 0) & np.isin(rows, rows[taken[~is_area[taken]]])] = head
-    is_small = (names == [each.kind.value for each in changes]) & ~is_area & (lengths_m < _LARGE_M)
-    alone, counts = np.unique(heads, return_counts=True)
-    heads[is_small & np.isin(heads, alone[counts == 1])] = len(changes)
+    is_named = (names != [each.kind.value for each in changes]) | is_area
+    sizes = len(changes) + np.digitize(lengths_m[heads], [_LORRY_M, _LARGE_M])
+    is_one_of_many = (lengths_m[heads] < _LORRY_M) & ~np.isin(heads, heads[is_named])
+    heads = np.where(is_one_of_many, sizes, heads)
     groups: dict[int, list[Seen]] = {}
     for head, each in sorted(zip(heads.tolist(), changes), key=lambda pair: _importance(pair[1])):
         groups.setdefault(head, []).append(each)
-    small = groups.pop(len(changes), None)
-    return [*groups.values(), *([small] if small else [])]
+    last = [groups.pop(len(changes) + size, []) for size in (1, 2)]
+    return [*groups.values(), *filter(None, last)]
 
 
 def in_short(changes: Sequence[ChangeFacts], *, is_local: bool = False) -> str:
