@@ -301,8 +301,8 @@ def _crop(find: Find, views: Sequence[View], picture: Picture) -> Any:
 
 
 def _ringed(under: UnderTrees, finds: Finds) -> ImageRGBA:
-    """(H, W, 4) the integral with a ring around each find."""
-    picture = _stretched(under.mean[..., None])
+    """(H, W, 4) what stands out from the floor around it, with a ring around each find."""
+    picture = _stretched(under.contrast[..., None])
     lattice = under.lattice
     for find in finds.people:
         x, y = np.round(lattice.cells_from_site(find.place_m[None, :2])[0]).astype(int).tolist()
