@@ -15,6 +15,8 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
+from urllib.request import Request, urlopen
+from xml.etree import ElementTree
 
 import pytest
 
@@ -1267,7 +1269,7 @@ def test_what_is_shown_can_be_taken_away(opened: Watched, tmp_path: Path) -> Non
     page.locator("[data-panel=share]").click()
     page.locator(".files a", has_text="GeoPackage").wait_for()
     taken = {}
-    for name in ("GeoJSON", "CSV", "KMZ"):
+    for name in ("GeoJSON", "CSV", "KMZ", "CalTopo", "TAK package"):
         with page.expect_download() as download:
             page.get_by_role("button", name=name).click()
         taken[name] = Path(shutil.copy(download.value.path(), tmp_path / name))
@@ -1277,7 +1279,53 @@ def test_what_is_shown_can_be_taken_away(opened: Watched, tmp_path: Path) -> Non
     assert rows[0].startswith("id,what,kind,class")
     assert sum(row.startswith("b-") for row in rows) == 4
     shutil.unpack_archive(taken["KMZ"], tmp_path / "kmz", "zip")
-    assert (tmp_path / "kmz" / "doc.kml").read_text().count("<Placemark>") == len(features)
+    places = check_kml(ElementTree.parse(tmp_path / "kmz" / "doc.kml").getroot())
+    assert len(places) == len(features)
+    marked = json.loads(taken["CalTopo"].read_text())["features"]
+    assert [each["id"] for each in marked] == [each["id"] for each in features]
+    assert {each["properties"]["class"] for each in marked} <= {"Marker", "Shape"}
+    assert all(each["properties"]["title"] for each in marked)
+    shutil.unpack_archive(taken["TAK package"], tmp_path / "tak", "zip")
+    contents = ElementTree.parse(tmp_path / "tak/MANIFEST/manifest.xml").getroot().iter("Content")
+    spots = [ElementTree.parse(tmp_path / "tak" / each.attrib["zipEntry"]) for each in contents]
+    assert len(spots) == len(features)
+    for each in spots:
+        event, point = each.getroot(), each.getroot()[0]
+        assert (event.get("version"), point.tag) == ("2.0", "point")
+        assert datetime.fromisoformat(event.attrib["stale"]) > datetime.now(UTC)
+        assert abs(float(point.attrib["lat"]) - 46.5) < 0.1 and float(point.attrib["ce"]) > 0
+
+
+KML_ORDER = {  # of children, as the schema of KML 2.2 has them
+    "kml": "Document",
+    "Document": "name Placemark",
+    "Placemark": "name description Style Point LineString Polygon MultiGeometry",
+    "Style": "IconStyle LineStyle PolyStyle",
+    **dict.fromkeys(("IconStyle", "LineStyle", "PolyStyle"), "color"),
+    **dict.fromkeys(("Point", "LineString", "LinearRing"), "coordinates"),
+    "Polygon": "outerBoundaryIs",
+    "outerBoundaryIs": "LinearRing",
+    "MultiGeometry": "Polygon",
+}
+
+
+def check_kml(root: ElementTree.Element) -> list[ElementTree.Element]:
+    """The placemarks of a document whose elements are in the schema's namespace and order, with values of its types."""
+    space = "{http://www.opengis.net/kml/2.2}"
+    for each in root.iter():
+        assert each.tag.startswith(space)
+        name, text = each.tag.removeprefix(space), each.text or ""
+        if name == "color":
+            assert re.fullmatch("[0-9a-f]{8}", text)
+        elif name == "coordinates":
+            assert all(abs(float(n)) <= 180 for pair in text.split() for n in pair.split(","))
+        elif name not in ("name", "description"):
+            at = [KML_ORDER[name].split().index(child.tag.removeprefix(space)) for child in each]
+            assert at == sorted(at) and at
+        if name == "LinearRing":
+            ring = (each[0].text or "").split()
+            assert ring[0] == ring[-1] and len(ring) > 3
+    return list(root.iter(f"{space}Placemark"))
 
 
 def test_an_upload_goes_on_after_a_cut_and_starts_a_mission(
@@ -1869,7 +1917,10 @@ def test_a_station_with_tokens_asks_who_comes(
         page.get_by_role("alert").get_by_text("not known here").wait_for()
         page.get_by_label("Token").fill(token)
         page.get_by_role("dialog").get_by_role("button", name="Log in").click()
+        sent = {"authorization": f"Bearer {make_token(station.station.state, 'Ben', 'view')}"}
+        urlopen(Request(f"{station.url}/api/status?site=field", headers=sent)).close()
         page.locator(".card a").click()
+        expect(page.locator(".present")).to_have_text("also here: Ben")
         page.locator("#rooms [data-panel=live]").click()
         page.get_by_text("Ask the team lead for operator access").wait_for()
         page.locator("#rooms [data-panel=findings]").click()

@@ -224,7 +224,7 @@ def test_a_page_sees_a_flight_grow_though_its_station_is_killed(
         )
         watched = Watched(context, station.url)
         page = watched.page
-        page.goto(f"{station.url}/#/site/new/missions")
+        page.goto(f"{station.url}/#/site/new/live")
         page.get_by_text("Start a mission").wait_for()
         flying.start()
         wait_for(lambda: any(each["flights"] for each in station.ask("/api/streams")))

@@ -4,6 +4,7 @@ import asyncio
 import logging
 import shutil
 import socket
+import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import uvicorn
-from fastapi import APIRouter, Body, FastAPI, Request, Response
+from fastapi import APIRouter, Body, FastAPI, Query, Request, Response
 from fastapi.responses import FileResponse, JSONResponse
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.staticfiles import StaticFiles
@@ -58,6 +59,7 @@ from sorvolo.station.tokens import Role, has_tokens
 from sorvolo.station.uploads import Uploads, upload_routes
 
 PAGE_FOLDER = Path(__file__).parent / "page"
+_PRESENT_S = 25.0  # after a page asked: it does every ten seconds
 _FOR_EVER = "public, max-age=31536000, immutable"
 _UPLOADS = "/api/uploads"
 _BASE_MAP = "/api/base-map.pmtiles"
@@ -220,13 +222,22 @@ def station_app(
 
 def _about_routes(station: Station) -> APIRouter:
     router = APIRouter(tags=["station"])
+    looked_s: dict[tuple[str, str], float] = {}  # by site and name, on the monotonic clock
 
     @router.get("/api/status")
-    def status(request: Request) -> dict[str, Any]:
-        """The station at a glance."""
+    def status(
+        request: Request, site: Annotated[str, Query(max_length=200)] = ""
+    ) -> dict[str, Any]:
+        """The station at a glance; with the `site` that a page shows, also the names of all who look at it now."""
         free, memory = shutil.disk_usage(station.settings.root).free, memory_bytes()
-        holder = holder_in(request)
+        holder, now_s = holder_in(request), time.monotonic()
+        if site:
+            looked_s[site, holder.name] = now_s
+        for key, at_s in list(looked_s.items()):
+            if now_s - at_s > _PRESENT_S:
+                looked_s.pop(key, None)
         return {
+            "present": sorted(name for at, name in list(looked_s) if at == site),
             "version": __version__,
             "role": holder.role.word,
             "name": holder.name,

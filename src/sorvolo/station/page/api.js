@@ -4,7 +4,7 @@
 export class Problem extends Error {
   constructor(status, title, detail, more = {}) {
     super(detail || title);
-    Object.assign(this, { name: "Problem", status, title, detail, more });
+    Object.assign(this, { name: "Problem", status, title, detail, more, words: `${title}. ${detail}` });
   }
 }
 
@@ -52,6 +52,15 @@ export const remove = (path) => ask("DELETE", path);
 /** The API's address of a site, or of something below it. */
 export function siteUrl(site, ...rest) {
   return ["/api/sites", encodeURIComponent(site), ...rest].join("/");
+}
+
+/** The page's address of a room of a site. */
+export const roomUrl = (site, room = "live") => `#/site/${encodeURIComponent(site)}/${room}`;
+
+export function socketTo(path) {
+  const url = new URL(path, location.href);
+  url.protocol = url.protocol.replace("http", "ws");
+  return new WebSocket(url);
 }
 
 /** All features of a collection, page after page, at most `most`. A collection that the site has not gives none. */

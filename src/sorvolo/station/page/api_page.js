@@ -2,35 +2,31 @@
 
 import { get } from "./api.js";
 import { el, fill } from "./dom.js";
+import { grouped } from "./site_data.js";
 
 /** List the station's addresses for who writes a program of their own. */
 export async function showApi(main, title) {
   const { paths, components } = await get("/openapi.json");
-  fill(title, el("h1", {}, "API"));
+  fill(title, el("h1", "API"));
   document.title = "API – Sorvolo station";
-  const groups = new Map();
-  for (const [path, methods] of Object.entries(paths)) {
-    for (const [method, asked] of Object.entries(methods)) {
-      const name = asked.tags?.[0] ?? "station";
-      groups.set(name, [...groups.get(name) ?? [], address(method.toUpperCase(), path, asked, components?.schemas ?? {})]);
-    }
-  }
-  fill(main, el("div", { class: "sites api" },
-    el("p", {}, "What a program may ask of this station. The same for tools, as OpenAPI: ", el("a", { href: "/openapi.json" }, "openapi.json"),
+  const all = Object.entries(paths).flatMap(([path, methods]) => Object.entries(methods).map(([method, asked]) => ({ path, method, asked })));
+  fill(main, el("div.sites.api",
+    el("p", "What a program may ask of this station. The same for tools, as OpenAPI: ", el("a", { href: "/openapi.json" }, "openapi.json"),
       ". Where the station has tokens, send one as Authorization: Bearer TOKEN. ", el("a", { href: "#/" }, "All sites")),
-    [...groups].map(([name, addresses]) => [el("h2", {}, name), addresses])));
+    [...grouped(all, ({ asked }) => asked.tags?.[0] ?? "station")].map(([name, list]) => [el("h2", name),
+      list.map(({ path, method, asked }) => address(method.toUpperCase(), path, asked, components?.schemas ?? {}))])));
   return { close() {} };
 }
 
 function address(method, path, asked, schemas) {
   const body = Object.entries(asked.requestBody?.content ?? {});
   const plain = method === "GET" && !(asked.parameters ?? []).some((each) => each.required);
-  return el("details", {},
-    el("summary", {}, el("code", {}, `${method} ${path}`)),
-    el("p", {}, asked.description ?? asked.summary, plain ? [" ", el("a", { href: path }, "Ask it")] : null),
+  return el("details",
+    el("summary", el("code", `${method} ${path}`)),
+    el("p", asked.description ?? asked.summary, plain ? [" ", el("a", { href: path }, "Ask it")] : null),
     rows((asked.parameters ?? []).map((each) => [each.name, `${each.in}${each.required ? ", needed" : ""}`, typeOf(each.schema, schemas), each.description])),
-    body.map(([kind, { schema }]) => [el("p", {}, "Body: ", el("code", {}, kind)), rows(fieldsOf(schema, schemas))]),
-    el("p", { class: "soft" }, "Answers ", Object.keys(asked.responses).join(", ")));
+    body.map(([kind, { schema }]) => [el("p", "Body: ", el("code", kind)), rows(fieldsOf(schema, schemas))]),
+    el("p.soft", "Answers ", Object.keys(asked.responses).join(", ")));
 }
 
 function fieldsOf(schema, schemas) {
@@ -40,7 +36,7 @@ function fieldsOf(schema, schemas) {
 
 function rows(lines) {
   if (!lines.length) return null;
-  return el("table", {}, lines.map(([name, ...rest]) => el("tr", {}, el("th", { scope: "row" }, name), rest.map((each) => el("td", {}, each ?? "")))));
+  return el("table", lines.map(([name, ...rest]) => el("tr", el("th", { scope: "row" }, name), rest.map((each) => el("td", each ?? "")))));
 }
 
 function resolved(schema = {}, schemas) {

@@ -2,7 +2,7 @@
 
 import * as maplibre from "./vendor/maplibre-gl.mjs";
 import { isDark } from "./choices.js";
-import { button, el, message } from "./dom.js";
+import { button, el, message, quiet } from "./dom.js";
 
 const VECTOR = 1; // the tile type in a PMTiles header
 
@@ -32,10 +32,9 @@ export function chooseBaseMap(screen) {
     await showBaseMap(screen, new PMTiles(new FileSource(input.files[0])));
   });
   const own = screen.station.status.base_map_url;
-  return el("div", { class: "stack" }, input, own ? button("The station's base map", () => showStationMap(screen)) : null, button("No base map", () => { if (screen.view) takeOut(screen.view.map); }, { class: "quiet" }));
+  return el("div.stack", input, own ? button("The station's base map", () => showStationMap(screen)) : null, quiet("No base map", () => { if (screen.view) takeOut(screen.view.map); }));
 }
 
-/** Show the base map that the station was started with, if any. */
 export async function showStationMap(screen) {
   const own = screen.station.status.base_map_url;
   if (!own) return;

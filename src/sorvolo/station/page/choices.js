@@ -6,14 +6,28 @@ const FIRST = {
   layers: {},
 };
 
+/** Text that the browser keeps, null to forget it; a private window may keep nothing. */
+export const stored = {
+  get(key) {
+    try { return localStorage.getItem(key); } catch { return null; }
+  },
+  /** Whether it is kept. */
+  set(key, text) {
+    try {
+      if (text === null) localStorage.removeItem(key);
+      else localStorage.setItem(key, text);
+      return true;
+    } catch { return false; }
+  },
+};
+
 class Choices extends EventTarget {
   constructor() {
     super();
-    let kept = {};
+    this.all = { ...FIRST };
     try {
-      kept = JSON.parse(localStorage.getItem(KEY) || "{}");
-    } catch { /* a browser without storage, or with something else in it: begin anew */ }
-    this.all = { ...FIRST, ...kept };
+      Object.assign(this.all, JSON.parse(stored.get(KEY)));
+    } catch { /* something else is kept there: begin anew */ }
   }
 
   get(name) {
@@ -22,21 +36,17 @@ class Choices extends EventTarget {
 
   set(name, value) {
     this.all[name] = value;
-    try {
-      localStorage.setItem(KEY, JSON.stringify(this.all));
-    } catch { /* private windows may refuse; the choice then lasts as long as the page */ }
+    stored.set(KEY, JSON.stringify(this.all));
     this.dispatchEvent(new CustomEvent("change", { detail: name }));
   }
 }
 
 export const choices = new Choices();
 
-/** Let the page's colours follow the choice. */
 export function applyTheme() {
   document.documentElement.dataset.theme = choices.get("theme");
 }
 
-/** Whether the page is dark now. */
 export function isDark() {
   const theme = choices.get("theme");
   return theme === "dark" || (theme === "auto" && matchMedia("(prefers-color-scheme: dark)").matches);

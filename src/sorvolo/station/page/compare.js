@@ -1,18 +1,15 @@
 // The room Compare: two dates of the map under a swipe, blinking, as their difference, or along the line of flights.
 
-import { button, choice, el, field, fill, tick } from "./dom.js";
+import { button, choice, el, field, fill, press, tick } from "./dom.js";
 import { MapView, tie } from "./map_view.js";
 import { badge, titleOf } from "./feature_card.js";
 import { counted, day } from "./words.js";
 
 const BLINK_MS = 700;
+const dayOf = (version) => day(version.flown_at ?? version.made_at);
 
-/** The panel's life; the map shows `after`, a second map over it `before`. */
-export function comparePanel(screen, body) {
-  return new Compare(screen, body);
-}
-
-class Compare {
+/** The room's life; the map shows `after`, a second map over it `before`. */
+export class Compare {
   constructor(screen, body) {
     Object.assign(this, { screen, body, versions: screen.data.detail.versions ?? [], mode: "swipe", split: 50, isBare: false, at: -1, hadGaps: screen.view?.isShown("coverage") });
     if (this.versions.length < 2) {
@@ -21,7 +18,7 @@ class Compare {
     }
     this.before = this.versions.at(-2).n;
     this.after = this.versions.at(-1).n;
-    this.list = el("div", {});
+    this.list = el("div");
     this.build();
     if (screen.view) {
       screen.view.show("coverage", true, false);
@@ -33,18 +30,18 @@ class Compare {
   tooFew() {
     const only = this.versions.length;
     this.versions = this.put = null;
-    fill(this.body, el("p", { class: "hint" }, only ? "The site has one version. Fly again and start a “compare” mission in “Live”: then two dates can be compared here."
+    fill(this.body, el("p.hint", only ? "The site has one version. Fly again and start a “compare” mission in “Live”: then two dates can be compared here."
       : "There is no map yet. Start a “map” mission in “Live”."));
   }
 
   build() {
-    const pairs = this.versions.map((each) => [each.n, `${each.n}: ${day(each.flown_at ?? each.made_at)} (${each.flight})`]);
+    const pairs = this.versions.map((each) => [each.n, `${each.n}: ${dayOf(each)} (${each.flight})`]);
     const pick = (name) => choice(pairs, this[name], (n) => { this[name] = Number(n); this.apply(); }, { data: { which: name } });
     const modes = [["swipe", "Swipe"], ["blink", "Blink"], ["difference", "Difference"], ["before", "Before"], ["after", "After"]];
     fill(this.body,
       field("Before", this.pickBefore = pick("before")), field("After", this.pickAfter = pick("after")),
-      el("div", { class: "segments", role: "group", "aria-label": "How to compare" }, this.buttons = modes.map(([mode, words]) =>
-        el("button", { type: "button", data: { mode }, on: { click: () => this.use(mode) } }, words))),
+      el("div.segments", { role: "group", "aria-label": "How to compare" }, this.buttons = modes.map(([mode, words]) =>
+        button(words, () => this.use(mode), { data: { mode } }))),
       this.timeline(),
       this.overlays = tick("Show what was found (O)", true, (on) => this.bare(!on)),
       this.list);
@@ -55,12 +52,12 @@ class Compare {
     const times = this.versions.map((each) => +new Date(each.flown_at ?? each.made_at));
     const whole = Math.max(...times) - Math.min(...times) || 1;
     this.marks = this.versions.map((each, k) => {
-      const mark = el("button", { type: "button", class: "mark", title: `Version ${each.n}: ${each.flight}`, on: { click: () => this.jump(each.n) } },
-        el("span", { class: "dot", "aria-hidden": true }), el("span", {}, day(each.flown_at ?? each.made_at)), el("small", {}, each.flight));
-      mark.style.flexGrow = String(k ? Math.max(0.05, (times[k] - times[k - 1]) / whole) : 0);
+      const mark = button([el("span.dot", { "aria-hidden": true }), el("span", dayOf(each)), el("small", each.flight)],
+        () => this.jump(each.n), { class: "mark", title: `Version ${each.n}: ${each.flight}` });
+      mark.style.flexGrow = k ? Math.max(0.05, (times[k] - times[k - 1]) / whole) : 0;
       return mark;
     });
-    return el("div", { class: "timeline", role: "group", "aria-label": "Flights in order of time" }, this.marks);
+    return el("div.timeline", { role: "group", "aria-label": "Flights in order of time" }, this.marks);
   }
 
   jump(n) {
@@ -68,18 +65,18 @@ class Compare {
     this.after = n;
     this.before = this.versions[Math.max(0, at - 1)].n;
     if (at === 0) this.use("after");
-    this.pickBefore.value = String(this.before);
-    this.pickAfter.value = String(this.after);
+    this.pickBefore.value = this.before;
+    this.pickAfter.value = this.after;
     this.apply();
   }
 
   begin() {
     if (this.closed) return;
     const { stage, view, data } = this.screen;
-    this.cover = el("div", { class: "before-map", inert: true });
+    this.cover = el("div.before-map", { inert: true });
     this.edge = el("input", { type: "range", min: 0, max: 100, step: 0.5, ".value": "50", class: "swipe", "aria-label": "Swipe between before and after", on: { input: () => this.cut(Number(this.edge.value)) } });
-    this.handle = el("div", { class: "swipe-edge", "aria-hidden": true }, el("span", {}, "↔"));
-    this.names = el("div", { class: "swipe-names", "aria-hidden": true });
+    this.handle = el("div.swipe-edge", { "aria-hidden": true }, el("span", "↔"));
+    this.names = el("div.swipe-names", { "aria-hidden": true });
     stage.append(this.cover, this.names, this.handle, this.edge);
     this.handle.addEventListener("pointerdown", (event) => this.drag(event));
     this.other = new MapView(this.cover, data.detail, { bare: true });
@@ -93,7 +90,7 @@ class Compare {
     const follow = (moved) => {
       const box = this.screen.stage.getBoundingClientRect();
       this.cut(Math.max(0, Math.min(100, (moved.clientX - box.left) / box.width * 100)));
-      this.edge.value = String(this.split);
+      this.edge.value = this.split;
     };
     this.handle.addEventListener("pointermove", follow);
     this.handle.addEventListener("pointerup", () => this.handle.removeEventListener("pointermove", follow), { once: true });
@@ -109,7 +106,7 @@ class Compare {
   use(mode) {
     this.mode = mode;
     clearInterval(this.blinking);
-    for (const each of this.buttons) each.setAttribute("aria-pressed", String(each.dataset.mode === mode));
+    press(this.buttons, (each) => each.dataset.mode === mode);
     if (!this.cover) return;
     this.cover.classList.toggle("difference", mode === "difference");
     this.put();
@@ -130,8 +127,7 @@ class Compare {
   }
 
   named(before = this.mode === "before") {
-    const name = (n) => { const found = this.versions.find((each) => each.n === n); return day(found.flown_at ?? found.made_at); };
-    const one = (words, n) => el("span", {}, `${words}: ${name(n)}`, el("small", {}, ` (v${n})`));
+    const one = (words, n) => el("span", `${words}: ${dayOf(this.versions.find((each) => each.n === n))}`, el("small", ` (v${n})`));
     fill(this.names, ["swipe", "difference"].includes(this.mode) ? [one("Before", this.before), one("After", this.after)] : before ? one("Before", this.before) : one("After", this.after));
   }
 
@@ -147,7 +143,7 @@ class Compare {
       });
       this.named();
     }
-    this.marks.forEach((mark, k) => mark.setAttribute("aria-pressed", String([this.before, this.after].includes(this.versions[k].n))));
+    press(this.marks, (mark) => [this.before, this.after].includes(this.versions[this.marks.indexOf(mark)].n));
     this.refresh();
   }
 
@@ -172,14 +168,13 @@ class Compare {
   refresh() {
     if (!this.versions) return;
     const shown = this.screen.data.shown("changes");
-    fill(this.list, el("h3", {}, counted(shown.length, "change")), el("ol", { class: "changes" }, shown.map((each, k) =>
-      el("li", {}, el("button", { type: "button", class: "link", "aria-current": k === this.at ? "true" : null, on: { click: () => this.fly(k) } }, badge(each), ` ${titleOf(each)}`)))),
-    el("p", { class: "note" }, "Arrow keys fly from one to the next. Hatched ground could not be compared."),
+    fill(this.list, el("h3", counted(shown.length, "change")), el("ol.changes", shown.map((each, k) =>
+      el("li", button([badge(each), ` ${titleOf(each)}`], () => this.fly(k), { class: "link", "aria-current": k === this.at || null })))),
+    el("p.note", "Arrow keys fly from one to the next. Hatched ground could not be compared."),
     shown.length ? button("Review them", () => this.screen.open("findings"), { icon: "review" }) : null);
     if (this.other) this.put();
   }
 
-  /** To a change by its number in the list. */
   fly(k) {
     const shown = this.screen.data.shown("changes");
     if (!shown.length) return;

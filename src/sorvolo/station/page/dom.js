@@ -1,57 +1,55 @@
 // Elements made in code: whatever comes from outside becomes a text node or an attribute, never markup.
 
-const SVG = "http://www.w3.org/2000/svg";
-
-/** An element. `props`: attributes; `class`; `on` {event: listener}; `data` {name: value}; properties by `.name`. */
-export function el(tag, props = {}, ...children) {
+/** An element, as "p.note" names its tag and classes. `props`, if any: attributes; `on` {event: listener}; `data` {name: value}; properties by `.name`. */
+export function el(name, ...children) {
+  const [tag, ...classes] = name.split(".");
   const node = document.createElement(tag);
-  for (const [name, value] of Object.entries(props)) set(node, name, value);
+  node.classList.add(...classes);
+  if (children[0]?.constructor === Object) for (const [each, value] of Object.entries(children.shift())) set(node, each, value);
   node.append(...flat(children));
   return node;
 }
 
 function set(node, name, value) {
-  if (value === null || value === undefined || value === false) return;
+  if (value === null || value === undefined) return;
   if (name === "on") for (const [type, listener] of Object.entries(value)) node.addEventListener(type, listener);
   else if (name === "data") Object.assign(node.dataset, value);
   else if (name.startsWith(".")) node[name.slice(1)] = value;
-  else node.setAttribute(name, value === true ? "" : String(value));
+  else if (typeof value === "boolean" && !name.startsWith("aria-")) node.toggleAttribute(name, value);
+  else node.setAttribute(name, value);
 }
 
 function flat(children) {
   return children.flat(Infinity).filter((each) => each !== null && each !== undefined && each !== false);
 }
 
-/** Put new children in the place of all old ones. */
 export function fill(node, ...children) {
   node.replaceChildren(...flat(children));
   return node;
 }
 
-/** One of the drawings of icons.svg. */
-export function icon(name) {
-  const svg = document.createElementNS(SVG, "svg");
-  svg.setAttribute("class", "icon");
-  svg.setAttribute("aria-hidden", "true");
-  const use = document.createElementNS(SVG, "use");
-  use.setAttribute("href", `/page/icons.svg#${name}`);
-  svg.append(use);
-  return svg;
-}
-
-/** An SVG element with attributes. */
 export function svg(tag, attributes = {}, ...children) {
-  const node = document.createElementNS(SVG, tag);
-  for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, String(value));
+  const node = document.createElementNS("http://www.w3.org/2000/svg", tag);
+  for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
   node.append(...flat(children));
   return node;
 }
 
-/** A button with words, and an icon where one is named. */
-export function button(words, listener, props = {}) {
-  const { icon: drawn, ...rest } = props;
-  return el("button", { type: "button", on: { click: listener }, ...rest }, drawn ? icon(drawn) : null,
-    el("span", {}, words));
+export const icon = (name) => svg("svg", { class: "icon", "aria-hidden": true }, svg("use", { href: `/page/icons.svg#${name}` }));
+
+/** A button with what is on it, and an icon where one is named. */
+export function button(words, listener, { icon: drawn, ...props } = {}) {
+  return el("button", { type: "button", on: { click: listener }, ...props }, drawn ? [icon(drawn), words ? el("span", words) : null] : words);
+}
+
+export const quiet = (words, listener, props) => button(words, listener, { class: "quiet", ...props });
+
+/** A quiet button that takes something away. */
+export const cross = (words, listener) => button("×", listener, { class: "quiet close", "aria-label": words });
+
+/** Let those of some buttons look pressed that are on. */
+export function press(buttons, isOn) {
+  for (const each of buttons) each.setAttribute("aria-pressed", isOn(each));
 }
 
 let labels = 0;
@@ -60,8 +58,8 @@ let labels = 0;
 export function field(words, control, note = "") {
   labels += 1;
   control.id ||= `field-${labels}`;
-  return el("div", { class: "field" }, el("label", { for: control.id }, words), control,
-    note ? el("p", { class: "note" }, note) : null);
+  return el("div.field", el("label", { for: control.id }, words), control,
+    note ? el("p.note", note) : null);
 }
 
 /** A choice among [value, words] pairs. */
@@ -70,9 +68,8 @@ export function choice(pairs, value, listener, props = {}) {
     pairs.map(([each, words]) => el("option", { value: each, ".selected": String(each) === String(value) }, words)));
 }
 
-/** A checkbox with its words. */
 export function tick(words, checked, listener, props = {}) {
-  return el("label", { class: "tick" },
+  return el("label.tick",
     el("input", { type: "checkbox", ".checked": checked, ...props, on: { change: (event) => listener(event.target.checked) } }),
     words);
 }
@@ -81,7 +78,7 @@ export function tick(words, checked, listener, props = {}) {
 export function dialog(title, ...children) {
   const heading = el("h2", { id: "dialog-title" }, title);
   const box = el("dialog", { "aria-labelledby": "dialog-title" },
-    el("div", { class: "dialog-head" }, heading, button("Close", () => box.close(), { class: "quiet", icon: "close" })),
+    el("div.dialog-head", heading, quiet("Close", () => box.close(), { icon: "close" })),
     children);
   box.addEventListener("close", () => box.remove());
   document.body.append(box);
@@ -95,8 +92,8 @@ new ResizeObserver(() => document.body.style.setProperty("--said", `${messages.o
 /** A message that goes away by itself, or stays until closed where a person must act. */
 export function message(words, { kind = "note", todo = "", act = null } = {}) {
   const box = el("div", { class: `message ${kind}` },
-    el("div", {}, el("b", {}, words), todo ? el("p", {}, todo) : null),
-    act, el("button", { type: "button", class: "quiet", "aria-label": "Close message", on: { click: () => box.remove() } }, icon("close")));
+    el("div", el("b", words), todo ? el("p", todo) : null),
+    act, cross("Close message", () => box.remove()));
   act?.addEventListener("click", () => box.remove());
   messages.append(box);
   while (messages.children.length > 4) (messages.querySelector(".message:not(.person)") ?? messages.firstElementChild).remove(); // a person found stays
@@ -104,7 +101,6 @@ export function message(words, { kind = "note", todo = "", act = null } = {}) {
   return box;
 }
 
-/** A problem in words, with what to do. */
 export function report(problem) {
   if (problem?.name === "AbortError") return;
   message(problem.title || "This did not work", { kind: `error${problem.status === 0 ? " away" : ""}`, todo: problem.detail || String(problem.message || problem) });

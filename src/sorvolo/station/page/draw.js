@@ -1,9 +1,9 @@
 // Drawing on the map: distances, areas and height profiles; areas of interest, alert zones and waypoints, shared by all.
 
 import { get, Problem, put, siteUrl } from "./api.js";
-import { button, el, fill, message, svg } from "./dom.js";
+import { button, cross, el, fill, message, press, quiet, svg } from "./dom.js";
 import { isWritten } from "./feature_card.js";
-import { area_m2, boundsOf, length_m } from "./places.js";
+import { area_m2, boundsOf, featureOf, length_m } from "./places.js";
 import { waypointsFor } from "./waypoints.js";
 import * as words from "./words.js";
 
@@ -15,51 +15,44 @@ const TOOLS = {
   waypoint: ["Waypoint", "point", "Tap the place to fly to."], found: ["Person seen", "point", "Tap where somebody is: a finding of the site."],
 };
 
-/** Load a site's shared drawings. */
 export async function loadDrawings(screen) {
   screen.zones ??= [];
   if (screen.data.detail.is_new) return;
   try {
-    const kept = await get(siteUrl(screen.data.id, "drawings"));
-    Object.assign(screen, { zones: kept.features, zonesRevision: kept.revision });
+    show(screen, await get(siteUrl(screen.data.id, "drawings")));
   } catch (problem) {
     if (!(problem instanceof Problem)) throw problem;
   }
+}
+
+function show(screen, { features, revision }) {
+  Object.assign(screen, { zones: features, zonesRevision: revision });
   screen.view?.ready.then(() => screen.view.put("drawings", screen.zones));
 }
 
 async function saveDrawings(screen, change) {
-  const wanted = change(screen.zones ?? []);
+  const save = async () => show(screen, await put(siteUrl(screen.data.id, "drawings"), { revision: screen.zonesRevision ?? 0, features: change(screen.zones ?? []) }));
   try {
-    const kept = await put(siteUrl(screen.data.id, "drawings"), { revision: screen.zonesRevision ?? 0, features: wanted });
-    Object.assign(screen, { zones: kept.features, zonesRevision: kept.revision });
+    await save();
   } catch (problem) {
     if (problem.status !== 409) throw problem;
     await loadDrawings(screen); // somebody drew meanwhile: put ours into theirs
-    const kept = await put(siteUrl(screen.data.id, "drawings"), { revision: screen.zonesRevision ?? 0, features: change(screen.zones) });
-    Object.assign(screen, { zones: kept.features, zonesRevision: kept.revision });
+    await save();
   }
-  screen.view?.put("drawings", screen.zones);
 }
 
-/** The panel's life. */
-export function drawPanel(screen, body) {
-  return new Draw(screen, body);
-}
-
-class Draw {
+export class Draw {
   constructor(screen, body) {
-    Object.assign(this, { screen, tool: null, points: [], cursor: null });
+    Object.assign(this, { screen, tool: null, points: [], cursor: null, over: new AbortController() });
     this.live = el("div", { role: "status" });
-    this.list = el("div", {});
-    this.may = screen.station.status.role !== "view";
-    this.buttons = Object.entries(TOOLS).map(([tool, [name]]) => el("button", { type: "button", data: { tool }, "aria-pressed": "false",
-      hidden: !this.may && ["interest", "alert", "waypoint", "found"].includes(tool), on: { click: () => this.take(tool) } }, name));
-    fill(body, el("div", { class: "tools", role: "group", "aria-label": "Tools" }, this.buttons), this.live, this.list,
-      this.may ? el("details", {}, el("summary", {}, "Re-fly gaps"), el("p", { class: "note" }, "A route over ground that a measured search saw badly; without one, over ground without pictures."),
+    this.list = el("div");
+    this.may = screen.station.reviews;
+    this.buttons = Object.entries(TOOLS).map(([tool, [name]]) => button(name, () => this.take(tool), { data: { tool }, "aria-pressed": false,
+      hidden: !this.may && ["interest", "alert", "waypoint", "found"].includes(tool) }));
+    fill(body, el("div.tools", { role: "group", "aria-label": "Tools" }, this.buttons), this.live, this.list,
+      this.may ? el("details", el("summary", "Re-fly gaps"), el("p.note", "A route over ground that a measured search saw badly; without one, over ground without pictures."),
         button("Plan a route", () => this.plan())) : null);
-    this.hearer = ({ detail }) => { if (detail.site === screen.data.id) loadDrawings(screen).then(() => { if (!isWritten(this.list)) this.showList(); }); };
-    screen.station.events.addEventListener("drawings.changed", this.hearer);
+    screen.on("drawings.changed", () => loadDrawings(screen).then(() => { if (!isWritten(this.list)) this.showList(); }), this.over);
     loadDrawings(screen).then(() => this.showList());
   }
 
@@ -68,11 +61,10 @@ class Draw {
     this.points = [];
     this.pointer = null;
     this.cursor = this.tool ? "crosshair" : null;
-    for (const each of this.buttons) each.setAttribute("aria-pressed", String(each.dataset.tool === this.tool));
-    fill(this.live, this.tool ? el("p", { class: "hint" }, TOOLS[this.tool][2]) : null);
+    press(this.buttons, (each) => each.dataset.tool === this.tool);
+    fill(this.live, this.tool ? el("p.hint", TOOLS[this.tool][2]) : null);
     this.sketch();
-    if (this.tool) this.screen.view?.map.doubleClickZoom.disable();
-    else this.screen.view?.map.doubleClickZoom.enable();
+    this.screen.view?.map.doubleClickZoom[this.tool ? "disable" : "enable"]();
   }
 
   click(place) {
@@ -98,20 +90,29 @@ class Draw {
   sketch() {
     const shape = this.tool && TOOLS[this.tool][1];
     const points = this.pointer ? [...this.points, this.pointer] : this.points;
-    const features = [];
-    if (points.length > 1) features.push({ type: "Feature", properties: { purpose: this.tool }, geometry: shape === "ring" && points.length > 2 ? { type: "Polygon", coordinates: [[...points, points[0]]] } : { type: "LineString", coordinates: points } });
-    for (const each of this.points) features.push({ type: "Feature", properties: { purpose: this.tool }, geometry: { type: "Point", coordinates: each } });
-    this.screen.view?.put("sketch", features);
-    if (points.length > 1 || this.points.length) this.showLive(points, shape);
+    const features = points.length > 1 ? [this.drawn(points.length > 2 ? shape : "line", points)] : [];
+    this.screen.view?.put("sketch", [...features, ...this.points.map((each) => this.drawn("point", [each]))]);
+    if (points.length) this.showLive(points, shape);
+  }
+
+  drawn(shape, points) {
+    const { type, coordinates } = geometryOf(shape, points);
+    return featureOf(type, coordinates, { purpose: this.tool });
+  }
+
+  back() {
+    this.points.pop();
+    this.pointer = null;
+    this.sketch();
   }
 
   showLive(points, shape) {
     const closed = shape === "ring";
     fill(this.live,
-      el("p", { class: "size" }, closed ? words.area(area_m2(points)) : words.length(length_m(points)),
-        closed ? el("small", {}, ` perimeter ${words.length(length_m([...points, points[0]]))}`) : null),
-      el("div", { class: "row wrap" }, button("Done", () => this.finish(), { class: "main" }),
-        button("Remove last point", () => { this.points.pop(); this.pointer = null; this.sketch(); }, { class: "quiet" }), button("Cancel", () => this.take(null), { class: "quiet" })));
+      el("p.size", closed ? words.area(area_m2(points)) : words.length(length_m(points)),
+        closed ? el("small", ` perimeter ${words.length(length_m([...points, points[0]]))}`) : null),
+      el("div.row.wrap", button("Done", () => this.finish(), { class: "main" }),
+        quiet("Remove last point", () => this.back()), quiet("Cancel", () => this.take(null))));
   }
 
   async finish() {
@@ -126,7 +127,7 @@ class Draw {
     else if (this.may) await this.keep(tool, shape, points);
     else {
       this.take(null);
-      fill(this.live, el("p", { class: "size" }, sizeOf(geometryOf(shape, points))));
+      fill(this.live, el("p.size", sizeOf(geometryOf(shape, points))));
     }
   }
 
@@ -140,30 +141,30 @@ class Draw {
     await saveDrawings(this.screen, (list) => [...list, feature]);
     this.showList();
     if (purpose === "found") await this.screen.data.load(["objects"]);
-    if (purpose === "measure") fill(this.live, el("p", { class: "size" }, name));
+    if (purpose === "measure") fill(this.live, el("p.size", name));
   }
 
   async profile(points) {
     this.take(null);
-    this.screen.view?.put("sketch", [{ type: "Feature", properties: { purpose: "profile" }, geometry: { type: "LineString", coordinates: points } }]);
+    this.screen.view?.put("sketch", [featureOf("LineString", points, { purpose: "profile" })]);
     const line = points.map((each) => each.map((value) => value.toFixed(8)).join(",")).join(";");
     try {
       if (!this.screen.data.detail.is_new) await this.screen.data.loadDetail(); // heights made in a terminal are announced by nobody
       if (!this.screen.data.detail.has_heights) {
-        fill(this.live, el("p", { class: "hint" }, "This site has no heights yet. Whoever runs the station can make them with “sorvolo heights”; then try again."));
+        fill(this.live, el("p.hint", "This site has no heights yet. Whoever runs the station can make them with “sorvolo heights”; then try again."));
         return;
       }
       const found = await get(`${siteUrl(this.screen.data.id, "profile")}?line=${line}`);
-      fill(this.live, profilePlot(found), button("Clear", () => this.take(null), { class: "quiet" }));
+      fill(this.live, profilePlot(found), quiet("Clear", () => this.take(null)));
     } catch (problem) {
-      fill(this.live, el("p", { class: "hint" }, problem.detail));
+      fill(this.live, el("p.hint", problem.detail));
     }
   }
 
   async plan() {
     const made = waypointsFor(this.screen.data);
     if (!made.length) {
-      fill(this.live, el("p", { class: "hint" }, "No gaps to re-fly: no search, flight or comparison of this site left out ground that another flight would show."));
+      fill(this.live, el("p.hint", "No gaps to re-fly: no search, flight or comparison of this site left out ground that another flight would show."));
       return;
     }
     await saveDrawings(this.screen, (list) => [...list.filter((each) => !each.properties.planned), ...made]);
@@ -174,15 +175,15 @@ class Draw {
     const { data } = this.screen;
     const zones = this.screen.zones ?? [];
     const route = zones.filter((each) => each.properties.planned);
-    fill(this.list, zones.length ? el("h3", {}, "Drawn here") : null, el("ul", { class: "plain drawn" }, zones.filter((each) => !each.properties.planned).map((each) => el("li", {},
+    fill(this.list, zones.length ? el("h3", "Drawn here") : null, el("ul.plain.drawn", zones.filter((each) => !each.properties.planned).map((each) => el("li",
       this.may ? el("input", { type: "text", ".value": each.properties.name ?? "", "aria-label": "Name", maxlength: 80, on: { change: (event) => this.rename(each, event.target.value) } }) : each.properties.name,
-      el("span", { class: "soft" }, sizeOf(each.geometry), each.properties.by ? ` · ${each.properties.by}` : ""),
-      button("Show", () => this.screen.view?.go(each.geometry.type === "Point" ? each.geometry.coordinates : boundsOf([each.geometry])), { class: "quiet" }),
-      each.properties.purpose === "interest" ? el("button", { type: "button", class: "quiet", "aria-pressed": String(data.filters.area === each.geometry.coordinates[0]), on: { click: () => this.narrow(each) } }, "Filter") : null,
-      this.may ? el("button", { type: "button", class: "quiet", "aria-label": `Delete ${each.properties.name ?? ""}`, on: { click: () => this.remove([each.id]) } }, "×") : null)),
-    route.length ? el("li", { class: "route" }, el("b", {}, "Re-fly route"), el("span", { class: "soft" }, `${words.counted(route.length, "point")}, ${words.length(length_m(route.map((each) => each.geometry.coordinates)))}`),
-      button("Show", () => this.screen.view?.go(boundsOf(route.map((each) => each.geometry))), { class: "quiet" }),
-      this.may ? button("Delete", () => this.remove(route.map((each) => each.id)), { class: "quiet" }) : null) : null));
+      el("span.soft", sizeOf(each.geometry), each.properties.by ? ` · ${each.properties.by}` : ""),
+      quiet("Show", () => this.screen.view?.go(each.geometry.type === "Point" ? each.geometry.coordinates : boundsOf([each.geometry]))),
+      each.properties.purpose === "interest" ? quiet("Filter", () => this.narrow(each), { "aria-pressed": data.filters.area === each.geometry.coordinates[0] }) : null,
+      this.may ? cross(`Delete ${each.properties.name ?? ""}`, () => this.remove([each.id])) : null)),
+    route.length ? el("li.route", el("b", "Re-fly route"), el("span.soft", `${words.counted(route.length, "point")}, ${words.length(length_m(route.map((each) => each.geometry.coordinates)))}`),
+      quiet("Show", () => this.screen.view?.go(boundsOf(route.map((each) => each.geometry)))),
+      this.may ? quiet("Delete", () => this.remove(route.map((each) => each.id))) : null) : null));
   }
 
   narrow(zone) {
@@ -205,13 +206,14 @@ class Draw {
     if (!this.tool) return false;
     if (event.key === "Enter") this.finish();
     else if (event.key === "Escape") this.take(null);
-    else if (event.key === "Backspace") { this.points.pop(); this.pointer = null; this.sketch(); } else return false;
+    else if (event.key === "Backspace") this.back();
+    else return false;
     return true;
   }
 
   close() {
     this.take(null);
-    this.screen.station.events.removeEventListener("drawings.changed", this.hearer);
+    this.over.abort();
   }
 }
 
@@ -226,7 +228,7 @@ function sizeOf({ type, coordinates }) {
 /** Heights along a line as a drawing with its axis. `found`: distance_m, height_m (null: not known), and sigma_m. */
 function profilePlot({ distance_m: along, height_m: heights, sigma_m: sigma }) {
   const known = heights.filter((each) => each !== null);
-  if (!known.length) return el("p", { class: "hint" }, "No height is known along this line.");
+  if (!known.length) return el("p.hint", "No height is known along this line.");
   const [low, high] = [Math.min(...known), Math.max(...known)];
   const [wide, tall] = [300, 130];
   const x = (m) => 4 + (m / along.at(-1)) * (wide - 8);
@@ -234,7 +236,7 @@ function profilePlot({ distance_m: along, height_m: heights, sigma_m: sigma }) {
   let path = "";
   heights.forEach((each, k) => { if (each !== null) path += `${path && heights[k - 1] !== null ? "L" : "M"}${x(along[k]).toFixed(1)} ${y(each).toFixed(1)}`; });
   const label = (text, at, top, anchor) => svg("text", { x: at, y: top, "text-anchor": anchor, class: "label" }, text);
-  return el("figure", { class: "profile" }, svg("svg", { viewBox: `0 0 ${wide} ${tall}`, role: "img", "aria-label": `Heights from ${words.length(low)} to ${words.length(high)} over ${words.length(along.at(-1))}` },
+  return el("figure.profile", svg("svg", { viewBox: `0 0 ${wide} ${tall}`, role: "img", "aria-label": `Heights from ${words.length(low)} to ${words.length(high)} over ${words.length(along.at(-1))}` },
     svg("path", { d: path, class: "line" }), label(words.length(high), 4, 12, "start"), label(words.length(low), 4, tall - 24, "start"), label(words.length(along.at(-1)), wide - 4, tall - 6, "end"), label("0", 4, tall - 6, "start")),
-  el("figcaption", {}, `Difference ${words.length(high - low)}${sigma ? `, accuracy of a height ${words.length(sigma)} (1 sigma)` : ""}`));
+  el("figcaption", `Difference ${words.length(high - low)}${sigma ? `, accuracy of a height ${words.length(sigma)} (1 sigma)` : ""}`));
 }

@@ -1,5 +1,7 @@
 // Live events: one WebSocket that comes back by itself and asks from the last number that it saw.
 
+import { socketTo } from "./api.js";
+
 const QUIET_MS = 40000; // the station sends a sign of life every 15 s
 const LONGEST_WAIT_MS = 15000;
 
@@ -21,10 +23,7 @@ export class Events extends EventTarget {
 
   connect() {
     clearTimeout(this.timer);
-    const url = new URL(`/api/events?after=${this.seq}`, location.href);
-    url.protocol = url.protocol.replace("http", "ws");
-    const socket = new WebSocket(url);
-    this.socket = socket;
+    const socket = this.socket = socketTo(`/api/events?after=${this.seq}`);
     this.begun_at = this.heard_at = Date.now();
     socket.addEventListener("open", () => this.set("live"));
     socket.addEventListener("message", (message) => this.hear(JSON.parse(message.data)));
@@ -72,11 +71,7 @@ export class Events extends EventTarget {
       if (message.seq < this.seq) this.restart(message.seq); // another station took the place of the first
       return;
     }
-    if (message.type === "events.lost") {
-      this.seq = message.seq ?? message.data?.to ?? this.seq;
-      this.dispatchEvent(new Event("reload"));
-      return;
-    }
+    if (message.type === "events.lost") return this.restart(message.seq ?? message.data?.to ?? this.seq);
     if (message.seq <= this.seq) return;
     this.seq = message.seq;
     for (const type of [message.type, "*"]) this.dispatchEvent(new CustomEvent(type, { detail: message }));

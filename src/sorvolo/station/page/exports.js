@@ -1,8 +1,8 @@
-// Share: a link, what is shown as GeoJSON, CSV, KMZ; the station's own files (map, GeoPackage, reports); print.
+// Share: a link, what is shown as GeoJSON, CSV, KMZ, for CalTopo and TAK; the station's own files (map, GeoPackage, reports); print.
 
-import { get, siteUrl } from "./api.js";
+import { get, roomUrl, siteUrl } from "./api.js";
 import { button, el, fill, report } from "./dom.js";
-import { titleOf } from "./feature_card.js";
+import { lookOf, titleOf } from "./feature_card.js";
 import { middleOf } from "./places.js";
 import { copy } from "./share.js";
 import { siteName } from "./sites.js";
@@ -10,44 +10,42 @@ import { bytes, counted, length, place, time } from "./words.js";
 import { zip } from "./zip.js";
 
 const COLUMNS = ["id", "what", "kind", "class", "score", "latitude", "longitude", "coordinates", "sigma_m", "length_m", "area_m2", "first_seen", "last_seen", "flight", "review", "reviewer", "note"];
+const DAY_MS = 86400000;
+const FORMATS = [["GeoJSON", ".geojson", geojson], ["CSV", ".csv", csv], ["KMZ", ".kmz", kmz, true], ["CalTopo", "-caltopo.json", caltopo, true], ["TAK package", "-tak.zip", tak, true]];
 
-/** The panel's life. */
 export function exportPanel(screen, body) {
-  const shown = el("div", {});
-  const files = el("div", {});
-  const copied = el("span", { class: "soft", role: "status" });
+  const shown = el("div");
+  const files = el("div");
+  const copied = el("span.soft", { role: "status" });
   const link = async () => {
-    await copy(`${location.origin}/#/site/${encodeURIComponent(screen.data.id)}/${screen.room}`);
+    await copy(`${location.origin}/${roomUrl(screen.data.id, screen.room)}`);
     fill(copied, "Link copied");
   };
-  fill(body, el("div", { class: "row wrap" }, button("Copy link", link, { class: "main" }), copied),
-    el("p", { class: "note" }, "Who opens it needs a token of their own where the station has tokens."), el("h3", {}, "What is shown"), shown,
-    el("div", { class: "row wrap" }, button("Print or PDF", () => print(screen))), el("details", { open: true }, el("summary", {}, "All files"), files));
+  fill(body, el("div.row.wrap", button("Copy link", link, { class: "main" }), copied),
+    el("p.note", "Who opens it needs a token of their own where the station has tokens."), el("h3", "What is shown"), shown,
+    el("div.row.wrap", button("Print or PDF", () => print(screen))), el("details", { open: true }, el("summary", "All files"), files));
 
   function refresh() {
     const features = shownFeatures(screen);
     const local = screen.data.detail.is_local;
-    fill(shown, el("p", { class: "soft" }, `${counted(features.length, "feature")}: the filters and the area of interest apply.`),
-      el("div", { class: "row wrap" },
-        button("GeoJSON", () => save(geojson(features), "geojson", "application/geo+json")),
-        button("CSV", () => save(csv(features), "csv", "text/csv")),
-        local ? null : button("KMZ", () => save(zip({ "doc.kml": new TextEncoder().encode(kml(screen.data.detail.name, features)) }, "application/vnd.google-earth.kmz"), "kmz"))));
+    fill(shown, el("p.soft", `${counted(features.length, "feature")}: the filters and the area of interest apply.`),
+      el("div.row.wrap", FORMATS.filter(([, , , isOnEarth]) => !(isOnEarth && local)).map(([words, ending, made]) =>
+        button(words, () => save(made(features, screen.data.detail.name, screen.data.id), ending)))));
   }
 
-  function save(content, ending, type) {
-    const name = screen.data.detail.name.replaceAll(/[^\w.-]+/g, "_");
-    download(content instanceof Blob ? content : new Blob([content], { type }), `${name}.${ending}`);
+  function save(content, ending) {
+    download(new Blob([content]), `${screen.data.detail.name.replaceAll(/[^\w.-]+/g, "_")}${ending}`);
   }
 
   async function load() {
-    fill(files, el("p", { class: "soft" }, "Looking…"));
+    fill(files, el("p.soft", "Looking…"));
     try {
       const list = await get(siteUrl(screen.data.id, "exports"));
-      fill(files, list.length ? el("ul", { class: "plain files" }, list.map((each) => el("li", {},
-        el("a", { href: each.url, download: each.name ?? "" }, each.title ?? each.name), el("span", { class: "soft" }, each.bytes ? ` ${bytes(each.bytes)}` : "", each.note ? ` · ${each.note}` : ""))))
-        : el("p", { class: "hint" }, "No files yet: they come with the first map."));
+      fill(files, list.length ? el("ul.plain.files", list.map((each) => el("li",
+        el("a", { href: each.url, download: each.name ?? "" }, each.title ?? each.name), el("span.soft", each.bytes ? ` ${bytes(each.bytes)}` : "", each.note ? ` · ${each.note}` : ""))))
+        : el("p.hint", "No files yet: they come with the first map."));
     } catch (problem) {
-      if (problem.status === 404) fill(files, el("p", { class: "hint" }, "This station offers no files; they lie in the site's folder."));
+      if (problem.status === 404) fill(files, el("p.hint", "This station offers no files; they lie in the site's folder."));
       else report(problem);
     }
   }
@@ -78,59 +76,89 @@ function extentWords(screen) {
   return `the picture is ${length(width)} wide, ${up}, its middle at ${place(middle, { local: screen.data.detail.is_local })}`;
 }
 
-/** Features as GeoJSON text, one a line. */
-export function geojson(features) {
-  const lines = features.map(({ type, id, geometry, properties: { crops, ...properties } }) => JSON.stringify({ type, id, geometry, properties }));
-  return `{"type": "FeatureCollection", "features": [\n${lines.join(",\n")}\n]}\n`;
+const listed = (features) => `{"type": "FeatureCollection", "features": [\n${features.map((each) => JSON.stringify(each)).join(",\n")}\n]}\n`;
+const nameOf = (feature) => feature.properties.name ?? titleOf(feature);
+const saidOf = ({ id, properties: { review, note } }) => [id, review, note].filter(Boolean).join(" · ");
+const colourOf = (feature) => (feature.properties.purpose ? "#ffe066" : lookOf(feature)[1]);
+
+function geojson(features) {
+  return listed(features.map(({ type, id, geometry, properties: { crops, ...properties } }) => ({ type, id, geometry, properties })));
+}
+
+/** GeoJSON as CalTopo and SARTopo take it: markers and shapes with their titles and colours. */
+function caltopo(features) {
+  return listed(features.map((each) => {
+    const colour = colourOf(each);
+    const look = each.geometry.type === "Point" ? { class: "Marker", "marker-symbol": "point", "marker-color": colour } : { class: "Shape", stroke: colour, "stroke-width": 2, fill: colour, "fill-opacity": 0.1 };
+    return { type: "Feature", id: each.id, geometry: each.geometry, properties: { title: nameOf(each), description: saidOf(each), ...look } };
+  }));
 }
 
 /** Features as CSV (RFC 4180); a cell that a spreadsheet would run as a formula gets an apostrophe. */
-export function csv(features) {
+function csv(features) {
   const cell = (value) => {
-    let text = value === null || value === undefined ? "" : String(value);
-    if (typeof value === "string" && /^[=+\-@\t\r]/.test(text)) text = `'${text}`;
+    const text = typeof value === "string" && /^[=+\-@\t\r]/.test(value) ? `'${value}` : String(value ?? "");
     return /[",\r\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
   };
   const rows = features.map((each) => {
     const [lon, lat] = middleOf(each.geometry);
-    const values = { ...each.properties, id: each.id, what: each.properties.name ?? titleOf(each), latitude: lat.toFixed(8), longitude: lon.toFixed(8), coordinates: place([lon, lat]) };
+    const values = { ...each.properties, id: each.id, what: nameOf(each), latitude: lat.toFixed(8), longitude: lon.toFixed(8), coordinates: place([lon, lat]) };
     return COLUMNS.map((name) => cell(values[name])).join(",");
   });
   return `${[COLUMNS.join(","), ...rows].join("\r\n")}\r\n`;
 }
 
-/** Features as KML. */
-export function kml(name, features) {
-  const doc = document.implementation.createDocument("http://www.opengis.net/kml/2.2", "kml");
-  const add = (parent, tag, text = null) => {
-    const node = doc.createElementNS("http://www.opengis.net/kml/2.2", tag);
-    if (text !== null) node.textContent = text;
-    parent.append(node);
-    return node;
-  };
-  const folder = add(doc.documentElement, "Document");
-  add(folder, "name", name);
-  const coordinates = (list) => list.map((each) => each.slice(0, 2).join(",")).join(" ");
-  for (const feature of features) {
-    const mark = add(folder, "Placemark");
-    add(mark, "name", feature.properties.name ?? titleOf(feature));
-    add(mark, "description", [feature.id, feature.properties.review, feature.properties.note].filter(Boolean).join(" · "));
-    const { type, coordinates: places } = feature.geometry;
-    if (type === "Point") add(add(mark, "Point"), "coordinates", places.slice(0, 2).join(","));
-    else if (type === "Polygon") add(add(add(add(mark, "Polygon"), "outerBoundaryIs"), "LinearRing"), "coordinates", coordinates(places[0]));
-    else if (type === "LineString") add(add(mark, "LineString"), "coordinates", coordinates(places));
-    else add(add(mark, "Point"), "coordinates", middleOf(feature.geometry).join(","));
-  }
-  return `<?xml version="1.0" encoding="UTF-8"?>\n${new XMLSerializer().serializeToString(doc)}`;
+class Xml extends String {}
+
+/** An element of XML: its name, its attributes if any, its children: elements, or one text. */
+function xml(name, ...children) {
+  const safe = (text) => String(text).replace(/[^\t\n\r -\ufffd]/g, "").replace(/[&<>"]/g, (each) => `&#${each.charCodeAt(0)};`);
+  const attributes = children[0].constructor === Object ? children.shift() : {};
+  const inner = children.flat().map((each) => (each instanceof Xml ? each : safe(each))).join("");
+  return new Xml(`<${name}${Object.entries(attributes).map(([key, value]) => ` ${key}="${safe(value)}"`).join("")}>${inner}</${name}>`);
+}
+
+const file = (root) => new TextEncoder().encode(`<?xml version="1.0" encoding="UTF-8"?>\n${root}`);
+
+/** Features as KMZ, each in its colour. */
+function kmz(features, name) {
+  const along = (places) => xml("coordinates", places.map((each) => each.slice(0, 2).join(",")).join(" "));
+  const polygon = ([outer]) => xml("Polygon", xml("outerBoundaryIs", xml("LinearRing", along(outer))));
+  const shapes = { Point: (place) => xml("Point", along([place])), LineString: (line) => xml("LineString", along(line)), Polygon: polygon,
+    MultiPolygon: (several) => xml("MultiGeometry", several.map(polygon)) };
+  const marks = features.map((each) => {
+    const [, red, green, blue] = /#(..)(..)(..)/.exec(colourOf(each));
+    const look = ["IconStyle", "LineStyle", "PolyStyle"].map((tag, k) => xml(tag, xml("color", ["ff", "ff", "40"][k] + blue + green + red)));
+    return xml("Placemark", xml("name", nameOf(each)), xml("description", saidOf(each)), xml("Style", look), shapes[each.geometry.type](each.geometry.coordinates));
+  });
+  return zip({ "doc.kml": file(xml("kml", { xmlns: "http://www.opengis.net/kml/2.2" }, xml("Document", xml("name", name), marks))) });
+}
+
+/** Features as a data package of ATAK, WinTAK and iTAK: a Cursor on Target event each. */
+function tak(features, name, site) {
+  const at = new Date().toISOString();
+  const stale = new Date(Date.now() + DAY_MS).toISOString();
+  const events = features.map((each) => {
+    const [lon, lat] = middleOf(each.geometry);
+    const uid = `sorvolo.${site}.${each.id}`;
+    const type = { person: "a-u-G", car: "a-u-G-E-V-C" }[each.properties.class] ?? "b-m-p-s-m";
+    return [uid, xml("event", { version: "2.0", uid, type, how: "m-g", time: at, start: at, stale },
+      xml("point", { lat, lon, hae: 9999999, ce: each.properties.sigma_m ?? 9999999, le: 9999999 }),
+      xml("detail", xml("contact", { callsign: nameOf(each) }), xml("remarks", saidOf(each))))];
+  });
+  const setting = (key, value) => xml("Parameter", { name: key, value });
+  const manifest = xml("MissionPackageManifest", { version: 2 }, xml("Configuration", setting("uid", `sorvolo.${site}.${at}`), setting("name", name)),
+    xml("Contents", events.map(([uid], k) => xml("Content", { ignore: false, zipEntry: `${k}/event.cot` }, setting("uid", uid)))));
+  return zip({ "MANIFEST/manifest.xml": file(manifest), ...Object.fromEntries(events.map(([, event], k) => [`${k}/event.cot`, file(event)])) });
 }
 
 async function print(screen) {
   const features = shownFeatures(screen);
   const picture = screen.view ? el("img", { alt: "The map", src: await screen.view.picture() }) : null;
-  const sheet = el("section", { class: "sheet" }, el("h1", {}, siteName(screen.data.detail)), el("p", {}, `${time(new Date().toISOString())}${screen.view ? ` · ${extentWords(screen)}` : ""}`), picture,
-    el("table", {}, el("thead", {}, el("tr", {}, ["Id", "What", "Place", "Score", "Verdict", "Note"].map((each) => el("th", {}, each)))),
-      el("tbody", {}, features.map((each) => el("tr", {}, [each.id, each.properties.name ?? titleOf(each), place(middleOf(each.geometry), { local: screen.data.detail.is_local }), each.properties.score ? Math.round(each.properties.score * 100) : "",
-        each.properties.review ?? "", each.properties.note ?? ""].map((value) => el("td", {}, String(value))))))));
+  const sheet = el("section.sheet", el("h1", siteName(screen.data.detail)), el("p", `${time(new Date().toISOString())}${screen.view ? ` · ${extentWords(screen)}` : ""}`), picture,
+    el("table", el("thead", el("tr", ["Id", "What", "Place", "Score", "Verdict", "Note"].map((each) => el("th", each)))),
+      el("tbody", features.map((each) => el("tr", [each.id, each.properties.name ?? titleOf(each), place(middleOf(each.geometry), { local: screen.data.detail.is_local }), each.properties.score ? Math.round(each.properties.score * 100) : "",
+        each.properties.review ?? "", each.properties.note ?? ""].map((value) => el("td", String(value))))))));
   document.body.append(sheet);
   const done = () => sheet.remove();
   addEventListener("afterprint", done, { once: true });

@@ -1,7 +1,7 @@
 // The card of the object or change that is chosen: pictures, facts, verdict.
 
 import { choices } from "./choices.js";
-import { button, el, fill } from "./dom.js";
+import { button, cross, el, fill, quiet } from "./dom.js";
 import { CLASSES, KINDS, OTHER_CLASS } from "./map_style.js";
 import { middleOf } from "./places.js";
 import { handover } from "./share.js";
@@ -13,7 +13,7 @@ const SHOWN_IN = new Set(["live", "layers", "compare", "place"]); // elsewhere t
 
 /** The card over the map; `show(feature)`, null hides it. */
 export function featureCard(screen) {
-  const box = el("aside", { class: "card-over", hidden: true, "aria-label": "What is chosen" });
+  const box = el("aside.card-over", { hidden: true, "aria-label": "What is chosen" });
   screen.stage.append(box);
   let told = "";
   return {
@@ -40,25 +40,27 @@ export const isWritten = (node) => node.contains(document.activeElement) && docu
 function cardOf(screen, feature, box) {
   const place = middleOf(feature.geometry);
   return [
-    el("div", { class: "card-head" }, badge(feature), el("h3", {}, titleOf(feature)),
+    el("div.card-head", badge(feature), el("h3", titleOf(feature)),
       button("More", () => { box.classList.toggle("whole"); screen.view?.reveal(place); }, { class: "quiet only-phone" }),
-      el("button", { type: "button", class: "quiet close", "aria-label": "Close", on: { click: () => screen.data.choose(null) } }, "×")),
+      cross("Close", () => screen.data.choose(null))),
     screen.data.detail.is_local ? null : handover(screen.data.id, titleOf(feature), place, feature.properties.sigma_m),
     pictures(feature),
     verdictForm(screen, feature),
     facts(feature, screen.data.detail.is_local),
-    el("div", { class: "row wrap" },
-      button("Memory of this place", () => { screen.open("place"); screen.opened.look(place); }, { class: "quiet", icon: "place" }),
-      button("Zoom in", () => screen.goTo(feature), { class: "quiet", icon: "target" })),
+    el("div.row.wrap",
+      quiet("Memory of this place", () => { screen.open("place"); screen.opened.look(place); }, { icon: "place" }),
+      quiet("Zoom in", () => screen.goTo(feature), { icon: "target" })),
   ];
 }
 
-/** A feature's name in a few words. */
 export const titleOf = (feature) => (isChange(feature) ? words.changeWords(feature.properties) : feature.properties.class);
+
+/** Its kind's or class's words, colour and letter on the map. */
+export const lookOf = (feature) => (isChange(feature) ? KINDS[feature.properties.kind] : CLASSES[feature.properties.class]) ?? OTHER_CLASS;
 
 /** A coloured mark of the feature's kind or class. */
 export function badge(feature) {
-  const [, colour] = isChange(feature) ? KINDS[feature.properties.kind] ?? OTHER_CLASS : CLASSES[feature.properties.class] ?? OTHER_CLASS;
+  const [, colour] = lookOf(feature);
   const mark = el("span", { class: `badge ${isChange(feature) ? "square" : "round"}`, "aria-hidden": true });
   mark.style.setProperty("--colour", colour);
   return mark;
@@ -68,16 +70,16 @@ export function badge(feature) {
 export function pictures(feature) {
   const names = isChange(feature) ? ["before", "after"] : ["latest view"];
   const crops = isChange(feature) ? cropsOf(feature) : cropsOf(feature).slice(-1); // of an object the latest, as in the lists
-  if (!crops.length) return el("p", { class: "hint" }, "Pictures come when the mission has ended.");
+  if (!crops.length) return el("p.hint", "Pictures come when the mission has ended.");
   return el("div", { class: `pictures n${names.length}` }, crops.map((src, k) =>
-    el("figure", {}, picture(src, `${titleOf(feature)}, ${names[k] ?? ""}`), el("figcaption", {}, names[k] ?? ""))));
+    el("figure", picture(src, `${titleOf(feature)}, ${names[k] ?? ""}`), el("figcaption", names[k] ?? ""))));
 }
 
 /** A picture, at most four times as large as it is; a note where it cannot be had. */
 export function picture(src, alt) {
   const image = el("img", { src, alt, loading: "lazy", decoding: "async" });
   image.addEventListener("load", () => { image.style.maxWidth = `${4 * image.naturalWidth}px`; });
-  image.addEventListener("error", () => image.replaceWith(el("div", { class: "gone" }, "no picture")));
+  image.addEventListener("error", () => image.replaceWith(el("div.gone", "no picture")));
   return image;
 }
 
@@ -104,5 +106,5 @@ export function facts(feature, local) {
     ["Flight", values.flight],
     ["Id", feature.id],
   ];
-  return el("dl", { class: "facts" }, rows.filter(([, value]) => value).map(([name, value]) => [el("dt", {}, name), el("dd", {}, value)]));
+  return el("dl.facts", rows.filter(([, value]) => value).map(([name, value]) => [el("dt", name), el("dd", value)]));
 }

@@ -1,28 +1,29 @@
 // The panel of the map: layers, filters by class, kind, score, time and verdict, the version shown, the base map.
 
 import { choices } from "./choices.js";
-import { button, choice, el, field, fill, tick } from "./dom.js";
+import { choice, el, field, fill, quiet, tick } from "./dom.js";
 import { ALL, sortOf } from "./filters.js";
 import { badge } from "./feature_card.js";
 import { GROUPS, KINDS, CLASSES, PLACED, POD_RAMP } from "./map_style.js";
 import { lookedAt } from "./sentence.js";
 import { chooseBaseMap } from "./base_map.js";
+import { grouped } from "./site_data.js";
 import { counted, day, percent } from "./words.js";
 
 /** The panel's life: `refresh` after data changed. */
 export function layersPanel(screen, body) {
   const { data, view } = screen;
-  const legend = el("div", {});
-  const layers = el("fieldset", { class: "ticks" }, el("legend", {}, "Layers"),
+  const legend = el("div");
+  const layers = el("fieldset.ticks", el("legend", "Layers"),
     Object.entries(GROUPS).map(([group, [words]]) => tick(words, choices.get("layers")[group] ?? GROUPS[group][1],
       (shown) => { view?.show(group, shown); refresh(); })));
-  const found = el("div", {});
-  const coverage = el("div", {});
+  const found = el("div");
+  const coverage = el("div");
   fill(body, legend, found, coverage, layers, filterForm(data), base(screen));
 
   function refresh() {
     const { detail } = data;
-    fill(legend, el("p", { class: "soft" }, counted(detail.flights?.length ?? 0, "flight"), " · ",
+    fill(legend, el("p.soft", counted(detail.flights?.length ?? 0, "flight"), " · ",
       detail.versions?.length ? `latest ${day(detail.versions.at(-1).flown_at ?? detail.versions.at(-1).made_at)}` : detail.bounds_wgs84 ? "a first one is being mapped" : "nothing mapped yet"),
       whyEmpty(data));
     fill(coverage, coverageCard(data));
@@ -34,20 +35,18 @@ export function layersPanel(screen, body) {
 
 function whyEmpty(data) {
   if (data.detail.versions?.length || data.detail.is_new || data.detail.bounds_wgs84) return null;
-  return el("p", { class: "hint" }, "This site has no map yet. Start a mission in “Live”.");
+  return el("p.hint", "This site has no map yet. Start a mission in “Live”.");
 }
 
 function kinds(data, name, title) {
   const all = data.all[name];
   if (!all.length) return null;
-  const groups = new Map();
-  for (const each of all) groups.set(sortOf(each), [...(groups.get(sortOf(each)) ?? []), each]);
   const shown = data.shown(name).length;
-  return el("fieldset", { class: "ticks" }, el("legend", {}, shown === all.length ? `${title}: ${all.length}` : `${title}: ${shown} of ${all.length} shown`),
-    [...groups].map(([sort, list]) => {
+  return el("fieldset.ticks", el("legend", shown === all.length ? `${title}: ${all.length}` : `${title}: ${shown} of ${all.length} shown`),
+    [...grouped(all, sortOf)].map(([sort, list]) => {
       const words = (KINDS[sort] ?? CLASSES[sort] ?? [sort])[0];
       const hidden = data.filters.hidden;
-      return el("div", { class: "kind" }, badge(list[0]), tick(`${words} (${list.length})`, !hidden.includes(sort),
+      return el("div.kind", badge(list[0]), tick(`${words} (${list.length})`, !hidden.includes(sort),
         (on) => data.filter({ hidden: on ? hidden.filter((each) => each !== sort) : [...hidden, sort] })));
     }));
 }
@@ -55,45 +54,45 @@ function kinds(data, name, title) {
 function placedLegend(data) {
   if (!(choices.get("layers").frames ?? false)) return null;
   const rejected = data.detail.flights.reduce((sum, each) => sum + each.rejected, 0);
-  return el("div", { class: "ticks" }, Object.values(PLACED).map(([words, colour]) => {
-    const mark = el("span", { class: "badge line" });
+  return el("div.ticks", Object.values(PLACED).map(([words, colour]) => {
+    const mark = el("span.badge.line");
     mark.style.setProperty("--colour", colour);
-    return el("div", { class: "kind" }, mark, words);
-  }), rejected ? el("p", { class: "soft" }, `${counted(rejected, "frame")} rejected: no place, so not drawn`) : null);
+    return el("div.kind", mark, words);
+  }), rejected ? el("p.soft", `${counted(rejected, "frame")} rejected: no place, so not drawn`) : null);
 }
 
 function filterForm(data) {
-  const score = el("output", {}, percent(data.filters.minScore));
+  const score = el("output", percent(data.filters.minScore));
   const slider = el("input", { type: "range", min: 0, max: 1, step: 0.05, ".value": String(data.filters.minScore),
     on: { input: (event) => { fill(score, percent(Number(event.target.value))); data.filter({ minScore: Number(event.target.value) }); } } });
   const least = el("input", { type: "number", min: 0, step: "any", inputmode: "decimal", ".value": data.filters.minArea_m2 || "",
     on: { input: (event) => data.filter({ minArea_m2: Number(event.target.value) || 0 }) } });
   const date = (name) => el("input", { type: "date", ".value": data.filters[name], on: { change: (event) => data.filter({ [name]: event.target.value }) } });
-  return el("details", { class: "filters" }, el("summary", {}, "Filter"),
+  return el("details.filters", el("summary", "Filter"),
     field("Verdict", choice([["all", "all"], ["none", "not reviewed"], ["confirmed", "confirmed"], ["rejected", "rejected"], ["disputed", "disputed"], ["unsure", "not sure"]],
       data.filters.verdict, (verdict) => data.filter({ verdict }))),
-    el("div", { class: "row" }, field("Score at least", slider), score),
+    el("div.row", field("Score at least", slider), score),
     field("Flight", choice([["", "all"], ...(data.detail.flights ?? []).map((each) => [each.id, each.id])], data.filters.flight, (flight) => data.filter({ flight }))),
-    el("div", { class: "row" }, field("Seen from", date("from")), field("until", date("to"))),
+    el("div.row", field("Seen from", date("from")), field("until", date("to"))),
     field("Changes of at least (m²)", least),
-    el("p", { class: "note" }, data.filters.area ? "Only what lies in the area of interest." : "Draw an area of interest with “Measure and draw” to filter by it."),
-    button("Show everything", () => { data.filter({ ...ALL }); }, { class: "quiet" }));
+    el("p.note", data.filters.area ? "Only what lies in the area of interest." : "Draw an area of interest with “Measure and draw” to filter by it."),
+    quiet("Show everything", () => data.filter(ALL)));
 }
 
 /** How well the ground was looked at, with the legend of its layer. */
 function coverageCard(data) {
   const looked = lookedAt(data.all.pod);
-  if (!looked) return el("p", { class: "hint" }, "How well the ground was searched is not measured. A search mission in “Live” does it.");
-  return el("fieldset", { class: "ticks coverage" }, el("legend", {}, "Chance to have seen a person"),
-    el("ol", { class: "ramp", "aria-label": "Colours" }, POD_RAMP.map((colour, k) => {
-      const step = el("li", {}, `${20 * k}–${20 * k + 20} %`);
+  if (!looked) return el("p.hint", "How well the ground was searched is not measured. A search mission in “Live” does it.");
+  return el("fieldset.ticks.coverage", el("legend", "Chance to have seen a person"),
+    el("ol.ramp", { "aria-label": "Colours" }, POD_RAMP.map((colour, k) => {
+      const step = el("li", `${20 * k}–${20 * k + 20} %`);
       step.style.setProperty("--colour", colour);
       return step;
-    })), el("p", { class: "note" }, `${percent(looked.share)} of the ground was looked at. Somebody on it would have been seen with ${percent(looked.from)} to ${percent(looked.to)}. Tap the coloured ground for its value, dashed ground for the reason.`));
+    })), el("p.note", `${percent(looked.share)} of the ground was looked at. Somebody on it would have been seen with ${percent(looked.from)} to ${percent(looked.to)}. Tap the coloured ground for its value, dashed ground for the reason.`));
 }
 
 function base(screen) {
-  return el("details", {}, el("summary", {}, "Base map"),
-    el("p", { class: "note" }, "A PMTiles file of this device or the station, shown under the mosaic. Nothing is loaded from the network."),
+  return el("details", el("summary", "Base map"),
+    el("p.note", "A PMTiles file of this device or the station, shown under the mosaic. Nothing is loaded from the network."),
     chooseBaseMap(screen));
 }

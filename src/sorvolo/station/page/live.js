@@ -2,27 +2,20 @@
 
 import { choices } from "./choices.js";
 import { button, el, fill, message } from "./dom.js";
-import { inRing, middleOf } from "./places.js";
+import { featureOf, inRing, middleOf } from "./places.js";
 import { titleOf } from "./feature_card.js";
+import { openOf, thereOf } from "./sentence.js";
 import * as words from "./words.js";
 
 const PLACED_FOR_MS = 3000; // a frame's place counts for so long before telemetry alone is shown
 const CLOCKS_AGREE_S = 0.5;
 const LONGEST_DELAY_S = 600; // more is a recording, or a clock that is wrong
 
-/** Follow the site's live events; `figures(run)` are a mission's own, `close` ends it. */
-export function followLive(screen) {
-  return new Live(screen);
-}
-
-class Live {
+/** Follows the site's live events while its screen is shown; `figures(run)` are a mission's own. */
+export class Live {
   constructor(screen) {
-    Object.assign(this, { screen, flown: new Map(), drones: new Map(), ends: [], alerted: new Set(), follows: true });
-    const on = (type, listener) => {
-      const mine = ({ detail }) => { if (detail.site === screen.data.id) listener(detail.data ?? {}, detail); };
-      screen.station.events.addEventListener(type, mine);
-      this.ends.push(() => screen.station.events.removeEventListener(type, mine));
-    };
+    Object.assign(this, { screen, flown: new Map(), drones: new Map(), alerted: new Set(), follows: true });
+    const on = screen.on.bind(screen);
     on("map.tiles", (data) => screen.view?.ready.then(() => this.refresh(data)));
     on("coverage.changed", () => this.coverSoon());
     on("frame.placed", (data, event) => this.placed(data, event));
@@ -115,7 +108,7 @@ class Live {
     if (!view || this.screen.closed || this.screen.opened?.put) return; // Compare shows ground
     view.put("drone", [...this.drones.values()].flatMap(droneFeatures));
     const trails = [...this.flown.values()].filter(({ trail }) => trail.length > 1);
-    view.put("track", [...data.all.track, ...trails.map(({ trail }) => ({ type: "Feature", properties: { live: true }, geometry: { type: "LineString", coordinates: trail } }))]);
+    view.put("track", [...data.all.track, ...trails.map(({ trail }) => featureOf("LineString", trail))]);
     const { position } = this.drones.values().next().value ?? {};
     if (this.follows && position && !view.isCentral(position.slice(0, 2))) view.go(position.slice(0, 2), view.map.getZoom());
   }
@@ -168,13 +161,12 @@ class Live {
   /** A mission ended well, and what it found is loaded: what is there to be looked at, people first. */
   done({ headline }) {
     const { objects, changes } = this.screen.data.all;
-    const people = objects.filter(({ properties: { class: name, review, gone } }) => name === "person" && review !== "rejected" && !gone).length;
-    const open = [...objects, ...changes].filter(({ properties }) => !properties.review && !properties.gone).length;
+    const people = thereOf(objects).filter(({ properties }) => properties.class === "person").length;
+    const open = openOf(objects, changes).length;
     const result = [people ? words.counted(people, "person", "people") : null, open ? `${open} to review` : "nothing new to review"].filter(Boolean).join(", ");
     message(`The mission is done: ${result}`, { todo: headline });
   }
 
-  /** How a running mission goes, in words. */
   figures(id) {
     const run = this.flown.get(id);
     const { matched, selected, latency_s: latency_s } = run?.progress ?? {};
@@ -189,7 +181,6 @@ class Live {
 
   close() {
     cancelAnimationFrame(this.drawing);
-    for (const end of this.ends) end();
   }
 }
 
@@ -204,13 +195,13 @@ function watched(feature, run) {
 function droneFeatures({ position, footprint, heading_deg: heading }) {
   const features = [];
   const ring = footprint?.coordinates?.[0] ?? footprint;
-  const add = (part, geometry, more = {}) => features.push({ type: "Feature", properties: { part, ...more }, geometry });
+  const add = (part, type, coordinates, more) => features.push(featureOf(type, coordinates, { part, ...more }));
   if (Array.isArray(ring) && ring.length > 3) {
     const closed = String(ring[0]) === String(ring.at(-1)) ? ring : [...ring, ring[0]];
-    add("footprint", { type: "Polygon", coordinates: [closed] });
-    if (position) add("view", { type: "MultiLineString", coordinates: closed.slice(0, 4).map((corner) => [position.slice(0, 2), corner.slice(0, 2)]) });
+    add("footprint", "Polygon", [closed]);
+    if (position) add("view", "MultiLineString", closed.slice(0, 4).map((corner) => [position.slice(0, 2), corner.slice(0, 2)]));
   }
-  if (position) add("body", { type: "Point", coordinates: position.slice(0, 2) }, { heading_deg: heading ?? 0 });
+  if (position) add("body", "Point", position.slice(0, 2), { heading_deg: heading ?? 0 });
   return features;
 }
 

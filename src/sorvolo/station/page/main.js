@@ -2,7 +2,7 @@
 
 import { get, post, remove, session, Problem } from "./api.js";
 import { applyTheme, choices } from "./choices.js";
-import { button, choice, dialog, el, field, fill, message, report, tick } from "./dom.js";
+import { button, choice, dialog, el, field, fill, message, quiet, report, tick } from "./dom.js";
 import { Events } from "./events.js";
 import { showSites } from "./sites.js";
 import { votes } from "./votes.js";
@@ -14,10 +14,13 @@ const linkState = document.getElementById("link-state");
 const rooms = document.getElementById("rooms");
 const known = document.getElementById("sentence");
 const frame = { main, title, rooms, known };
-const OLD_NAMES = { map: "live", review: "findings", draw: "measure", missions: "live", export: "share" };
 
 /** What all screens share. */
-export const station = { status: null, events: null };
+export const station = {
+  status: null, events: null,
+  get operates() { return this.status.role === "operate"; },
+  get reviews() { return this.status.role !== "view"; },
+};
 
 let screen = null;
 let turn = 0;
@@ -40,7 +43,7 @@ async function enter() {
     station.status = await get("/api/status");
   } catch (problem) {
     if (problem.status === 401) return;
-    fill(main, el("div", { class: "starting" }, el("h1", {}, problem.title), el("p", {}, problem.detail)));
+    blank(problem.title, problem.detail);
     setTimeout(enter, 3000);
     return;
   }
@@ -49,6 +52,8 @@ async function enter() {
   if (!station.events) listen();
   await route();
 }
+
+const blank = (heading, words, ...more) => fill(main, el("div.starting", el("h1", heading), el("p", words), more));
 
 function listen() {
   station.events = new Events(station.status.last_event ?? 0);
@@ -77,7 +82,6 @@ function disk({ is_low: isLow, free_gb: free, floor_gb: floor }) {
     todo: `${free} GB are free, and ${floor} GB must stay so. No upload, mission or stream is taken in until there is room: delete uploads, recordings or flights.` });
 }
 
-/** Show the screen that the address names. */
 async function route() {
   turn += 1;
   const mine = turn;
@@ -94,7 +98,7 @@ async function route() {
     let made;
     if (kind === "site" && id) {
       const { showSite } = await siteScreen();
-      made = await showSite(frame, station, id, OLD_NAMES[view] ?? (view || "live"), at.length === 2 && at.every(Number.isFinite) ? at : null);
+      made = await showSite(frame, station, id, view || "live", at.length === 2 && at.every(Number.isFinite) ? at : null);
     } else if (kind === "api") {
       made = await (await import("./api_page.js")).showApi(main, title);
     } else {
@@ -107,18 +111,17 @@ async function route() {
     if (!(problem instanceof Problem)) throw problem;
     if (problem.status === 401) return;
     const isAwaited = problem.status === 404 && kind === "site";
-    fill(main, el("div", { class: "starting" }, el("h1", {}, problem.title), el("p", {}, problem.detail),
-      isAwaited ? el("p", {}, "Once a first mission has put something on its map, it is shown here.") : null,
-      el("p", {}, el("a", { href: "#/" }, "All sites"), " ", button("Try again", () => route()))));
+    blank(problem.title, problem.detail, isAwaited ? el("p", "Once a first mission has put something on its map, it is shown here.") : null,
+      el("p", el("a", { href: "#/" }, "All sites"), " ", button("Try again", () => route())));
     if (isAwaited) screen = whenMade(id, route);
   }
 }
 
 /** Call back once something of a site that is not there is on its map: its first mission may just have begun. */
 function whenMade(id, then) {
-  const heard = ({ detail }) => { if (detail.site === id) then(); };
-  for (const type of ["map.tiles", "site.changed"]) station.events.addEventListener(type, heard);
-  return { close() { for (const type of ["map.tiles", "site.changed"]) station.events.removeEventListener(type, heard); } };
+  const over = new AbortController();
+  for (const type of ["map.tiles", "site.changed"]) station.events.addEventListener(type, ({ detail }) => { if (detail.site === id) then(); }, over);
+  return { close: () => over.abort() };
 }
 
 let loginBox = null;
@@ -126,11 +129,11 @@ let loginBox = null;
 function showLogin() {
   if (loginBox?.isConnected) return;
   const input = el("input", { type: "password", autocomplete: "current-password", required: true, maxlength: 200 });
-  const note = el("p", { class: "note", role: "alert" });
-  const form = el("form", { class: "stack" },
-    el("p", {}, "This station is shared: it needs a token to know who you are. Who runs it makes one with ",
-      el("code", {}, "sorvolo token"), "."),
-    field("Token", input), note, el("button", { class: "main" }, "Log in"));
+  const note = el("p.note", { role: "alert" });
+  const form = el("form.stack",
+    el("p", "This station is shared: it needs a token to know who you are. Who runs it makes one with ",
+      el("code", "sorvolo token"), "."),
+    field("Token", input), note, el("button.main", "Log in"));
   form.addEventListener("submit", async (event) => {
     event.preventDefault();
     try {
@@ -149,7 +152,7 @@ function showLogin() {
     if (isLoggedIn) return;
     screen?.close?.(); // its questions would bring the dialog back
     screen = null;
-    fill(main, el("div", { class: "starting" }, el("h1", {}, "You are not logged in"), el("p", {}, "This station shows its sites to those who have a token."), button("Log in", showLogin, { class: "main" })));
+    blank("You are not logged in", "This station shows its sites to those who have a token.", button("Log in", showLogin, { class: "main" }));
   });
   input.focus();
 }
@@ -158,22 +161,22 @@ function showSettings() {
   const set = (name) => (value) => choices.set(name, value);
   const who = station.status;
   dialog("Settings",
-    el("div", { class: "stack" },
+    el("div.stack",
       field("Units", choice([["metric", "Metres, hectares"], ["imperial", "Feet, acres"]], choices.get("units"), set("units"))),
       field("Coordinates", choice([["latlon", "Latitude, longitude"], ["utm", "UTM"], ["mgrs", "MGRS"]],
         choices.get("coordinates"), set("coordinates"))),
       field("Times", choice([["local", "This device's time zone"], ["utc", "UTC"]], choices.get("clock"), set("clock"))),
       field("Colours", choice([["auto", "As the device"], ["light", "Light"], ["dark", "Dark"]], choices.get("theme"), set("theme"))),
       tick("Sound when something appears in an alert zone", choices.get("sound"), set("sound")),
-      el("h3", {}, "Keys"),
-      el("dl", { class: "keys" }, [
+      el("h3", "Keys"),
+      el("dl.keys", [
         ["1 2 3", "Live, Findings, Compare"], ["J / K", "next and previous finding"], ["C or Y / R / ? / U", "confirm, reject, not sure, withdraw"],
         ["N", "note"], ["M", "show on the map"], ["B", "blink before and after"], ["O", "hide what was found, in Compare"], ["← →", "from change to change, in Compare"], ["Esc", "end drawing, close"],
-      ].map(([key, words]) => [el("dt", {}, key), el("dd", {}, words)])),
-      who ? el("details", {}, el("summary", {}, "Diagnostics"), el("p", { class: "note diagnostics" }, `memory ${bytes((who.memory_mb ?? NaN) * 1e6)}, disk left ${bytes(who.disk_free_gb * 1e9)}, connection ${station.events?.state}`)) : null,
-      el("p", { class: "note" }, el("a", { href: "#/api" }, "Addresses for programs (API)")),
-      who ? el("p", { class: "note" }, `Sorvolo ${who.version}. Logged in as ${who.name || "this machine"} (${who.role}). `,
-        who.name && who.name !== "this machine" ? button("Log out", logOut, { class: "quiet" }) : null) : null));
+      ].map(([key, words]) => [el("dt", key), el("dd", words)])),
+      who ? el("details", el("summary", "Diagnostics"), el("p.note.diagnostics", `memory ${bytes((who.memory_mb ?? NaN) * 1e6)}, disk left ${bytes(who.disk_free_gb * 1e9)}, connection ${station.events?.state}`)) : null,
+      el("p.note", el("a", { href: "#/api" }, "Addresses for programs (API)")),
+      who ? el("p.note", `Sorvolo ${who.version}. Logged in as ${who.name || "this machine"} (${who.role}). `,
+        who.name && who.name !== "this machine" ? quiet("Log out", logOut) : null) : null));
 }
 
 async function logOut() {

@@ -4,13 +4,12 @@ import * as maplibre from "./vendor/maplibre-gl.mjs";
 import { siteUrl } from "./api.js";
 import { choices, isDark } from "./choices.js";
 import { GROUPS, groundColour, mapStyle, pictures } from "./map_style.js";
-import { distance_m } from "./places.js";
+import { distance_m, tileColumn, tileRow } from "./places.js";
 
 const EARTH_M_PER_PX = 156543.034; // of a tile of 256 px at zoom 0, on the equator
 const REFRESH_MS = 300;
 const MOST_CHANGES = 500; // that are remembered of the growing map
 
-/** Whether this browser can draw the map at all. */
 export function canDraw() {
   return Boolean(document.createElement("canvas").getContext("webgl2"));
 }
@@ -131,7 +130,6 @@ export class MapView {
     return revision ? `${found[1]}${revision}${found[2]}` : url;
   }
 
-  /** The features below a point, the uppermost first. */
   hits(point) {
     const layers = ["objects", "changes-fill", "changes-line", "pod-hole-fill", "pod", "drawings-fill", "drawings-point"].filter((id) => this.map.getLayer(id));
     const box = [[point.x - 6, point.y - 6], [point.x + 6, point.y + 6]];
@@ -177,7 +175,6 @@ export class MapView {
     return Math.abs(x - width / 2) < width / 4 && Math.abs(y - seen / 2) < seen / 4;
   }
 
-  /** Whether some of these bounds is in view. */
   shows([west, south, east, north]) {
     const view = this.map.getBounds();
     return west < view.getEast() && east > view.getWest() && south < view.getNorth() && north > view.getSouth();
@@ -213,11 +210,8 @@ export function tie(one, other) {
   return () => { one.off("move", there); other.off("move", back); };
 }
 
-const columnOf = (lon, z) => (lon + 180) / 360 * 2 ** z;
-const rowOf = (lat, z) => (1 - Math.asinh(Math.tan(lat * Math.PI / 180)) / Math.PI) / 2 * 2 ** z;
-
 function tileMeets(z, x, y, [west, south, east, north]) {
-  return columnOf(west, z) <= x + 1 && columnOf(east, z) >= x && rowOf(north, z) <= y + 1 && rowOf(south, z) >= y;
+  return tileColumn(west, z) <= x + 1 && tileColumn(east, z) >= x && tileRow(north, z) <= y + 1 && tileRow(south, z) >= y;
 }
 
 function meet(one, other) {
@@ -227,8 +221,8 @@ function meet(one, other) {
 function tilesWithin(z, [west, south, east, north]) {
   const tiles = [];
   if (west > east || south > north) return tiles;
-  for (let x = Math.floor(columnOf(west, z)); x <= columnOf(east, z); x++) {
-    for (let y = Math.floor(rowOf(north, z)); y <= rowOf(south, z) && tiles.length < 400; y++) tiles.push({ z, x, y });
+  for (let x = Math.floor(tileColumn(west, z)); x <= tileColumn(east, z); x++) {
+    for (let y = Math.floor(tileRow(north, z)); y <= tileRow(south, z) && tiles.length < 400; y++) tiles.push({ z, x, y });
   }
   return tiles;
 }

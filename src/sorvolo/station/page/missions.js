@@ -2,9 +2,11 @@
 
 import { get, post, Problem, remove } from "./api.js";
 import { choices } from "./choices.js";
-import { button, choice, dialog, el, field, fill, message, report } from "./dom.js";
+import { button, choice, dialog, el, field, fill, message, quiet, report } from "./dom.js";
 import { badge, picture, titleOf } from "./feature_card.js";
-import { cropsOf } from "./site_data.js";
+import { thereOf } from "./sentence.js";
+import { cropsOf, newestFirst, peopleFirst } from "./site_data.js";
+import { mayNot } from "./sites.js";
 import { Upload } from "./upload.js";
 import { bytes, clock, counted, duration, time } from "./words.js";
 import { zipOfFiles } from "./zip.js";
@@ -24,53 +26,42 @@ export async function mapAndFind(stream, site, hasMap) {
   if (mapped instanceof Problem) report(new Problem(mapped.status, "People are looked for, but no map is made", mapped.detail));
 }
 
-/** The room's life. */
-export function missionsPanel(screen, body) {
-  return new Missions(screen, body);
-}
-
-class Missions {
+export class Missions {
   constructor(screen, body) {
-    Object.assign(this, { screen, rows: new Map(), told: "" });
-    this.list = el("div", { class: "runs" });
-    this.finds = el("ul", { class: "strip finds", "aria-label": "Found, people first" });
-    this.drones = el("div", { class: "stack" });
-    this.may = screen.station.status.role === "operate";
-    this.starting = this.may ? el("details", { class: "starting-form" }, el("summary", {}, "Start a mission"), this.form()) : null;
-    fill(body, this.finds, this.drones, el("h3", {}, "Activity"), this.list, this.uploadList = el("div", {}),
-      this.starting ?? el("p", { class: "note" }, "View only. Ask the team lead for operator access to start missions."), this.kept = el("div", {}));
+    Object.assign(this, { screen, rows: new Map(), told: "", over: new AbortController() });
+    this.list = el("div.runs");
+    this.finds = el("ul.strip.finds", { "aria-label": "Found, people first" });
+    this.drones = el("div.stack");
+    this.may = screen.station.operates;
+    this.starting = this.may ? el("details.starting-form", el("summary", "Start a mission"), this.form()) : null;
+    fill(body, this.finds, this.drones, el("h3", "Activity"), this.list, this.uploadList = el("div"),
+      this.starting ?? mayNot(), this.kept = el("div"));
     if (this.starting && !screen.data.detail.versions.length && !screen.runs.length) this.starting.open = true;
-    const again = () => this.load();
-    const types = ["stream.state", "station.disk"]; // the last: rows state what it means
-    for (const type of types) screen.station.events.addEventListener(type, again);
-    this.end = () => types.forEach((type) => screen.station.events.removeEventListener(type, again));
+    for (const type of ["stream.state", "station.disk"]) screen.hear(screen.station.events, type, () => this.load(), this.over); // the last: rows state what it means
     this.refresh();
     this.load();
   }
 
   /** What was found, people first, the newest first. */
   refresh() {
-    const isPerson = (each) => each.properties.class === "person";
-    const found = this.screen.data.all.objects.filter(({ properties: { gone, review } }) => !gone && review !== "rejected")
-      .sort((one, other) => isPerson(other) - isPerson(one) || String(other.properties.first_seen ?? "").localeCompare(String(one.properties.first_seen ?? ""))).slice(0, MOST_FINDS);
+    const found = peopleFirst(thereOf(this.screen.data.all.objects), newestFirst).slice(0, MOST_FINDS);
     const state = JSON.stringify([found, choices.all]);
     if (state === this.told) return;
     this.told = state;
-    fill(this.finds, found.map((each) => el("li", {}, el("button", { type: "button", data: { id: each.id }, on: { click: () => this.screen.live.showFound(each) } },
-      cropsOf(each).length ? picture(cropsOf(each).at(-1), "") : null,
-      el("span", { class: "name" }, badge(each), titleOf(each), el("span", { class: "soft" }, each.properties.first_seen ? ` ${clock(each.properties.first_seen)}` : ""))))));
+    fill(this.finds, found.map((each) => el("li", button([cropsOf(each).length ? picture(cropsOf(each).at(-1), "") : null,
+      el("span.name", badge(each), titleOf(each), el("span.soft", each.properties.first_seen ? ` ${clock(each.properties.first_seen)}` : ""))], () => this.screen.live.showFound(each), { data: { id: each.id } }))));
   }
 
   form() {
     this.mission = this.screen.data.detail.versions?.length ? "compare" : "map";
     this.from = this.flown = "upload";
-    const note = el("p", { class: "note" }, KINDS[this.mission][1]);
+    const note = el("p.note", KINDS[this.mission][1]);
     const files = this.files = el("input", { type: "file", multiple: true, "aria-label": "Files of the flight" });
     const url = el("input", { type: "text", inputmode: "url", placeholder: "rtsp://…, udp://…", autocomplete: "off" });
     const camera = el("input", { type: "text", maxlength: 80, placeholder: "found by itself", pattern: "(aov=[0-9.]+|focal_px=[0-9.]+|[A-Za-z0-9 .+\\-]+)" });
-    const ready = el("div", {});
-    const input = el("div", {});
-    const from = el("div", {});
+    const ready = el("div");
+    const input = el("div");
+    const from = el("div");
     const origins = [["ready", "Drone streams and files"], ["upload", "Upload"], ["stream", "Camera URL"]];
     const show = () => {
       this.from = this.mission === "search" ? this.searched ?? "site" : this.flown;
@@ -79,19 +70,19 @@ class Missions {
       fill(input, { upload: field("Files of the flight", files, "The video, and its telemetry (SRT, CSV, GPX …) if it is not inside; or all photos."),
         stream: field("Camera URL", url, "RTSP, RTMP or MPEG-TS over UDP, from networks that the station allows. The station opens the camera once; its video appears beside the map."), ready, site: null }[this.from]);
     };
-    const start = el("button", { class: "main" }, "Start");
-    const form = el("form", { class: "stack start", on: { submit: async (event) => {
+    const start = el("button.main", "Start");
+    const form = el("form.stack.start", { on: { submit: async (event) => {
       event.preventDefault();
       start.disabled = true;
       try {
         await this.start({ files: [...files.files], url: url.value.trim(), camera: camera.value.trim(), ...chosen(ready) });
         files.value = "";
       } catch (problem) {
-        if (problem.name !== "AbortError") this.say(`${problem.title ?? "This did not work"}. ${problem.detail ?? problem.message}`);
+        if (problem.name !== "AbortError") this.say(problem.words ?? problem.message);
       } finally { start.disabled = false; }
     } } },
     field("Mission", choice(Object.entries(KINDS).map(([key, [words]]) => [key, words]), this.mission, (mission) => { this.mission = mission; fill(note, KINDS[mission][1]); show(); })), note,
-    from, input, el("details", {}, el("summary", {}, "Camera"), field("Camera", camera, "A model such as “DJI Mavic 2 Pro”, or aov=78; only where the flight's files do not name it.")), this.fault = el("p", { class: "error", role: "alert" }), start);
+    from, input, el("details", el("summary", "Camera"), field("Camera", camera, "A model such as “DJI Mavic 2 Pro”, or aov=78; only where the flight's files do not name it.")), this.fault = el("p.error", { role: "alert" }), start);
     this.showInput = show;
     show();
     this.loadReady(ready);
@@ -118,7 +109,7 @@ class Missions {
     const rows = streams.filter((each) => each.flights.length).map((each) => [JSON.stringify({ stream: each.stream }), `Stream ${each.stream}${each.is_connected ? " (on)" : ""}`]);
     const texts = inputs.filter((each) => each.kind.startsWith("telemetry"));
     rows.push(...inputs.filter((each) => !texts.includes(each)).map((each) => [JSON.stringify({ input: each.id }), `${each.name} (${bytes(each.megabytes * 1e6)})`]));
-    if (!rows.length) return fill(box, el("p", { class: "hint" }, "No drone sent a stream yet, and no flight lies in the station's folder."));
+    if (!rows.length) return fill(box, el("p.hint", "No drone sent a stream yet, and no flight lies in the station's folder."));
     return fill(box, field("Stream or file", choice(rows, rows[0][0], () => {}, { name: "input" })),
       texts.length ? field("Telemetry", choice([["", "found by itself"], ...texts.map((each) => [each.id, each.name])], "", () => {}, { name: "telemetry" })) : null);
   }
@@ -140,8 +131,7 @@ class Missions {
       if (wish.telemetry) options.telemetry = { input: wish.telemetry };
       return wish.input ? JSON.parse(wish.input) : void this.say("The station has no flight or stream; choose files of this device");
     }
-    const kinds = grouped(wish.files);
-    const [videos, photos, archives, texts] = ["video", "photo", "archive", "text"].map((kind) => kinds.get(kind) ?? []);
+    const [videos, photos, archives, texts] = ["video", "photo", "archive", "text"].map((kind) => wish.files.filter(({ name }) => kindOf(name) === kind));
     const flights = [...videos, ...archives, ...(photos.length ? [photos] : [])];
     if (flights.length !== 1) return void this.say(flights.length ? "Choose one flight: one video, or photos" : "Choose the files of the flight first");
     if (texts.length > 1) return void this.say("Choose one telemetry file");
@@ -149,11 +139,10 @@ class Missions {
     return { upload: await this.upload(Array.isArray(flights[0]) ? await photosAsOne(photos) : flights[0]) };
   }
 
-  /** Send a file; gives the upload's id. */
   async upload(file) {
     const upload = new Upload(file);
     const bar = el("progress", { max: 1, value: 0, "aria-label": file.name });
-    const row = el("div", { class: "upload" }, el("span", {}, `${file.name} (${bytes(file.size)})`), bar, button("Stop", () => upload.stop(), { class: "quiet" }));
+    const row = el("div.upload", el("span", `${file.name} (${bytes(file.size)})`), bar, quiet("Stop", () => upload.stop()));
     this.uploadList.append(row);
     upload.addEventListener("progress", ({ detail }) => { bar.value = detail; });
     try {
@@ -168,7 +157,7 @@ class Missions {
       this.showDrones(streams.filter((each) => each.is_connected));
       await this.showKept(streams);
     } catch (problem) {
-      fill(this.list, el("p", { class: "hint" }, problem.detail));
+      fill(this.list, el("p.hint", problem.detail));
     }
   }
 
@@ -188,7 +177,7 @@ class Missions {
     const is = (running) => runs.filter(({ state }) => (state === "running") === running);
     const rows = [...is(true), ...is(false)].map((run) => this.rowOf(run));
     const { children } = this.list;
-    if (!rows.length) fill(this.list, el("p", { class: "hint" }, "No mission yet."));
+    if (!rows.length) fill(this.list, el("p.hint", "No mission yet."));
     else if (rows.length !== children.length || rows.some((each, k) => each !== children[k])) fill(this.list, rows);
   }
 
@@ -198,7 +187,7 @@ class Missions {
     const state = JSON.stringify([fixed, choices.all]);
     const there = this.rows.get(run.id);
     if (there?.state !== state) {
-      const moving = el("div", {});
+      const moving = el("div");
       this.rows.set(run.id, { state, moving, row: this.row(run, moving) });
     }
     const { moving, row } = this.rows.get(run.id);
@@ -206,13 +195,12 @@ class Missions {
     return row;
   }
 
-  /** What changes while a mission runs. */
   moving(run) {
     const { frames, frames_expected: expected, searched, to_search: wanted, landed } = run.progress ?? {};
     return [el("progress", { ...(expected ? { value: Math.min(frames, expected), max: expected } : {}), "aria-label": "Progress" }),
-      wanted ? el("p", {}, `${landed ? "landed, searching the rest: " : ""}${searched} of ${wanted} pictures searched`) : null,
-      frames ? el("p", {}, expected ? `frame ${frames} of ${expected}` : counted(frames, "frame")) : null,
-      el("p", { class: "soft figures" }, this.screen.live.figures(run.id))];
+      wanted ? el("p", `${landed ? "landed, searching the rest: " : ""}${searched} of ${wanted} pictures searched`) : null,
+      frames ? el("p", expected ? `frame ${frames} of ${expected}` : counted(frames, "frame")) : null,
+      el("p.soft.figures", this.screen.live.figures(run.id))];
   }
 
   /** What the station keeps of streams and uploads, with its size; taken away by whoever may start missions. */
@@ -222,13 +210,13 @@ class Missions {
       ...streams.filter((each) => each.flight_count).map((each) => [`Stream ${each.stream}`, `${counted(each.flight_count, "flight")}, ${bytes(each.bytes)}`, `/api/streams/${encodeURIComponent(each.stream)}`]),
       ...uploads.map((each) => [each.name, `upload, ${bytes(each.offset)}`, `/api/uploads/${encodeURIComponent(each.id)}`]),
     ];
-    fill(this.kept, rows.length ? el("details", {}, el("summary", {}, "Recordings and uploads of the station"), el("ul", { class: "files" }, rows.map(([name, size, path]) => el("li", {}, el("b", {}, name), " ", el("span", { class: "soft" }, size),
-      this.may ? button("Delete", () => this.remove(path, `${name} (${size})`), { class: "quiet", "aria-label": `Delete ${name}` }) : null)))) : null);
+    fill(this.kept, rows.length ? el("details", el("summary", "Recordings and uploads of the station"), el("ul.files", rows.map(([name, size, path]) => el("li", el("b", name), " ", el("span.soft", size),
+      this.may ? quiet("Delete", () => this.remove(path, `${name} (${size})`), { "aria-label": `Delete ${name}` }) : null)))) : null);
   }
 
   /** Take away for good what a person confirms. */
   remove(path, words) {
-    const box = dialog("Delete for good?", el("p", {}, words), el("p", { class: "note" }, "Maps that were made of it stay."),
+    const box = dialog("Delete for good?", el("p", words), el("p.note", "Maps that were made of it stay."),
       button("Delete", async () => {
         box.close();
         try { await remove(path); } catch (problem) { report(problem); }
@@ -239,15 +227,15 @@ class Missions {
   row(run, moving) {
     const running = run.state === "running";
     return el("article", { class: `run ${run.state}` },
-      el("header", {}, el("b", {}, KINDS[run.mission]?.[0] ?? run.mission), el("span", { class: "state" }, run.stop_asked && running ? "stopping" : run.state), el("span", { class: "soft" }, `${time(run.started_at)}${run.who ? `, ${run.who}` : ""}`)),
-      run.input?.name || run.input?.stream || run.input?.stream_url ? el("p", { class: "soft" }, run.input.name ?? run.input.stream ?? run.input.stream_url) : null,
+      el("header", el("b", KINDS[run.mission]?.[0] ?? run.mission), el("span.state", run.stop_asked && running ? "stopping" : run.state), el("span.soft", `${time(run.started_at)}${run.who ? `, ${run.who}` : ""}`)),
+      run.input?.name || run.input?.stream || run.input?.stream_url ? el("p.soft", run.input.name ?? run.input.stream ?? run.input.stream_url) : null,
       moving,
-      run.notice ? el("p", { class: "error", role: "status" }, run.notice) : null,
-      run.headline ? el("p", {}, run.headline) : null,
-      run.error ? el("p", { class: "error" }, run.error) : null,
-      run.ended_at ? el("p", { class: "soft" }, `took ${duration((new Date(run.ended_at) - new Date(run.started_at)) / 1000)}`) : null,
-      running && this.may ? button(run.stop_asked ? "Stop at once" : "Stop", () => this.stop(run), { class: "quiet" }) : null,
-      !running && this.may ? button("Delete", () => this.remove(`/api/runs/${encodeURIComponent(run.id)}`, `The record of this ${run.mission}${run.mission === "watch" ? ", what it found" : ""}${run.input?.stream_url ? ", the recording of its camera" : ""}`), { class: "quiet" }) : null);
+      run.notice ? el("p.error", { role: "status" }, run.notice) : null,
+      run.headline ? el("p", run.headline) : null,
+      run.error ? el("p.error", run.error) : null,
+      run.ended_at ? el("p.soft", `took ${duration((new Date(run.ended_at) - new Date(run.started_at)) / 1000)}`) : null,
+      running && this.may ? quiet(run.stop_asked ? "Stop at once" : "Stop", () => this.stop(run)) : null,
+      !running && this.may ? quiet("Delete", () => this.remove(`/api/runs/${encodeURIComponent(run.id)}`, `The record of this ${run.mission}${run.mission === "watch" ? ", what it found" : ""}${run.input?.stream_url ? ", the recording of its camera" : ""}`)) : null);
   }
 
   async stop(run) {
@@ -256,23 +244,12 @@ class Missions {
   }
 
   close() {
-    this.end();
+    this.over.abort();
   }
 }
 
 /** What a file is to the station, by its name's ending. */
-export function kindOf(name) {
-  const ending = name.toLowerCase().split(".").at(-1);
-  if (["mp4", "mov", "mkv", "ts", "m4v"].includes(ending)) return "video";
-  if (["jpg", "jpeg", "tif", "tiff", "dng", "heic"].includes(ending)) return "photo";
-  return ending === "zip" ? "archive" : "text";
-}
-
-function grouped(files) {
-  const groups = new Map();
-  for (const each of files) groups.set(kindOf(each.name), [...(groups.get(kindOf(each.name)) ?? []), each]);
-  return groups;
-}
+const kindOf = (name) => [["video", /\.(mp4|mov|mkv|ts|m4v)$/i], ["photo", /\.(jpe?g|tiff?|dng|heic)$/i], ["archive", /\.zip$/i]].find(([, ending]) => ending.test(name))?.[0] ?? "text";
 
 /** Photos as one zip file, always the same of the same photos, so that an upload goes on where it was cut. */
 async function photosAsOne(photos) {

@@ -1,9 +1,11 @@
 // Memory of a place: everything that ever saw a spot of ground, in order of time.
 
 import { get, siteUrl } from "./api.js";
-import { button, el, fill } from "./dom.js";
+import { button, el, fill, quiet } from "./dom.js";
 import { picture } from "./feature_card.js";
-import { handover } from "./share.js";
+import { featureOf } from "./places.js";
+import { handover, placeUrl } from "./share.js";
+import { grouped } from "./site_data.js";
 import * as words from "./words.js";
 
 /** The panel's life; `look(place)` asks for a [lon, lat]. */
@@ -13,7 +15,7 @@ export function placePanel(screen, body) {
   let ground = null; // how well it was looked at, where that layer is shown
   let drawn = ""; // what of the page's state the list was last drawn with
   let last = screen.lastPlace ?? null;
-  const hint = el("p", { class: "hint" }, "Tap the ground on the map: every flight that saw it, in order, what changed there, and people's verdicts.");
+  const hint = el("p.hint", "Tap the ground on the map: every flight that saw it, in order, what changed there, and people's verdicts.");
 
   async function look(place, hits = []) {
     turn += 1;
@@ -21,14 +23,14 @@ export function placePanel(screen, body) {
     const mine = turn;
     shown = null;
     last = screen.lastPlace = place;
-    history.replaceState(null, "", `#/site/${encodeURIComponent(screen.data.id)}/place?at=${place.map((each) => each.toFixed(7)).join(",")}`);
+    history.replaceState(null, "", placeUrl(screen.data.id, place));
     mark(screen, place);
-    fill(body, el("p", { class: "place-name" }, words.place(place, { local: screen.data.detail.is_local })), el("p", { class: "soft" }, "Looking through the flights…"));
+    fill(body, el("p.place-name", words.place(place, { local: screen.data.detail.is_local })), el("p.soft", "Looking through the flights…"));
     let views;
     try {
       views = await get(`${siteUrl(screen.data.id, "place")}?lon=${place[0]}&lat=${place[1]}`);
     } catch (problem) {
-      if (mine === turn) fill(body, el("p", { class: "hint" }, `${problem.title}. ${problem.detail}`));
+      if (mine === turn) fill(body, el("p.hint", problem.words));
       return;
     }
     if (mine !== turn) return;
@@ -38,19 +40,18 @@ export function placePanel(screen, body) {
   }
 
   function show(place, views) {
-    const flights = new Map();
-    for (const each of views) flights.set(each.flight, [...(flights.get(each.flight) ?? []), each]);
+    const flights = grouped(views, (each) => each.flight);
     const found = unique(views.flatMap((each) => [...each.changes, ...each.objects]));
     const reviews = unique(views.flatMap((each) => each.reviews), (each) => `${each.id} ${each.at}`);
     fill(body,
-      el("div", { class: "row" }, el("p", { class: "place-name" }, words.place(place, { local: screen.data.detail.is_local }))), ground, screen.data.detail.is_local ? null : handover(screen.data.id, `Place on ${screen.data.detail.name}`, place),
-      views.length ? el("p", { class: "soft" }, `${words.counted(views.length, "view")} in ${words.counted(flights.size, "flight")}, first ${words.time(views[0].time)}`)
-        : el("p", { class: "hint" }, "No flight saw this place."),
-      found.length ? el("section", {}, el("h3", {}, "What was found here"), el("ul", { class: "plain" }, found.map((each) => change(screen, each)))) : null,
-      reviews.length ? el("section", {}, el("h3", {}, "Reviews"), el("ul", { class: "plain" }, reviews.map(review))) : null,
-      [...flights].map(([flight, list]) => el("section", { class: "dates" },
-        el("h3", {}, words.day(list[0].time), el("small", {}, ` ${flight}`)),
-        el("ol", { class: "film", tabindex: 0, "aria-label": `Views of ${flight}` }, list.map((each) => view(screen, each))))));
+      el("div.row", el("p.place-name", words.place(place, { local: screen.data.detail.is_local }))), ground, screen.data.detail.is_local ? null : handover(screen.data.id, `Place on ${screen.data.detail.name}`, place),
+      views.length ? el("p.soft", `${words.counted(views.length, "view")} in ${words.counted(flights.size, "flight")}, first ${words.time(views[0].time)}`)
+        : el("p.hint", "No flight saw this place."),
+      found.length ? el("section", el("h3", "What was found here"), el("ul.plain", found.map((each) => change(screen, each)))) : null,
+      reviews.length ? el("section", el("h3", "Reviews"), el("ul.plain", reviews.map(review))) : null,
+      [...flights].map(([flight, list]) => el("section.dates",
+        el("h3", words.day(list[0].time), el("small", ` ${flight}`)),
+        el("ol.film", { tabindex: 0, "aria-label": `Views of ${flight}` }, list.map((each) => view(screen, each))))));
   }
 
   if (last) look(last);
@@ -69,7 +70,7 @@ export function placePanel(screen, body) {
 }
 
 function mark(screen, place) {
-  screen.view?.put("sketch", place ? [{ type: "Feature", properties: { purpose: "waypoint" }, geometry: { type: "Point", coordinates: place } }] : []);
+  screen.view?.put("sketch", place ? [featureOf("Point", place, { purpose: "waypoint" })] : []);
 }
 
 function unique(list, key = (each) => each.id ?? each) {
@@ -81,17 +82,19 @@ function change(screen, each) {
   const feature = screen.data.find(each.id);
   const what = each.type === "change" ? words.changeWords(feature?.properties ?? each) : `${each.class} found`;
   const text = `${words.day(each.first_seen)}: ${what}`;
-  return el("li", {}, feature ? button(text, () => screen.data.choose(feature), { class: "link" }) : text, ` (${each.id})`);
+  return el("li", feature ? button(text, () => screen.data.choose(feature), { class: "link" }) : text, ` (${each.id})`);
 }
 
 function review(each) {
-  return el("li", {}, el("b", {}, each.verdict), ` by ${each.who}, ${words.time(each.at)}`, each.note ? ` “${each.note}”` : "");
+  return el("li", el("b", each.verdict), ` by ${each.who}, ${words.time(each.at)}`, each.note ? ` “${each.note}”` : "");
 }
 
+/** A button that plays the video of a place's view; null where there is none. */
+export const jump = (screen, each) => (each.video_s === null || !each.video_url ? null
+  : quiet(`▶ ${words.duration(each.video_s)}`, () => screen.video.play(each), { title: "Show the video at this second" }));
+
 function view(screen, each) {
-  const jump = each.video_s === null || !each.video_url ? null
-    : button(`▶ ${words.duration(each.video_s)}`, () => screen.video.play(each), { class: "quiet", title: "Show the video at this second" });
-  return el("li", {}, each.crop_url ? picture(each.crop_url, `Seen ${words.time(each.time)}`) : el("div", { class: "gone" }, "no picture kept"), el("span", {}, words.clock(each.time)), jump);
+  return el("li", each.crop_url ? picture(each.crop_url, `Seen ${words.time(each.time)}`) : el("div.gone", "no picture kept"), el("span", words.clock(each.time)), jump(screen, each));
 }
 
 /** With which chance somebody at a place would have been seen, and why so little; null where the map shows no such layer. */
@@ -100,5 +103,5 @@ function chanceAt(hits) {
   const [pod, hole] = [at("pod"), at("hole")];
   if (!pod && !hole) return null;
   const chance = pod ? `A ${pod.class ?? "person"} here would have been seen with ${words.percent(pod.pod_from)} to ${words.percent(pod.pod_to)}` : "Nobody here would have been seen";
-  return el("p", { class: "hint chance" }, hole ? `${chance}: ${hole.reason}.` : `${chance}.`);
+  return el("p.hint.chance", hole ? `${chance}: ${hole.reason}.` : `${chance}.`);
 }

@@ -68,7 +68,6 @@ export function distance_m([lon1, lat1], [lon2, lat2]) {
   return Math.hypot((lon2 - lon1) * x, (lat2 - lat1) * y);
 }
 
-/** Metres along a line of [lon, lat]. */
 export function length_m(line) {
   return line.slice(1).reduce((sum, each, k) => sum + distance_m(line[k], each), 0);
 }
@@ -85,7 +84,8 @@ export function area_m2(ring) {
   return Math.abs(twice) / 2;
 }
 
-/** Whether a [lon, lat] lies in a ring. */
+export const polygonsOf = ({ type, coordinates }) => (type === "MultiPolygon" ? coordinates : [coordinates]);
+
 export function inRing([x, y], ring) {
   let inside = false;
   for (let i = 0, j = ring.length - 1; i < ring.length; j = i++) {
@@ -95,6 +95,16 @@ export function inRing([x, y], ring) {
   }
   return inside;
 }
+
+/** Column and row of a place among the tiles of a zoom, Web Mercator. */
+export const tileColumn = (lon, z) => (lon + 180) / 360 * 2 ** z;
+export const tileRow = (lat, z) => (1 - Math.asinh(Math.tan(lat * RAD)) / Math.PI) / 2 * 2 ** z;
+
+/** Whether a [lon, lat] lies in [west, south, east, north], or within so many degrees of it. */
+export const isWithin = ([lon, lat], [west, south, east, north], near_deg = 0) =>
+  lon >= west - near_deg && lon <= east + near_deg && lat >= south - near_deg && lat <= north + near_deg;
+
+export const featureOf = (type, coordinates, properties = {}) => ({ type: "Feature", properties, geometry: { type, coordinates } });
 
 /** A [lon, lat] in the middle of a geometry's box. */
 export function middleOf(geometry) {

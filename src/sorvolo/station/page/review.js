@@ -2,33 +2,30 @@
 
 import { get, siteUrl } from "./api.js";
 import { choices } from "./choices.js";
-import { button, choice, el, fill, icon, svg, tick } from "./dom.js";
+import { button, choice, el, fill, icon, press, quiet, svg, tick } from "./dom.js";
 import { badge, facts, isWritten, picture, pictures, titleOf } from "./feature_card.js";
 import { middleOf } from "./places.js";
 import { handover } from "./share.js";
-import { duration, time } from "./words.js";
-import { cropsOf, isChange } from "./site_data.js";
+import { jump } from "./place.js";
+import { time } from "./words.js";
+import { cropsOf, isChange, newestFirst, peopleFirst } from "./site_data.js";
 import { judge, verdictForm } from "./verdicts.js";
 
 const ORDERS = {
   score: ["Highest confidence", (one, other) => (other.properties.score ?? 0) - (one.properties.score ?? 0)],
   doubt: ["Lowest confidence", (one, other) => (one.properties.score ?? 0) - (other.properties.score ?? 0)],
   size: ["Largest first", (one, other) => (other.properties.area_m2 ?? other.properties.length_m ?? 0) - (one.properties.area_m2 ?? one.properties.length_m ?? 0)],
-  time: ["Newest first", (one, other) => String(other.properties.first_seen ?? "").localeCompare(String(one.properties.first_seen ?? ""))],
+  time: ["Newest first", newestFirst],
 };
 
-/** The panel's life: a strip of all, and the stage's large card. */
-export function reviewPanel(screen, body) {
-  return new Review(screen, body);
-}
-
-class Review {
+/** The room's life: a strip of all, and the stage's large card. */
+export class Review {
   constructor(screen, body) {
     Object.assign(this, { screen, what: "objects", order: "score", open: false, at: null });
     if (screen.data.chosen ? isChange(screen.data.chosen) : !screen.data.all.objects.length) this.what = "changes";
-    this.head = el("div", {});
-    this.strip = el("ul", { class: "strip", "aria-label": "To review" });
-    this.big = el("div", { class: "gallery" });
+    this.head = el("div");
+    this.strip = el("ul.strip", { "aria-label": "To review" });
+    this.big = el("div.gallery");
     screen.stage.append(this.big);
     fill(body, this.head, this.strip);
     screen.card.show(null);
@@ -42,8 +39,7 @@ class Review {
 
   list() {
     const shown = this.shown().filter((each) => !this.open || !each.properties.review || each.id === this.at);
-    const isPerson = (each) => each.properties.class === "person";
-    return [...shown].sort((one, other) => isPerson(other) - isPerson(one) || ORDERS[this.order][1](one, other));
+    return peopleFirst(shown, ORDERS[this.order][1]);
   }
 
   refresh() {
@@ -59,23 +55,23 @@ class Review {
     const all = this.shown();
     const done = all.filter((each) => each.properties.review).length;
     fill(this.head,
-      el("div", { class: "segments", role: "group", "aria-label": "What to review" }, ["objects", "changes"].map((what) =>
-        el("button", { type: "button", "aria-pressed": String(what === this.what), on: { click: () => { this.isChosen = true; this.what = what; this.at = null; this.refresh(); } } },
-          `${what === "changes" ? "Changes" : "Objects"} (${this.shown(what).length})`))),
-      el("div", { class: "review-order" }, choice(Object.entries(ORDERS).map(([key, [words]]) => [key, words]), this.order,
+      el("div.segments", { role: "group", "aria-label": "What to review" }, ["objects", "changes"].map((what) =>
+        button(`${what === "changes" ? "Changes" : "Objects"} (${this.shown(what).length})`, () => { this.isChosen = true; this.what = what; this.choose(null); }, { "aria-pressed": what === this.what }))),
+      el("div.review-order", choice(Object.entries(ORDERS).map(([key, [words]]) => [key, words]), this.order,
         (order) => { this.order = order; this.refresh(); }, { "aria-label": "Order" }),
         tick("Unreviewed only", this.open, (open) => { this.open = open; this.refresh(); })),
-      all.length ? el("div", { class: "progress" }, el("progress", { max: all.length, value: done, "aria-label": "Reviewed" }), el("span", {}, `${done} of ${all.length} reviewed`)) : null,
-      list.length ? null : el("p", { class: "hint" }, all.length ? "All reviewed. Untick “Unreviewed only” to see them again." : `No ${this.what} to review${this.screen.data.all[this.what].length ? ": the filter hides them all" : ""}.`));
+      all.length ? el("div.progress", el("progress", { max: all.length, value: done, "aria-label": "Reviewed" }), el("span", `${done} of ${all.length} reviewed`)) : null,
+      list.length ? null : el("p.hint", all.length ? "All reviewed. Untick “Unreviewed only” to see them again." : `No ${this.what} to review${this.screen.data.all[this.what].length ? ": the filter hides them all" : ""}.`));
   }
 
   item(feature) {
     const chosen = feature.id === this.at;
     const words = { confirmed: "check", rejected: "cross" }[feature.properties.review];
-    return el("li", {}, el("button", { type: "button", "aria-current": chosen ? "true" : null, data: { id: feature.id }, class: feature.properties.review ?? "open", on: { click: () => this.choose(feature.id) } },
-      cropsOf(feature).length ? picture(cropsOf(feature).at(-1), "") : el("div", { class: "gone" }, "no picture yet"),
-      el("span", { class: "name" }, badge(feature), titleOf(feature)),
-      words ? el("span", { class: "mark" }, icon(words), el("span", { class: "sr" }, feature.properties.review)) : null));
+    return el("li", button([
+      cropsOf(feature).length ? picture(cropsOf(feature).at(-1), "") : el("div.gone", "no picture yet"),
+      el("span.name", badge(feature), titleOf(feature)),
+      words ? el("span.mark", icon(words), el("span.sr", feature.properties.review)) : null,
+    ], () => this.choose(feature.id), { "aria-current": chosen || null, data: { id: feature.id }, class: feature.properties.review ?? "open" }));
   }
 
   showBig(list) {
@@ -88,18 +84,18 @@ class Review {
     if (state === this.told) return; // what a person is about to press stays under the finger
     Object.assign(this, { drawn: this.at, told: state });
     this.pictures = pictures(feature);
-    this.film = el("ol", { class: "film", tabindex: 0, "aria-label": "Seen here, in order of time" });
+    this.film = el("ol.film", { tabindex: 0, "aria-label": "Seen here, in order of time" });
     const { data } = this.screen;
-    const [role, place] = [this.screen.station.status.role, middleOf(feature.geometry)];
+    const place = middleOf(feature.geometry);
     fill(this.big,
-      el("div", { class: "gallery-head" }, badge(feature), el("h3", {}, titleOf(feature)), el("span", { class: "soft" }, `${at + 1} of ${list.length}`),
-        isChange(feature) ? null : el("button", { type: "button", class: "quiet", "aria-pressed": "false", on: { click: (event) => this.around(feature, event.currentTarget) } }, "10 m around"),
-        button("Previous", () => this.step(-1), { class: "quiet", "aria-keyshortcuts": "K" }), button("Next", () => this.step(1), { class: "quiet", "aria-keyshortcuts": "J" })),
+      el("div.gallery-head", badge(feature), el("h3", titleOf(feature)), el("span.soft", `${at + 1} of ${list.length}`),
+        isChange(feature) ? null : quiet("10 m around", (event) => this.around(feature, event.currentTarget), { "aria-pressed": false }),
+        quiet("Previous", () => this.step(-1), { "aria-keyshortcuts": "K" }), quiet("Next", () => this.step(1), { "aria-keyshortcuts": "J" })),
       this.pictures, this.film,
-      el("div", { class: "gallery-foot" }, facts(feature, data.detail.is_local),
-        el("div", {}, verdictForm(this.screen, feature, { keys: role !== "view", given: (verdict, note) => this.give(verdict, note) }),
-          el("div", { class: "row" }, button("Show on the map", () => this.map(), { icon: "target", "aria-keyshortcuts": "M" }),
-            isChange(feature) ? button("Blink", () => this.blink(), { class: "quiet", "aria-keyshortcuts": "B" }) : null),
+      el("div.gallery-foot", facts(feature, data.detail.is_local),
+        el("div", verdictForm(this.screen, feature, { keys: true, given: (verdict, note) => this.give(verdict, note) }),
+          el("div.row", button("Show on the map", () => this.map(), { icon: "target", "aria-keyshortcuts": "M" }),
+            isChange(feature) ? quiet("Blink", () => this.blink(), { "aria-keyshortcuts": "B" }) : null),
           data.detail.is_local ? null : handover(data.id, titleOf(feature), place, feature.properties.sigma_m))));
     this.showFilm(feature, place);
     this.strip.querySelector("[aria-current]")?.scrollIntoView({ block: "nearest" });
@@ -111,14 +107,13 @@ class Review {
     const views = await get(`${siteUrl(this.screen.data.id, "place")}?lon=${lon}&lat=${lat}`).catch(() => []);
     if (film !== this.film) return;
     this.views = views.filter((each) => each.crop_url);
-    fill(film, this.views.map((each) => el("li", {}, el("button", { type: "button", class: "frame", "aria-label": `Seen ${time(each.time)}`, on: { click: () => this.large(feature, each) } }, picture(each.crop_url, "")),
-      each.video_url && each.video_s !== null ? button(`▶ ${duration(each.video_s)}`, () => this.screen.video.play(each), { class: "quiet", title: "Show the video at this second" }) : null)));
+    fill(film, this.views.map((each) => el("li", button(picture(each.crop_url, ""), () => this.large(feature, each), { class: "frame", "aria-label": `Seen ${time(each.time)}` }), jump(this.screen, each))));
   }
 
   /** The surroundings in place of the crop, or back. */
   around(feature, pressed) {
     const on = pressed.getAttribute("aria-pressed") !== "true";
-    pressed.setAttribute("aria-pressed", String(on));
+    press([pressed], () => on);
     if (on && this.views?.length) this.large(feature, this.views.find((each) => each.flight === feature.properties.flight) ?? this.views[0]);
     else if (!on) this.pictures.replaceWith(this.pictures = pictures(feature));
   }
@@ -128,7 +123,7 @@ class Review {
     const length_m = Math.max(1, Math.min(8, feature.properties.length_m || 2));
     const ring = svg("svg", { viewBox: "0 0 10 10", class: "scale", "aria-hidden": "true" }, svg("circle", { cx: 5, cy: 5, r: 0.65 * length_m }), svg("path", { d: "M.5 9.5h2M9.5 2V.6m-.3.5.3-.5.3.5" }),
       svg("text", { x: 0.5, y: 9.2 }, "2 m"), svg("text", { x: 9.35, y: 2.6 }, "N"));
-    const shown = el("div", { class: "pictures n1" }, el("figure", { class: "ground" }, picture(view.crop_url, `10 m around, ${time(view.time)}`), ring, el("figcaption", {}, time(view.time))));
+    const shown = el("div.pictures.n1", el("figure.ground", picture(view.crop_url, `10 m around, ${time(view.time)}`), ring, el("figcaption", time(view.time))));
     this.pictures.replaceWith(shown);
     this.pictures = shown;
   }
@@ -164,7 +159,7 @@ class Review {
   /** Judge what is shown, and go on to the next at once: whatever is pressed from now on is meant for that. */
   give(verdict, note = null) {
     const feature = this.screen.data.find(this.at);
-    if (!feature || this.screen.station.status.role === "view") return;
+    if (!feature || !this.screen.station.reviews) return;
     const list = this.list();
     const next = list[list.findIndex((each) => each.id === this.at) + 1]?.id;
     judge(this.screen, feature, verdict, note);

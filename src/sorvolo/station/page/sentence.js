@@ -1,6 +1,6 @@
 // The line above every room: what is known, as a result. It never states that nobody is there.
 
-import { area_m2 } from "./places.js";
+import { area_m2, polygonsOf } from "./places.js";
 import { counted, day, duration, percent } from "./words.js";
 
 const ACTS = { map: "Mapping", compare: "Comparing", watch: "Looking for people and vehicles", search: "Measuring the search" };
@@ -12,7 +12,7 @@ function polygonArea_m2([outer, ...inner]) {
   return inner.reduce((sum, each) => sum - area_m2(each), area_m2(outer));
 }
 
-const featureArea_m2 = ({ geometry: { type, coordinates } }) => (type === "MultiPolygon" ? coordinates : [coordinates]).reduce((sum, each) => sum + polygonArea_m2(each), 0);
+const featureArea_m2 = ({ geometry }) => polygonsOf(geometry).reduce((sum, each) => sum + polygonArea_m2(each), 0);
 
 /** How much of the ground of a measured search was looked at (a share), and with which chance somebody on all of it would
  * have been seen: null without a measured search. */
@@ -25,6 +25,11 @@ export function lookedAt(pod) {
   if (!(whole_m2 > 0)) return null;
   return { share: seen_m2 / whole_m2, from: sum(seen, (each) => each.pod_from) / whole_m2, to: sum(seen, (each) => each.pod_to) / whole_m2 };
 }
+
+/** Of what was found, what is there by the newest look at each place and by all verdicts. */
+export const thereOf = (objects) => objects.filter(({ properties: { review, gone } }) => review !== "rejected" && !gone);
+
+export const openOf = (...lists) => lists.flat().filter(({ properties: { review, gone } }) => !review && !gone);
 
 /**
  * The parts of the sentence: {words, act, kind}. `link` is "live", "late" (kept answers are shown), "waiting" or "lost"; `loaded` "yes", "no" or "failed";
@@ -54,7 +59,7 @@ export function sentence({ link, loaded, runs, objects, changes, pod, versions, 
   say(...found(objects, pod, running, runs));
   const looked = lookedAt(pod);
   say(looked ? `${percent(looked.share)} of the ground looked at (a person on it: ${Math.round(looked.from * 100)}–${percent(looked.to)})` : "how much was looked at is not measured", "coverage");
-  const open = [...objects, ...changes].filter(({ properties }) => !properties.review && !properties.gone).length;
+  const open = openOf(objects, changes).length;
   if (changes.length) say(counted(changes.length, "change"), "compare");
   if (open) say(`${open} to review`, "review");
   return parts;
@@ -62,7 +67,7 @@ export function sentence({ link, loaded, runs, objects, changes, pod, versions, 
 
 /** People first, then all else; where there is no person, why that says little. */
 function found(objects, pod, running, runs) {
-  const there = objects.filter(({ properties: { review, gone } }) => review !== "rejected" && !gone);
+  const there = thereOf(objects);
   const number = (name) => there.filter(({ properties }) => properties.class === name).length;
   const [people, cars] = [number("person"), number("car")];
   const others = there.length - people - cars;

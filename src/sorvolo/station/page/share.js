@@ -1,5 +1,6 @@
 // Places handed on: every way to write one, a link, what the device can send by.
 
+import { roomUrl } from "./api.js";
 import { button, el, fill } from "./dom.js";
 import { placeIn } from "./words.js";
 
@@ -16,10 +17,7 @@ export async function copy(text) {
   }
 }
 
-/** The page's address of a place on a site's map. */
-export function linkTo(site, [lon, lat]) {
-  return `${location.origin}/#/site/${encodeURIComponent(site)}/place?at=${lon.toFixed(7)},${lat.toFixed(7)}`;
-}
+export const placeUrl = (site, place) => `${roomUrl(site, "place")}?at=${place.map((each) => each.toFixed(7)).join(",")}`;
 
 /** What is sent of a place: what is there, where, how surely, a link. */
 function wordsOf(name, place, sigma_m, link) {
@@ -30,8 +28,8 @@ function wordsOf(name, place, sigma_m, link) {
 
 /** Buttons that hand a place on; `name` says what is there. */
 export function handover(site, name, place, sigma_m = null) {
-  const link = linkTo(site, place);
-  const done = el("span", { class: "soft", role: "status" });
+  const link = `${location.origin}/${placeUrl(site, place)}`;
+  const done = el("span.soft", { role: "status" });
   const give = async (what, text) => {
     await copy(text);
     fill(done, `${what} copied`);
@@ -49,9 +47,9 @@ export function handover(site, name, place, sigma_m = null) {
     await give("Place", text);
   };
   const systems = [["latlon", "Degrees"], ["dms", "Degrees, minutes, seconds"], ["utm", "UTM"], ["mgrs", "MGRS"]];
-  return el("div", { class: "handover" },
-    el("div", { class: "row" }, button("Send place", send, { class: "main", icon: "export" }), el("a", { class: "button", href: `geo:${place[1].toFixed(6)},${place[0].toFixed(6)}` }, "Navigate"), done),
-    el("details", {}, el("summary", {}, "Coordinates and link"), el("ul", { class: "plain" },
+  return el("div.handover",
+    el("div.row", button("Send place", send, { class: "main", icon: "export" }), el("a.button", { href: `geo:${place[1].toFixed(6)},${place[0].toFixed(6)}` }, "Navigate"), done),
+    el("details", el("summary", "Coordinates and link"), el("ul.plain",
       systems.map(([kind, words]) => [words, placeIn(kind, place)]).concat([["Link", link]]).map(([words, text]) =>
-        el("li", {}, button(text, () => give(words, text), { class: "link", title: `${words}: a tap copies it` }))))));
+        el("li", button(text, () => give(words, text), { class: "link", title: `${words}: a tap copies it` }))))));
 }

@@ -1,33 +1,32 @@
 // The screen of one site: three rooms, Live, Findings and Compare; the map with its tools; the sentence of what is known.
 
-import { get, kept, siteUrl } from "./api.js";
+import { get, kept, roomUrl, siteUrl } from "./api.js";
 import { showStationMap } from "./base_map.js";
 import { choices } from "./choices.js";
-import { comparePanel } from "./compare.js";
-import { button, el, fill, icon, message } from "./dom.js";
-import { drawPanel, loadDrawings } from "./draw.js";
+import { Compare } from "./compare.js";
+import { button, el, fill, message, press, quiet } from "./dom.js";
+import { Draw, loadDrawings } from "./draw.js";
 import { exportPanel } from "./exports.js";
 import { featureCard } from "./feature_card.js";
 import { ALL, chips } from "./filters.js";
 import { layersPanel } from "./layers.js";
-import { followLive } from "./live.js";
+import { Live } from "./live.js";
 import { canDraw, MapView } from "./map_view.js";
-import { missionsPanel } from "./missions.js";
+import { Missions } from "./missions.js";
 import { placePanel } from "./place.js";
-import { boundsOf, middleOf } from "./places.js";
-import { reviewPanel } from "./review.js";
+import { featureOf, middleOf } from "./places.js";
+import { Review } from "./review.js";
 import { sentence } from "./sentence.js";
 import { SiteData } from "./site_data.js";
 import { siteName } from "./sites.js";
-import { videoWall } from "./video.js";
+import { VideoWall } from "./video.js";
 import { votes } from "./votes.js";
 import * as words from "./words.js";
 
-const ROOMS = { live: ["Live", missionsPanel], findings: ["Findings", reviewPanel], compare: ["Compare", comparePanel] };
-const TOOLS = { layers: ["Layers", layersPanel, "layers"], measure: ["Measure and draw", drawPanel, "draw"], place: ["Memory of a place", placePanel, "place"], share: ["Share", exportPanel, "export"] };
+const ROOMS = { live: ["Live", Missions], findings: ["Findings", Review], compare: ["Compare", Compare] };
+const TOOLS = { layers: ["Layers", layersPanel, "layers"], measure: ["Measure and draw", Draw, "draw"], place: ["Memory of a place", placePanel, "place"], share: ["Share", exportPanel, "export"] };
 const ALL_PANELS = { ...ROOMS, ...TOOLS };
 const STOPS = ["half", "full", "peek"]; // of the sheet that a panel is on a phone
-const RUNS_CHANGE = ["run.started", "run.finished", "run.stopped", "run.failed", "run.deleted"];
 const STATUS_MS = 10000;
 
 /** Show a site; gives what closes it. */
@@ -45,19 +44,18 @@ function notMadeYet(id) {
 
 class SiteScreen {
   constructor({ main, title, rooms, known }, station, data, view, at) {
-    Object.assign(this, { station, data, known, ends: [], lastPlace: at, room: "live", loaded: "no", runs: [] });
-    this.stage = el("section", { class: "stage", "aria-label": "Map" });
-    this.panel = el("section", { class: "panel", id: "panel", tabindex: -1, data: { stop: "half" } });
-    this.canvas = el("div", { class: "map-canvas" });
-    this.readout = el("output", { class: "readout", "aria-label": "Place under the pointer" });
-    this.chips = el("div", { class: "chips" });
+    Object.assign(this, { station, data, known, over: new AbortController(), lastPlace: at, room: "live", loaded: "no", runs: [] });
+    this.stage = el("section.stage", { "aria-label": "Map" });
+    this.panel = el("section.panel", { id: "panel", tabindex: -1, data: { stop: "half" } });
+    this.canvas = el("div.map-canvas");
+    this.readout = el("output.readout", { "aria-label": "Place under the pointer" });
+    this.chips = el("div.chips");
     this.stage.append(this.canvas, this.chips, this.readout);
-    this.wall = el("section", { class: "wall", "aria-label": "Videos", hidden: true });
-    this.tabs = Object.entries(ROOMS).map(([name, [words_]]) => el("button", { type: "button", data: { panel: name }, "aria-controls": "panel", on: { click: () => this.open(name, true) } }, words_));
-    fill(rooms, this.tabs, el("button", { type: "button", class: "share", data: { panel: "share" }, "aria-controls": "panel", on: { click: () => this.open("share", true) } }, icon("export"), el("span", {}, "Share")));
-    this.tabs.push(rooms.lastElementChild);
-    fill(main, el("div", { class: "site" }, this.panel, this.stage, this.wall));
-    fill(title, el("h1", {}, siteName(data.detail)));
+    this.wall = el("section.wall", { "aria-label": "Videos", hidden: true });
+    const tab = (name, props) => button(ALL_PANELS[name][0], () => this.open(name, true), { data: { panel: name }, "aria-controls": "panel", ...props });
+    fill(rooms, this.tabs = [...Object.keys(ROOMS).map((name) => tab(name)), tab("share", { icon: "export", class: "share" })]);
+    fill(main, el("div.site", this.panel, this.stage, this.wall));
+    fill(title, el("h1", siteName(data.detail)), this.people = el("span.soft.present"));
     document.title = `${siteName(data.detail)} – Sorvolo`;
     this.tell(); // before the map is made: it lies over the map's ground
     this.begin(view);
@@ -65,8 +63,8 @@ class SiteScreen {
 
   begin(view) {
     if (!canDraw()) {
-      fill(this.canvas, el("div", { class: "starting" }, el("h2", {}, "This browser cannot draw the map"),
-        el("p", {}, "It has no WebGL 2. Use a newer Firefox, Chrome, Edge or Safari, or switch on hardware acceleration in its settings. Findings, missions and exports work without the map.")));
+      fill(this.canvas, el("div.starting", el("h2", "This browser cannot draw the map"),
+        el("p", "It has no WebGL 2. Use a newer Firefox, Chrome, Edge or Safari, or switch on hardware acceleration in its settings. Findings, missions and exports work without the map.")));
       this.view = null;
     } else {
       this.view = new MapView(this.canvas, this.data.detail, {
@@ -75,24 +73,22 @@ class SiteScreen {
       this.stage.append(this.tools());
     }
     this.card = featureCard(this);
-    this.live = followLive(this);
-    this.video = videoWall(this);
+    this.live = new Live(this);
+    this.video = new VideoWall(this);
     loadDrawings(this); // alert zones count in every room
-    this.onKey = (event) => this.key(event);
-    addEventListener("keydown", this.onKey);
+    this.hear(window, "keydown", (event) => this.key(event));
     const { events } = this.station;
-    const here = (listener) => ({ detail }) => { if (detail.site === this.data.id) listener(detail); };
     this.hear(this.data, "data", (event) => this.draw(event.detail));
     this.hear(this.data, "filters", () => { fill(this.chips, chips(this.data)); this.draw(["objects", "changes"]); });
     this.hear(this.data, "chosen", () => this.drawChosen());
     this.hear(choices, "change", (event) => { this.view?.follow(); if (event.detail !== "layers") this.redraw(); });
     this.hear(matchMedia("(prefers-color-scheme: dark)"), "change", () => this.view?.follow());
-    for (const type of ["site.changed", ...RUNS_CHANGE.slice(1)]) this.hear(events, type, (event) => this.reload(event.detail));
-    this.hear(events, "run.started", here(() => this.loadRuns()));
-    this.hear(events, "run.progress", here(({ run, data }) => { const found = this.runs.find(({ id }) => id === run); if (found) { found.progress = data; this.opened?.running?.(); this.tell(); } }));
-    this.hear(events, "site.gone", here(() => this.gone()));
+    for (const type of ["site.changed", "run.finished", "run.stopped", "run.failed", "run.deleted"]) this.on(type, (data, event) => this.reload(event));
+    this.on("run.started", () => this.loadRuns());
+    this.on("run.progress", (data, { run }) => { const found = this.runs.find(({ id }) => id === run); if (found) { found.progress = data; this.opened?.running?.(); this.tell(); } });
+    this.on("site.gone", () => this.gone());
     this.hear(events, "state", ({ detail }) => { if (detail === "live") this.check(); this.tell(); });
-    this.hear(events, "review.changed", here(({ data }) => this.data.judge(data)));
+    this.on("review.changed", (data) => this.data.judge(data));
     this.hear(votes, "change", () => { this.data.expect(); this.data.changed(["changes", "objects"]); });
     this.hear(votes, "taken", ({ detail: { vote, answer } }) => { if (vote.site === this.data.id) this.data.judge(answer); });
     this.hear(votes, "refused", ({ detail }) => this.refused(detail));
@@ -101,32 +97,36 @@ class SiteScreen {
       event.preventDefault();
       if (event.dataTransfer.files.length) { this.open("live", true); this.opened.take(event.dataTransfer.files); }
     });
-    const timers = [setInterval(() => this.tell(), 1000), setInterval(() => this.look(), STATUS_MS)];
-    this.ends.push(() => timers.forEach(clearInterval));
+    this.timers = [setInterval(() => this.tell(), 1000), setInterval(() => this.look(), STATUS_MS)];
     this.open(view);
     this.load();
+    this.look();
   }
 
-  /** What is done on the map itself. */
   tools() {
-    const tool = (words_, drawn, act, props = {}) => el("button", { type: "button", title: words_, "aria-label": words_, on: { click: act }, ...props }, icon(drawn));
-    this.follower = tool("Follow the drone", "video", () => this.follow(!this.live.follows), { "aria-pressed": "true" });
-    return el("div", { class: "map-tools", role: "toolbar", "aria-label": "Map tools" },
+    const tool = (title, drawn, act, props = {}) => button("", act, { icon: drawn, title, "aria-label": title, ...props });
+    this.follower = tool("Follow the drone", "video", () => this.follow(!this.live.follows), { "aria-pressed": true });
+    return el("div.map-tools", { role: "toolbar", "aria-label": "Map tools" },
       tool("Whole site", "fit", () => { if (this.data.detail.bounds_wgs84) this.view.go(this.data.detail.bounds_wgs84); this.follow(false); }), this.follower,
       Object.entries(TOOLS).filter(([name]) => name !== "share").map(([name, [words_, , drawn]]) => tool(words_, drawn, () => (this.shown === name ? this.open(this.room) : this.open(name, true)), { data: { panel: name } })));
   }
 
   /** Keep the drone in the middle of the map, until somebody moves it. */
   follow(on) {
-    if (!this.live || this.live.follows === on) return;
+    if (!this.view || !this.live || this.live.follows === on) return;
     this.live.follows = on;
-    this.follower.setAttribute("aria-pressed", String(on));
+    press([this.follower], () => on);
     if (on) this.live.drawSoon();
   }
 
-  hear(target, type, listener) {
-    target.addEventListener(type, listener);
-    this.ends.push(() => target.removeEventListener(type, listener));
+  /** Hear events while the screen is shown, or while something in it is. */
+  hear(target, type, listener, { signal } = this.over) {
+    target.addEventListener(type, listener, { signal });
+  }
+
+  /** Hear the station's events of this site: `listener(data, event)`. */
+  on(type, listener, during = this.over) {
+    this.hear(this.station.events, type, ({ detail }) => { if (detail.site === this.data.id) listener(detail.data ?? {}, detail); }, during);
   }
 
   /** A vote that the station does not take: what it has is shown again. */
@@ -184,10 +184,12 @@ class SiteScreen {
   /** The station's own state: its disk, who is logged in; and what could not be loaded is tried again. */
   async look() {
     try {
-      this.station.status = { ...this.station.status, ...await get("/api/status") };
+      this.station.status = { ...this.station.status, ...await get(`/api/status?site=${encodeURIComponent(this.data.id)}`) };
+      const others = this.station.status.present.filter((name) => name !== this.station.status.name);
+      fill(this.people, others.length ? `also here: ${others.join(", ")}` : "");
       if (this.closed || this.station.events.state !== "live") return;
       if (this.station.status.name !== votes.who) location.reload(); // another tab changed it
-      if (this.loaded === "failed" || this.isOld) await this.reload({ site: this.data.id });
+      if (this.loaded === "failed" || this.isOld) await this.reload();
     } catch { /* the sentence states it */ }
   }
 
@@ -203,14 +205,13 @@ class SiteScreen {
     this.told = text;
     this.known.dataset.loaded = this.loaded;
     const acts = { live: () => this.open("live", true), review: () => this.open("findings", true), compare: () => this.open("compare", true), coverage: () => { this.view?.show("pod", true); this.open("layers", true); } };
-    fill(this.known, parts.map(({ words: said, act, kind }, k) => [k ? " · " : null, act ? el("button", { type: "button", class: `link ${kind}`, on: { click: acts[act] } }, said) : el("span", { class: kind }, said)]));
+    fill(this.known, parts.map(({ words: said, act, kind }, k) => [k ? " · " : null, act ? button(said, acts[act], { class: `link ${kind}` }) : el("span", { class: kind }, said)]));
   }
 
-  async reload({ site, type, data }) {
-    if (site !== this.data.id) return;
+  async reload({ type, data } = {}) {
     try {
       // its first mission failed, or the records of its missions go because it does
-      const isHere = !(this.data.detail.is_new || type === "run.deleted") || await isMade(site);
+      const isHere = !(this.data.detail.is_new || type === "run.deleted") || await isMade(this.data.id);
       const wasNew = this.data.detail.is_new || !this.data.detail.bounds_wgs84;
       await this.learn(async () => {
         if (isHere) {
@@ -237,7 +238,7 @@ class SiteScreen {
     if (this.data.detail.is_new) return;
     try {
       await get(siteUrl(this.data.id));
-      if (this.loaded === "failed") await this.reload({ site: this.data.id });
+      if (this.loaded === "failed") await this.reload();
     } catch (problem) { this.lost(problem); }
   }
 
@@ -259,17 +260,17 @@ class SiteScreen {
     this.opened?.close?.();
     this.shown = shown;
     if (shown in ROOMS) this.room = shown;
-    for (const each of [...this.tabs, ...this.stage.querySelectorAll(".map-tools [data-panel]")]) each.setAttribute("aria-pressed", String(each.dataset.panel === shown));
+    press([...this.tabs, ...this.stage.querySelectorAll(".map-tools [data-panel]")], (each) => each.dataset.panel === shown);
     this.stage.dataset.panel = document.body.dataset.panel = shown;
     const [words_, made] = ALL_PANELS[shown];
     const body = el("div", { class: `body ${shown}` });
-    fill(this.panel, el("div", { class: "panel-head" }, button("", () => this.resize(), { class: "quiet handle", "aria-label": "More or less of this sheet" }), el("h2", {}, words_),
-      shown in TOOLS ? button("Close", () => this.open(this.room), { class: "quiet", icon: "close" }) : null), body);
+    fill(this.panel, el("div.panel-head", button("", () => this.resize(), { class: "quiet handle", "aria-label": "More or less of this sheet" }), el("h2", words_),
+      shown in TOOLS ? quiet("Close", () => this.open(this.room), { icon: "close" }) : null), body);
     this.panel.setAttribute("aria-label", words_);
     if (byHand && this.panel.dataset.stop === "peek") this.resize("half");
-    this.opened = made(this, body) ?? {};
+    this.opened = new made(this, body);
     this.card.show(this.data.chosen);
-    history.replaceState(null, "", `#/site/${encodeURIComponent(this.data.id)}/${shown}`);
+    history.replaceState(null, "", roomUrl(this.data.id, shown));
     if (byHand) this.panel.focus({ preventScroll: true });
   }
 
@@ -282,14 +283,10 @@ class SiteScreen {
     if (this.opened?.click?.(place, hits)) return;
     const hit = hits.find((each) => ["objects", "changes"].includes(each.source));
     const found = hit && this.data.find(hit.properties.id);
-    if (found) this.data.choose(found);
-    else {
-      this.data.choose(null);
-      if (!this.data.detail.is_new) {
-        if (this.shown !== "place") this.open("place");
-        this.opened.look?.(place, hits);
-      }
-    }
+    this.data.choose(found || null);
+    if (found || this.data.detail.is_new) return;
+    if (this.shown !== "place") this.open("place");
+    this.opened.look?.(place, hits);
   }
 
   moved(place, hits) {
@@ -313,7 +310,7 @@ class SiteScreen {
 
   drawChosen() {
     const chosen = this.data.chosen;
-    this.view?.put("chosen", chosen ? [chosen, { type: "Feature", properties: {}, geometry: { type: "Point", coordinates: middleOf(chosen.geometry) } }] : []);
+    this.view?.put("chosen", chosen ? [chosen, featureOf("Point", middleOf(chosen.geometry))] : []);
     this.card.show(chosen);
     this.opened?.chosen?.(chosen);
   }
@@ -323,11 +320,10 @@ class SiteScreen {
     this.opened?.refresh?.();
   }
 
-  /** Move the map to a feature. */
   goTo(feature) {
-    const box = boundsOf([feature.geometry]);
+    const middle = middleOf(feature.geometry);
     this.follow(false);
-    if (box) this.view?.go([(box[0] + box[2]) / 2, (box[1] + box[3]) / 2]);
+    if (middle) this.view?.go(middle);
   }
 
   key(event) {
@@ -347,8 +343,8 @@ class SiteScreen {
     this.opened?.close?.();
     this.live.close();
     this.video.close();
-    for (const end of this.ends) end();
-    removeEventListener("keydown", this.onKey);
+    this.over.abort();
+    this.timers.forEach(clearInterval);
     delete document.body.dataset.panel;
     this.view?.close();
   }

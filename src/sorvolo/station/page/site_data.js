@@ -19,7 +19,6 @@ export class SiteData extends EventTarget {
     this.versions = null; // [from, to] of a comparison that narrows the changes
   }
 
-  /** Load collections anew. */
   async load(names = NAMES) {
     await Promise.all(names.map(async (name) => {
       const mine = this.turns[name] = (this.turns[name] ?? 0) + 1;
@@ -33,7 +32,6 @@ export class SiteData extends EventTarget {
     this.changed(names);
   }
 
-  /** Load the site's own description anew. */
   async loadDetail() {
     this.detail = await get(siteUrl(this.id));
     this.changed(["detail"]);
@@ -82,7 +80,6 @@ export class SiteData extends EventTarget {
     this.changed([name]);
   }
 
-  /** Take a feature out. */
   drop(name, id) {
     this.all[name] = this.all[name].filter((each) => each.id !== id);
     this.changed([name]);
@@ -115,6 +112,19 @@ const isOf = (feature, id) => feature.id === id || (feature.properties.sightings
 
 /** Whether a feature is a change; else it is an object. */
 export const isChange = (feature) => feature.properties.kind !== undefined;
+
+export function grouped(list, keyOf) {
+  const groups = new Map();
+  for (const each of list) groups.set(keyOf(each), [...(groups.get(keyOf(each)) ?? []), each]);
+  return groups;
+}
+
+const isPerson = ({ properties }) => properties.class === "person";
+
+/** Features in an order, people before all else. */
+export const peopleFirst = (list, order) => [...list].sort((one, other) => isPerson(other) - isPerson(one) || order(one, other));
+
+export const newestFirst = (one, other) => String(other.properties.first_seen ?? "").localeCompare(one.properties.first_seen ?? "");
 
 /** The addresses of a feature's pictures: none while the mission that announced it runs. */
 export const cropsOf = (feature) => feature.properties.crops ?? [];

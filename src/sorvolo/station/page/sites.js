@@ -1,7 +1,8 @@
 // The start page: drones that send, with one button each; the sites; flights dropped on the page.
 
-import { ask, get, siteUrl } from "./api.js";
-import { button, dialog, el, field, fill, report } from "./dom.js";
+import { ask, get, roomUrl, siteUrl } from "./api.js";
+import { button, dialog, el, field, fill, quiet, report } from "./dom.js";
+import { isWithin, tileColumn, tileRow } from "./places.js";
 import { DroneVideo } from "./video.js";
 import * as words from "./words.js";
 import { choices } from "./choices.js";
@@ -10,14 +11,13 @@ const PREVIEW_SHAPE = 1.6; // width over height
 const LOOK_MS = 5000;
 const HEARD = ["run.started", "run.finished", "run.failed", "site.changed", "site.gone", "stream.state"];
 
-/** Show drones and sites; keeps both fresh. */
 export async function showSites({ main, title }, station) {
-  fill(title, el("h1", { class: "sr" }, "Sites"));
+  fill(title, el("h1.sr", "Sites"));
   document.title = "Sorvolo station";
   const videos = new Map();
   let [shown, closed] = ["", false];
-  const drones = el("section", { class: "drones", "aria-label": "Drones" });
-  const below = el("div", {});
+  const drones = el("section.drones", { "aria-label": "Drones" });
+  const below = el("div");
   const load = async () => {
     const [sites, streams] = await Promise.all([get("/api/sites"), get("/api/streams")]);
     if (closed) return;
@@ -34,18 +34,18 @@ export async function showSites({ main, title }, station) {
     fill(drones, on.map((each) => droneCard(each, videos.get(each.stream), sites, station)));
     fill(below, sites.length ? list(sites, station) : on.length ? null : firstRun(station));
   };
-  fill(main, el("div", { class: "sites" }, drones, below));
+  fill(main, el("div.sites", drones, below));
   await load();
   const again = () => load().catch(() => {});
-  for (const type of HEARD) station.events.addEventListener(type, again);
-  choices.addEventListener("change", again);
+  const over = new AbortController();
+  for (const type of HEARD) station.events.addEventListener(type, again, over);
+  choices.addEventListener("change", again, over);
   const timer = setInterval(again, LOOK_MS); // where a drone is becomes known as it flies
   return {
     close() {
       closed = true;
       clearInterval(timer);
-      for (const type of HEARD) station.events.removeEventListener(type, again);
-      choices.removeEventListener("change", again);
+      over.abort();
       for (const each of videos.values()) each.close();
     },
   };
@@ -54,7 +54,7 @@ export async function showSites({ main, title }, station) {
 /** The site over whose ground a drone flies. */
 function siteAt(sites, telemetry) {
   const { latitude_deg: lat, longitude_deg: lon } = telemetry ?? {};
-  return sites.find(({ bounds_wgs84: box }) => box && lon >= box[0] && lon <= box[2] && lat >= box[1] && lat <= box[3]);
+  return sites.find(({ bounds_wgs84: box }) => box && isWithin([lon, lat], box));
 }
 
 /** A drone with its moving picture, and the next act: to map what it flies over and look for people. */
@@ -62,64 +62,65 @@ function droneCard({ stream, telemetry }, video, sites, station) {
   const { latitude_deg: lat, longitude_deg: lon } = telemetry ?? {};
   const here = siteAt(sites, telemetry);
   const site = here?.id ?? `${stream} ${new Date().toISOString().slice(0, 10)}`;
-  const fault = el("p", { class: "error", role: "alert" });
+  const fault = el("p.error", { role: "alert" });
   const start = async (event) => {
     const pressed = event.currentTarget;
     pressed.disabled = true;
     try {
       await (await import("./missions.js")).mapAndFind(stream, site, Boolean(here?.versions));
-      location.hash = `#/site/${encodeURIComponent(site)}/live`;
+      location.hash = roomUrl(site);
     } catch (problem) {
-      fill(fault, `${problem.title}. ${problem.detail}`);
+      fill(fault, problem.words);
       pressed.disabled = false;
     }
   };
-  const may = station.status.role === "operate";
-  return el("article", { class: "card drone" }, video.pane, el("p", {}, "Sends now", lat === undefined || lat === null ? "" : ` at ${words.place([lon, lat])}`, here ? `, over ${siteName(here)}` : ""),
-    may ? button("Map and find people", start, { class: "main" }) : el("p", { class: "note" }, "View only. Ask the team lead for operator access."),
-    here ? el("p", {}, el("a", { href: `#/site/${encodeURIComponent(here.id)}` }, `Look at ${siteName(here)}`)) : null, fault);
+  return el("article.card.drone", video.pane, el("p", "Sends now", lat === undefined || lat === null ? "" : ` at ${words.place([lon, lat])}`, here ? `, over ${siteName(here)}` : ""),
+    station.operates ? button("Map and find people", start, { class: "main" }) : mayNot(),
+    here ? el("p", el("a", { href: roomUrl(here.id) }, `Look at ${siteName(here)}`)) : null, fault);
 }
 
 function list(sites, station) {
-  return [el("h2", {}, "Sites"),
-    el("ul", { class: "cards" }, sites.map((site) => card(site, station.status.role === "operate"))),
-    station.status.role === "operate" ? newSite() : null];
+  return [el("h2", "Sites"),
+    el("ul.cards", sites.map((site) => card(site, station.operates))),
+    station.operates ? newSite() : null];
 }
 
 function card(site, may) {
-  const remove = may ? button("Delete", () => showDeletion(site).catch(report), { class: "quiet", "aria-label": `Delete ${site.id}` }) : null;
+  const remove = may ? quiet("Delete", () => showDeletion(site).catch(report), { "aria-label": `Delete ${site.id}` }) : null;
   if (site.error) {
-    return el("li", { class: "card broken" }, el("h3", {}, site.name), el("p", {}, site.error), remove);
+    return el("li.card.broken", el("h3", site.name), el("p", site.error), remove);
   }
-  const href = `#/site/${encodeURIComponent(site.id)}`;
   const where = site.is_local ? "no GPS" : site.center_wgs84 ? words.place(site.center_wgs84) : "nothing mapped yet";
-  return el("li", { class: "card" },
-    el("a", { href },
-      site.versions && site.bounds_wgs84 ? preview(site) : el("div", { class: "preview none" }, "no map yet"),
-      el("h3", {}, siteName(site))),
-    el("p", {}, words.counted(site.flights, "flight"), " · ", words.counted(site.versions, "version")),
-    el("p", { class: "soft" }, where, site.updated_at ? ` · ${words.time(site.updated_at)}` : ""),
-    remove ? el("details", { class: "more" }, el("summary", { "aria-label": `More of ${site.id}` }, "⋯"), remove) : null);
+  return el("li.card",
+    el("a", { href: roomUrl(site.id) },
+      site.versions && site.bounds_wgs84 ? preview(site) : el("div.preview.none", "no map yet"),
+      el("h3", siteName(site))),
+    el("p", words.counted(site.flights, "flight"), " · ", words.counted(site.versions, "version")),
+    el("p.soft", where, site.updated_at ? ` · ${words.time(site.updated_at)}` : ""),
+    remove ? el("details.more", el("summary", { "aria-label": `More of ${site.id}` }, "⋯"), remove) : null);
 }
 
 /** State what would be lost with a site, and delete it when its id is typed (two may have one name); or why it cannot be deleted now. */
 async function showDeletion(site) {
   const loss = await get(siteUrl(site.id, "deletion"));
   const name = el("input", { autocomplete: "off", spellcheck: "false" });
-  const remove = el("button", { class: "main", disabled: true }, "Delete");
+  const remove = el("button.main", { disabled: true }, "Delete");
   name.addEventListener("input", () => { remove.disabled = name.value.trim() !== site.id; });
-  const form = el("form", { class: "stack", on: { submit: async (event) => {
+  const form = el("form.stack", { on: { submit: async (event) => {
     event.preventDefault();
     box.close();
     try { await ask("DELETE", siteUrl(site.id), undefined, { headers: { "if-match": loss.etag } }); } catch (problem) { report(problem); }
   } } },
-  el("p", {}, loss.versions === null ? "This site cannot be read." : `${words.counted(loss.flights, "flight")}, ${words.counted(loss.versions, "version")} of the map.`,
+  el("p", loss.versions === null ? "This site cannot be read." : `${words.counted(loss.flights, "flight")}, ${words.counted(loss.versions, "version")} of the map.`,
     ` ${words.counted(loss.files, "file")}, ${words.bytes(loss.bytes)}.`),
-  el("p", { class: "note" }, `Verdicts and drawings go with it, and the records of its missions (${loss.missions}) with what watches found. Recordings and uploads stay.`),
+  el("p.note", `Verdicts and drawings go with it, and the records of its missions (${loss.missions}) with what watches found. Recordings and uploads stay.`),
   field(`Type ${site.id} to confirm`, name), remove);
   const box = dialog(`Delete the site ${site.id} for good?`, form);
   name.focus();
 }
+
+/** What stands in the place of what a person may not do. */
+export const mayNot = (role = "operator") => el("p.note", `View only. Ask the team lead for ${role} access.`);
 
 /** A site as its list and title name it: its folder below the root. */
 export const siteName = (site) => (site.id.includes(":") ? site.id.replaceAll(":", " / ") : site.name);
@@ -127,15 +128,14 @@ export const siteName = (site) => (site.id.includes(":") ? site.id.replaceAll(":
 /** The tiles over the site's box, laid so that the box fills the picture. */
 function preview(site) {
   const [west, south, east, north] = site.bounds_wgs84;
-  const x = (lon) => (lon + 180) / 360;
-  const y = (lat) => (1 - Math.asinh(Math.tan(lat * (Math.PI / 180))) / Math.PI) / 2;
-  const box = [x(west), y(north), Math.max(x(east) - x(west), 1e-9), Math.max(y(south) - y(north), 1e-9)];
+  const [x, y] = [tileColumn(west, 0), tileRow(north, 0)];
+  const box = [x, y, Math.max(tileColumn(east, 0) - x, 1e-9), Math.max(tileRow(south, 0) - y, 1e-9)];
   const z = Math.max(8, Math.min(22, Math.floor(-Math.log2(Math.max(box[2], box[3]))) + 1));
   const size = 1 / 2 ** z;
   const images = [];
   for (let column = Math.floor(box[0] / size); column * size < box[0] + box[2]; column++) {
     for (let row = Math.floor(box[1] / size); row * size < box[1] + box[3]; row++) {
-      const image = el("img", { src: `/api/sites/${encodeURIComponent(site.id)}/tiles/live/${z}/${column}/${row}.webp`, alt: "", loading: "lazy" });
+      const image = el("img", { src: siteUrl(site.id, "tiles/live", z, column, `${row}.webp`), alt: "", loading: "lazy" });
       const share = Math.max(box[2], box[3] * PREVIEW_SHAPE); // of the world, over the picture's width
       Object.assign(image.style, {
         left: `${(column * size - box[0] - (box[2] - share) / 2) / share * 100}%`, width: `${size / share * 100}%`,
@@ -145,32 +145,31 @@ function preview(site) {
       images.push(image);
     }
   }
-  return el("div", { class: "preview" }, images);
+  return el("div.preview", images);
 }
 
 function newSite() {
-  const name = el("input", { required: true, maxlength: 80, placeholder: "My field" });
-  name.setAttribute("aria-label", "Name of a new site");
-  return el("form", { class: "row new-site", on: { submit: (event) => {
+  const name = el("input", { required: true, maxlength: 80, placeholder: "My field", "aria-label": "Name of a new site" });
+  return el("form.row.new-site", { on: { submit: (event) => {
     event.preventDefault();
     const id = name.value.trim().replaceAll(/[/\\:]+/g, "-"); // a site is a folder
-    location.hash = `#/site/${encodeURIComponent(id)}/live`;
-  } } }, name, el("button", {}, "New site"));
+    location.hash = roomUrl(id);
+  } } }, name, el("button", "New site"));
 }
 
 function firstRun(station) {
-  return el("div", { class: "first-run" },
-    el("h2", {}, "No site yet"),
-    el("p", {}, "A site is a piece of ground with its maps, flight after flight. Three ways to the first one:"),
-    el("ol", { class: "ways" },
-      el("li", {}, el("h3", {}, "See it with a demo flight"),
-        el("p", {}, "Two simulated flights over a village, mapped and compared in about two minutes. On the station's machine, in the folder it serves:"),
-        el("pre", { tabindex: 0 }, el("code", {}, "sorvolo demo")),
-        el("p", { class: "soft" }, "The site appears here when it is done.")),
-      el("li", {}, el("h3", {}, "Map a flight of yours"),
-        el("p", {}, "Name the site, then upload a video with its telemetry, or a folder of photos."),
-        station.status.role === "operate" ? newSite() : el("p", { class: "soft" }, "View only. Ask the team lead for operator access.")),
-      el("li", {}, el("h3", {}, "Let the drone stream"),
-        el("p", {}, "On its companion computer, or to replay a recorded flight:"),
-        el("pre", { tabindex: 0 }, el("code", {}, `sorvolo stream FLIGHT.MP4 --to ${location.origin}`)))));
+  return el("div.first-run",
+    el("h2", "No site yet"),
+    el("p", "A site is a piece of ground with its maps, flight after flight. Three ways to the first one:"),
+    el("ol.ways",
+      el("li", el("h3", "See it with a demo flight"),
+        el("p", "Two simulated flights over a village, mapped and compared in about two minutes. On the station's machine, in the folder it serves:"),
+        el("pre", { tabindex: 0 }, el("code", "sorvolo demo")),
+        el("p.soft", "The site appears here when it is done.")),
+      el("li", el("h3", "Map a flight of yours"),
+        el("p", "Name the site, then upload a video with its telemetry, or a folder of photos."),
+        station.operates ? newSite() : mayNot()),
+      el("li", el("h3", "Let the drone stream"),
+        el("p", "On its companion computer, or to replay a recorded flight:"),
+        el("pre", { tabindex: 0 }, el("code", `sorvolo stream FLIGHT.MP4 --to ${location.origin}`)))));
 }

@@ -1,6 +1,7 @@
 // Uploads that go on where they were cut off: the tus protocol 1.0.0, creation and resumption, in pieces.
 
 import { Problem, send } from "./api.js";
+import { stored } from "./choices.js";
 import { message } from "./dom.js";
 import { bytes } from "./words.js";
 
@@ -21,7 +22,7 @@ export class Upload extends EventTarget {
   }
 
   async send() {
-    let url = recall(this.key);
+    let url = stored.get(this.key);
     let offset = url ? await this.offsetAt(url) : null;
     if (offset === null) {
       url = await this.create();
@@ -42,7 +43,7 @@ export class Upload extends EventTarget {
         offset = await this.offsetAt(url) ?? offset;
       }
     }
-    forget(this.key);
+    stored.set(this.key, null);
     return this.checked(url);
   }
 
@@ -74,7 +75,7 @@ export class Upload extends EventTarget {
     const answer = await send("/api/uploads", { method: "POST", headers: { ...VERSION, "upload-length": String(this.file.size), "upload-metadata": metadata }, signal: this.stopped.signal });
     const url = answer.headers.get("location");
     if (!url) throw new Problem(500, "The upload did not begin", "The station gave it no address; look at its messages.");
-    remember(this.key, url);
+    stored.set(this.key, url);
     return url;
   }
 
@@ -84,7 +85,7 @@ export class Upload extends EventTarget {
       const answer = await send(url, { method: "HEAD", headers: VERSION, signal: this.stopped.signal });
       return Number(answer.headers.get("upload-offset"));
     } catch (problem) {
-      if ([403, 404, 410].includes(problem.status)) forget(this.key);
+      if ([403, 404, 410].includes(problem.status)) stored.set(this.key, null);
       else if (problem.status === 0 || problem.name === "AbortError") throw problem;
       return null;
     }
@@ -98,15 +99,3 @@ export class Upload extends EventTarget {
 }
 
 const base64 = (text) => btoa(String.fromCharCode(...new TextEncoder().encode(text)));
-
-function recall(key) {
-  try { return localStorage.getItem(key); } catch { return null; }
-}
-
-function remember(key, url) {
-  try { localStorage.setItem(key, url); } catch { /* without storage an upload cannot outlive the page */ }
-}
-
-function forget(key) {
-  try { localStorage.removeItem(key); } catch { /* nothing was kept */ }
-}

@@ -1,8 +1,9 @@
 // A person's vote on an object or a change: confirm, reject, not sure, note; votes that differ are shown as disputed, none is overwritten.
 
 import { get, siteUrl } from "./api.js";
-import { button, el, fill } from "./dom.js";
+import { button, el, fill, quiet } from "./dom.js";
 import { isChange } from "./site_data.js";
+import { mayNot } from "./sites.js";
 import { votes } from "./votes.js";
 import * as words from "./words.js";
 
@@ -12,24 +13,20 @@ export function judge(screen, feature, verdict, note = null) {
   votes.add({ site: screen.data.id, kind, id: feature.id, verdict, note: note ?? feature.properties.note ?? "" });
 }
 
-const wordsOf = (verdict) => (verdict === "none" || !verdict ? "no verdict" : verdict);
-
 /** Who judged it how and when, in a line. */
 export function verdictLine(feature) {
   const { review, reviewer, reviewed_at: at, note, review_state: state, waiting } = feature.properties;
-  if (waiting) return el("p", { class: `verdict ${review || "none"}` }, el("b", {}, wordsOf(review)), " · waits to be sent", note ? el("span", { class: "remark" }, ` “${note}”`) : "");
-  if (!review && !note) return el("p", { class: "verdict none" }, "Not reviewed yet");
-  return el("p", { class: `verdict ${review || "none"}` }, el("b", {}, wordsOf(review)),
-    state === "agreed" ? ", agreed" : "", reviewer ? ` by ${reviewer}` : "", at ? `, ${words.time(at)}` : "", note ? el("span", { class: "remark" }, ` “${note}”`) : "");
+  if (!waiting && !review && !note) return el("p.verdict.none", "Not reviewed yet");
+  return el("p", { class: `verdict ${review || "none"}` }, el("b", review && review !== "none" ? review : "no verdict"),
+    waiting ? " · waits to be sent" : [state === "agreed" ? ", agreed" : "", reviewer ? ` by ${reviewer}` : "", at ? `, ${words.time(at)}` : ""], note ? el("span.remark", ` “${note}”`) : "");
 }
 
 /** Buttons and a note for a feature. `given(verdict, note)`: what a button does, if not only to judge. */
 export function verdictForm(screen, feature, { keys = false, given = null } = {}) {
-  const may = screen.station.status.role !== "view";
-  const line = el("div", {}, verdictLine(feature));
-  const others = el("ul", { class: "plain votes", "aria-label": "Votes" });
+  const line = el("div", verdictLine(feature));
+  const others = el("ul.plain.votes", { "aria-label": "Votes" });
   showVotes(screen, feature, others);
-  if (!may) return el("div", {}, line, others, el("p", { class: "note" }, "View only. Ask the team lead for reviewer access."));
+  if (!screen.station.reviews) return el("div", line, others, mayNot("reviewer"));
   const note = el("input", { type: "text", maxlength: 2000, placeholder: "Note", "aria-label": "Note", ".value": feature.properties.note ?? "" });
   const current = feature.properties.review;
   const give = (verdict) => {
@@ -41,15 +38,13 @@ export function verdictForm(screen, feature, { keys = false, given = null } = {}
     if (event.key === "Escape") note.blur();
     event.stopPropagation();
   });
-  const press = (verdict) => (given ? given(verdict, note.value.trim()) : give(verdict));
-  const hint = (key) => (keys ? el("kbd", { "aria-hidden": true }, key) : null);
-  return el("div", { class: "verdict-form" }, line, others,
-    el("div", { class: "row" },
-      el("button", { type: "button", class: "confirm", "aria-pressed": String(current === "confirmed"), on: { click: () => press("confirmed") } }, "Confirm", hint("C")),
-      el("button", { type: "button", class: "reject", "aria-pressed": String(current === "rejected"), on: { click: () => press("rejected") } }, "Reject", hint("R")),
-      el("button", { type: "button", class: "quiet", "aria-pressed": String(current === "unsure"), on: { click: () => press("unsure") } }, "Not sure"),
-      current ? el("button", { type: "button", class: "quiet", on: { click: () => press("none") } }, "Withdraw", hint("U")) : null),
-    el("div", { class: "row" }, note, button("Save note", () => give(null), { class: "quiet" })));
+  const vote = (words, verdict, key, style) => button([words, keys && key ? el("kbd", { "aria-hidden": true }, key) : null],
+    () => (given ? given(verdict, note.value.trim()) : give(verdict)), { class: style, "aria-pressed": current === verdict });
+  return el("div.verdict-form", line, others,
+    el("div.row",
+      vote("Confirm", "confirmed", "C", "confirm"), vote("Reject", "rejected", "R", "reject"), vote("Not sure", "unsure", "", "quiet"),
+      current ? vote("Withdraw", "none", "U", "quiet") : null),
+    el("div.row", note, quiet("Save note", () => give(null))));
 }
 
 /** Each person's last vote, where several people voted. */
@@ -58,5 +53,5 @@ async function showVotes(screen, feature, list) {
   const query = new URLSearchParams({ kind: isChange(feature) ? "change" : "object", id: feature.id });
   const given = await get(`${siteUrl(screen.data.id, "reviews")}?${query}`).catch(() => []);
   const last = [...new Map(given.reverse().map((each) => [each.who, each])).values()].filter(({ verdict }) => verdict !== "none");
-  if (last.length > 1) fill(list, last.map(({ who, verdict, at }) => el("li", {}, el("b", {}, who), `: ${verdict}, ${words.time(at)}`)));
+  if (last.length > 1) fill(list, last.map(({ who, verdict, at }) => el("li", el("b", who), `: ${verdict}, ${words.time(at)}`)));
 }

@@ -1,10 +1,11 @@
 // The drone's video with boxes on the picture they belong to: WebCodecs where the page is secure, MediaSource otherwise.
 
-import { get } from "./api.js";
+import { get, socketTo } from "./api.js";
 import { choices } from "./choices.js";
-import { button, el, fill, tick } from "./dom.js";
+import { button, cross, el, fill, quiet, tick } from "./dom.js";
 import { CLASSES, OTHER_CLASS } from "./map_style.js";
 import { PictureMotion } from "./picture_motion.js";
+import { isWithin } from "./places.js";
 import * as words from "./words.js";
 
 const { number, percent } = words;
@@ -23,38 +24,30 @@ const DEAD_S = 10; // the connection looks open and is dead, as after a sleep: m
 const NEAR_DEG = 0.02; // of a site's ground: a drone there is shown with it
 
 /** The videos beside a site's map: one for each drone that flies there. `play(view)` shows a recorded flight at a second. */
-export function videoWall(screen) {
-  return new VideoWall(screen);
-}
-
-class VideoWall {
+export class VideoWall {
   constructor(screen) {
     Object.assign(this, { screen, panes: new Map(), closed: new Set() });
     this.opener = button("Video", () => { this.closed.clear(); this.look(); }, { class: "video-open", icon: "video" });
     this.opener.hidden = true;
     screen.stage.append(this.opener);
-    const heard = ({ detail: { data } }) => {
-      if (data.is_connected) this.look();
-      else {
-        this.panes.get(data.stream)?.off(data.flights?.at(-1)?.is_over ? "ended" : "no signal");
-        screen.live.drones.delete(data.stream);
-        screen.live.drawSoon();
-      }
-    };
-    screen.station.events.addEventListener("stream.state", heard);
-    this.end = () => screen.station.events.removeEventListener("stream.state", heard);
+    screen.hear(screen.station.events, "stream.state", ({ detail: { data: { stream, is_connected: isOn, flights } } }) => {
+      if (isOn) return void this.look();
+      this.panes.get(stream)?.off(flights?.at(-1)?.is_over ? "ended" : "no signal");
+      screen.live.drones.delete(stream);
+      screen.live.drawSoon();
+    });
     this.look();
   }
 
-  /** Which drones fly here? */
   async look() {
     let streams;
     try {
       streams = await get("/api/streams");
     } catch { return; } // the connection's own sign shows it
     if (this.screen.closed) return;
-    for (const each of streams) if (each.is_connected && this.isHere(each) && !this.panes.has(each.stream) && !this.closed.has(each.stream)) this.open(each.stream);
-    this.opener.hidden = !streams.some((each) => each.is_connected && this.closed.has(each.stream));
+    const on = streams.filter((each) => each.is_connected);
+    for (const each of on) if (this.isHere(each) && !this.panes.has(each.stream) && !this.closed.has(each.stream)) this.open(each.stream);
+    this.opener.hidden = !on.some((each) => this.closed.has(each.stream));
   }
 
   /** Whether a mission of the site follows a drone, or it flies there, or nobody knows where it is. */
@@ -63,23 +56,31 @@ class VideoWall {
     if (runs.some((each) => each.state === "running" && each.input?.stream === stream)) return true;
     const { latitude_deg: lat, longitude_deg: lon } = telemetry ?? {};
     if (lat === undefined || lat === null || !bounds) return true;
-    return lon > bounds[0] - NEAR_DEG && lon < bounds[2] + NEAR_DEG && lat > bounds[1] - NEAR_DEG && lat < bounds[3] + NEAR_DEG;
+    return isWithin([lon, lat], bounds, NEAR_DEG);
   }
 
   open(stream) {
     const pane = new DroneVideo(stream, { heard: (telemetry) => this.screen.live.heard(stream, telemetry), leave: () => this.leave(stream) });
-    this.panes.set(stream, pane);
-    pane.pane.querySelector("header").prepend(el("button", { type: "button", class: "quiet", "aria-label": "Larger or smaller", on: { click: () => { this.screen.wall.classList.toggle("large"); this.screen.view?.map.resize(); } } }, "⤢"));
+    pane.pane.querySelector("header").prepend(quiet("⤢", () => { this.screen.wall.classList.toggle("large"); this.fit(); }, { "aria-label": "Larger or smaller" }));
+    this.add(stream, pane);
+  }
+
+  add(name, pane) {
+    this.panes.set(name, pane);
     this.screen.wall.append(pane.pane);
+    this.fit();
+  }
+
+  take(name) {
+    this.panes.get(name)?.close();
+    this.panes.delete(name);
     this.fit();
   }
 
   leave(stream) {
     this.closed.add(stream);
-    this.panes.get(stream)?.close();
-    this.panes.delete(stream);
     this.opener.hidden = false;
-    this.fit();
+    this.take(stream);
   }
 
   /** The map has the room that the videos leave. */
@@ -92,18 +93,15 @@ class VideoWall {
   play(view) {
     if (!view.video_url) return;
     const name = view.flight;
-    this.panes.get(name)?.close();
+    this.take(name);
     const player = el("video", { src: view.video_url, controls: true, playsinline: true, ".muted": true });
     player.addEventListener("loadedmetadata", () => { player.currentTime = view.video_s; player.play().catch(() => {}); }, { once: true });
-    const pane = el("aside", { class: "video", "aria-label": `Recording of ${name}` }, el("header", {}, el("b", {}, name), el("span", { class: "delay" }, "recorded"),
-      el("button", { type: "button", class: "quiet", "aria-label": "Close the video", on: { click: () => { this.panes.get(name).close(); this.panes.delete(name); this.fit(); } } }, "×")), el("div", { class: "picture" }, player));
-    this.panes.set(name, { close: () => pane.remove(), off() {} });
-    this.screen.wall.append(pane);
-    this.fit();
+    const pane = el("aside.video", { "aria-label": `Recording of ${name}` }, el("header", el("b", name), el("span.delay", "recorded"),
+      cross("Close the video", () => this.take(name))), el("div.picture", player));
+    this.add(name, { pane, close: () => pane.remove(), off() {} });
   }
 
   close() {
-    this.end();
     for (const each of this.panes.values()) each.close();
   }
 }
@@ -111,15 +109,15 @@ class VideoWall {
 /** A drone's moving picture with what is detected in it: `pane` is its element; `heard(telemetry)` gets what it states. */
 export class DroneVideo {
   constructor(stream, { heard = () => {}, leave = null } = {}) {
-    Object.assign(this, { stream, told: heard, boxes: [], motion: new PictureMotion(), socket: null, late_s: 0 });
+    Object.assign(this, { url: `/api/streams/${encodeURIComponent(stream)}`, told: heard, boxes: [], motion: new PictureMotion(), socket: null, late_s: 0 });
     this.canvas = el("canvas", { width: 640, height: 360 });
-    this.overlay = el("canvas", { class: "boxes", width: 640, height: 360, "aria-hidden": true });
+    this.overlay = el("canvas.boxes", { width: 640, height: 360, "aria-hidden": true });
     this.player = el("video", { ".muted": true, playsinline: true, hidden: true });
-    this.delay = el("span", { class: "delay" });
-    this.pane = el("aside", { class: "video", "aria-label": `Live video of ${stream}` },
-      el("header", {}, el("b", {}, stream), this.delay, leave ? el("button", { type: "button", class: "quiet", "aria-label": "Close the video", on: { click: leave } }, "×") : null),
-      el("div", { class: "picture" }, this.canvas, this.player, this.overlay),
-      el("footer", {}, tick("Sync video to detections", choices.get("holdForBoxes"), (on) => choices.set("holdForBoxes", on), { title: "Show each picture when its boxes are known" }), this.seen = el("span", { class: "soft" })));
+    this.delay = el("span.delay");
+    this.pane = el("aside.video", { "aria-label": `Live video of ${stream}` },
+      el("header", el("b", stream), this.delay, leave ? cross("Close the video", leave) : null),
+      el("div.picture", this.canvas, this.player, this.overlay),
+      el("footer", tick("Sync video to detections", choices.get("holdForBoxes"), (on) => choices.set("holdForBoxes", on), { title: "Show each picture when its boxes are known" }), this.seen = el("span.soft")));
     this.connect();
   }
 
@@ -132,11 +130,8 @@ export class DroneVideo {
   connect() {
     this.drop();
     this.fmp4 = !("VideoDecoder" in window);
-    const url = new URL(`/api/streams/${encodeURIComponent(this.stream)}/video${this.fmp4 ? "?mode=fmp4" : ""}`, location.href);
-    url.protocol = url.protocol.replace("http", "ws");
-    const socket = new WebSocket(url);
+    const socket = this.socket = socketTo(`${this.url}/video${this.fmp4 ? "?mode=fmp4" : ""}`);
     socket.binaryType = "arraybuffer";
-    this.socket = socket;
     this.heard_at = performance.now();
     this.cameAlive = false; // pictures came by this connection
     this.show = this.fmp4 ? new SegmentPlayer(this.player, (pts_us) => this.shown(pts_us), (pts_us) => { this.newest = { pts_us, at: performance.now() }; }) : new FramePlayer(this.canvas, (pts_us) => this.shown(pts_us), () => this.hold_s());
@@ -157,7 +152,7 @@ export class DroneVideo {
     if (quiet_s > QUIET_S && !this.isOff) fill(this.delay, `no picture for ${number(quiet_s, 0)} s`);
     try {
       const asked_us = Date.now() * 1000;
-      const state = await get(`/api/streams/${encodeURIComponent(this.stream)}`);
+      const state = await get(this.url);
       if (!this.socket) return; // closed meanwhile
       this.ahead_us = (asked_us + Date.now() * 1000) / 2 - state.time_us;
       if (state.is_connected) {
@@ -204,7 +199,6 @@ export class DroneVideo {
     if (this.now_us !== undefined) this.drawBoxes(this.now_us);
   }
 
-  /** A picture is on the screen. */
   shown(pts_us) {
     this.now_us = pts_us;
     this.drawBoxes(pts_us);
@@ -242,10 +236,9 @@ export class DroneVideo {
   /** The looks that show most of a picture, the older first: the nearest whole one, and where cars of a later one are known already, those. */
   looksFor(pts_us) {
     const nearest = (looks) => {
-      let best = null;
-      for (const each of looks) if (!best || Math.abs(each.pts_us - pts_us) < Math.abs(best.pts_us - pts_us)) best = each;
-      const isShown = best && (Math.abs(best.pts_us - pts_us) < BOXES_WITHIN_US || (best.pts_us < pts_us && pts_us - best.pts_us < OLD_BOXES_US));
-      return isShown ? best : null;
+      const away_us = (each) => Math.abs(each.pts_us - pts_us);
+      const best = looks.length ? looks.reduce((one, other) => (away_us(other) < away_us(one) ? other : one)) : null;
+      return best && away_us(best) < (best.pts_us < pts_us ? OLD_BOXES_US : BOXES_WITHIN_US) ? best : null;
     };
     const best = nearest(this.boxes);
     if (!best?.classes) return best ? [best] : [];
@@ -256,13 +249,10 @@ export class DroneVideo {
   drop() {
     clearTimeout(this.timer);
     clearInterval(this.poll);
-    const old = this.socket;
-    this.socket = null;
-    old?.close();
-    this.show?.close();
-    this.show = null;
-    this.now_us = undefined;
-    this.newest = null;
+    const { socket, show } = this;
+    Object.assign(this, { socket: null, show: null, newest: null, now_us: undefined });
+    socket?.close();
+    show?.close();
   }
 
   close() {
@@ -368,14 +358,13 @@ class SegmentPlayer {
   }
 
   begin({ codec }) {
-    const type = `video/mp4; codecs="${codec}"`;
     if (this.player.src) URL.revokeObjectURL(this.player.src);
     const source = new MediaSource();
     Object.assign(this, { source, buffer: null, queue: [] });
     this.player.src = URL.createObjectURL(source);
     source.addEventListener("sourceopen", () => {
       if (source !== this.source) return;
-      this.buffer = source.addSourceBuffer(type);
+      this.buffer = source.addSourceBuffer(`video/mp4; codecs="${codec}"`);
       this.buffer.addEventListener("updateend", () => {
         const held = this.buffer.buffered;
         if (held.length) this.appended(held.end(held.length - 1) * 1e6);

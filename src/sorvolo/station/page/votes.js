@@ -1,6 +1,7 @@
 // Votes on their way: kept by this browser until the station has each of them, sent one by one in the order they were given.
 
 import { post, siteUrl } from "./api.js";
+import { stored } from "./choices.js";
 
 const KEPT = "sorvolo-votes";
 const LONGEST_WAIT_MS = 15000;
@@ -21,16 +22,13 @@ class Votes extends EventTarget {
   get waiting() {
     if (this.isFull) return this.memory;
     try {
-      return JSON.parse(localStorage.getItem(KEPT) || "[]");
+      return JSON.parse(stored.get(KEPT)) ?? [];
     } catch { return this.memory; }
   }
 
   keep(list) {
     this.memory = list;
-    try {
-      localStorage.setItem(KEPT, JSON.stringify(list));
-      this.isFull = false;
-    } catch { this.isFull = true; /* a browser without storage keeps them as long as the page */ }
+    this.isFull = !stored.set(KEPT, JSON.stringify(list)); // then they are kept as long as the page
     this.changed();
   }
 
@@ -38,7 +36,6 @@ class Votes extends EventTarget {
     this.dispatchEvent(new Event("change"));
   }
 
-  /** Take a vote: {site, kind, id, verdict, note}. */
   add(vote) {
     const number = `${Date.now()} ${Math.random()}`;
     this.keep([...this.waiting, { ...vote, who: this.who, number, at: new Date().toISOString() }]);

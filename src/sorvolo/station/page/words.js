@@ -13,7 +13,6 @@ function rounded(value, digits) {
   return value.toLocaleString("en", { maximumFractionDigits: digits, minimumFractionDigits: 0, useGrouping: value >= 10000 });
 }
 
-/** A length; "–" where it is not known. */
 export function length(m) {
   if (!isNumber(m)) return "–";
   if (choices.get("units") === "imperial") {
@@ -22,7 +21,6 @@ export function length(m) {
   return Math.abs(m) < 1000 ? `${rounded(m, Math.abs(m) < 10 ? 2 : 1)} m` : `${rounded(m / 1000, 2)} km`;
 }
 
-/** An area. */
 export function area(m2) {
   if (!isNumber(m2)) return "–";
   if (choices.get("units") === "imperial") {
@@ -31,19 +29,15 @@ export function area(m2) {
   return m2 < 10000 ? `${rounded(m2, m2 < 10 ? 2 : m2 < 100 ? 1 : 0)} m²` : `${rounded(m2 / 10000, 2)} ha`;
 }
 
-/** A speed. */
 export function speed(m_s) {
   if (!isNumber(m_s)) return "–";
   return choices.get("units") === "imperial" ? `${rounded(m_s / MILE_M * 3600, 1)} mph` : `${rounded(m_s, 1)} m/s`;
 }
 
-/** A share of 0 to 1 as per cent. */
 export const percent = (share) => (isNumber(share) ? `${Math.round(share * 100)} %` : "–");
 
-/** A plain number. */
 export const number = (value, digits = 1) => (isNumber(value) ? rounded(value, digits) : "–");
 
-/** Bytes of a file. */
 export function bytes(count) {
   if (!isNumber(count)) return "–";
   const units = ["B", "kB", "MB", "GB", "TB"];
@@ -63,21 +57,18 @@ export function duration(seconds) {
 const style = () => (choices.get("clock") === "utc" ? { timeZone: "UTC" } : {});
 const zone = () => (choices.get("clock") === "utc" ? " UTC" : "");
 
-/** A time with its day. */
 export function time(iso) {
   const at = new Date(iso);
   if (!iso || Number.isNaN(at.getTime())) return "–";
   return at.toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "short", ...style() }) + zone();
 }
 
-/** A time of day to the second. */
 export function clock(iso) {
   const at = new Date(iso);
   if (!iso || Number.isNaN(at.getTime())) return "–";
   return at.toLocaleTimeString("en-GB", style()) + zone();
 }
 
-/** A day. */
 export function day(iso) {
   const at = new Date(iso);
   if (!iso || Number.isNaN(at.getTime())) return "undated";
@@ -113,7 +104,6 @@ export function counted(count, one, many = `${one}s`) {
   return `${number(count, 0)} ${count === 1 ? one : many}`;
 }
 
-/** What a change is, in a few words. */
 export function changeWords(properties) {
   const { kind, class_before: before, class_after: after } = properties;
   if (kind === "replaced" && before && after) return `${before} replaced by ${after}`;

@@ -6,8 +6,7 @@ const TABLE = Uint32Array.from({ length: 256 }, (_, byte) => {
   return value >>> 0;
 });
 
-/** The CRC-32 of bytes (IEEE 802.3). */
-export function crc32(bytes) {
+function crc32(bytes) {
   let value = 0xffffffff;
   for (const each of bytes) value = TABLE[(value ^ each) & 255] ^ (value >>> 8);
   return (value ^ 0xffffffff) >>> 0;
@@ -27,8 +26,8 @@ function record(signature, fields) {
 }
 
 /** A Blob of a zip file of `{name: Uint8Array}`. */
-export function zip(members, type = "application/zip") {
-  return packed(Object.entries(members).map(([name, data]) => ({ name, crc: crc32(data), size: data.length, data })), type);
+export function zip(members) {
+  return packed(Object.entries(members).map(([name, data]) => ({ name, crc: crc32(data), size: data.length, data })));
 }
 
 /** A Blob of a zip file of files; they are read once for their checksums and stay where they are. */
@@ -38,12 +37,12 @@ export async function zipOfFiles(files) {
     const crc = crc32(new Uint8Array(await file.arrayBuffer()));
     members.push({ name: file.name, crc, size: file.size, data: file });
   }
-  return packed(members, "application/zip");
+  return packed(members);
 }
 
 const UTF8_NAMES = 0x0800;
 
-function packed(members, type) {
+function packed(members) {
   const parts = [];
   const directory = [];
   let [offset, directorySize] = [0, 0];
@@ -58,5 +57,5 @@ function packed(members, type) {
     directorySize += entry.length + label.length;
   }
   const end = record(0x06054b50, [[2, 0], [2, 0], [2, members.length], [2, members.length], [4, directorySize], [4, offset], [2, 0]]);
-  return new Blob([...parts, ...directory, end], { type });
+  return new Blob([...parts, ...directory, end], { type: "application/zip" });
 }
