@@ -556,6 +556,11 @@ def test_what_hides_what_is_measured_and_what_is_wrong_is_said_where_it_is(
     assert "83 % of the ground looked at" in page.locator("#sentence").inner_text()
     page.locator("#sentence button", has_text="83 %").click()
     expect(page.locator(".ramp li")).to_have_count(5)
+    ground = page.locator(".map-canvas").bounding_box()
+    page.mouse.click(ground["x"] + 0.45 * ground["width"], ground["y"] + 0.5 * ground["height"])
+    seen = re.compile(r"A person here would have been seen with \d+ % to \d+ %\.")
+    expect(page.locator(".chance")).to_have_text(seen)
+    page.locator(".map-tools [data-panel=layers]").click()
     page.get_by_text("Filter", exact=True).click()
     page.get_by_label("Verdict").select_option("rejected")
     page.locator(".chips button", has_text="Only rejected").click()
@@ -580,6 +585,10 @@ def test_what_hides_what_is_measured_and_what_is_wrong_is_said_where_it_is(
     page.get_by_text("Start a mission").click()
     page.get_by_role("button", name="Start", exact=True).click()
     expect(page.locator(".start").get_by_role("alert")).to_contain_text("Choose the files")
+    page.locator(".start summary").click()
+    page.get_by_label("Camera", exact=True).fill("Caméra")
+    page.get_by_role("button", name="Start", exact=True).click()
+    expect(page.locator(".start").get_by_role("alert")).to_contain_text("letters A to Z")
     assert not page.locator(".message.error").count()
     page.locator("#rooms [data-panel=findings]").click()
     shown = page.locator(".gallery .pictures img").first
@@ -610,6 +619,28 @@ def outlined(page: Any) -> bool:
     shot = Image.open(BytesIO(page.locator(".stage").screenshot())).convert("RGB")
     away = np.abs(np.asarray(shot).astype(int) - (0x12, 0xB8, 0x86)).max(axis=2)
     return bool((away < 12).sum() > 40)
+
+
+DATES = """async () => {
+  const {SiteData} = await import('/page/site_data.js');
+  const data = new SiteData({id: 'x', versions: [{n: 1, flight: 'a'}, {n: 2, flight: 'b'}]});
+  data.all.objects = ['a', 'b'].map((flight) => ({id: flight, properties: {class: 'car', flights: [flight]}}));
+  return [null, [1, 1], [1, 2]].map((versions) => {
+    data.versions = versions;
+    return data.shown('objects').map((each) => each.id);
+  });
+}"""
+
+
+def test_an_earlier_version_shows_nothing_of_a_later_one(opened: Watched) -> None:
+    assert opened.page.evaluate(DATES) == [["a", "b"], ["a"], ["a", "b"]]
+
+
+def test_two_drones_have_a_pane_each(served: Served, opened: Watched) -> None:
+    panes = opened.page.locator("aside.video header b")
+    with greeted(served, "north", "1" * 16), greeted(served, "south", "2" * 16):
+        expect(panes).to_have_count(2)
+        assert sorted(panes.all_inner_texts()) == ["north", "south"]
 
 
 def test_a_map_that_grows_out_of_view_is_followed(served: Served, opened: Watched) -> None:
@@ -1258,7 +1289,7 @@ def test_what_is_drawn_is_measured_and_shared(
     kept = served.ask("/api/sites/field/drawings")["features"]
     assert "interest" in {each["properties"]["purpose"] for each in kept}
     other = Watched(context_of(browser), served.url)
-    show(other, served, "draw")
+    show(other, served, "measure")
     other.page.locator(".drawn li").first.wait_for()
     assert other.faults == []
     other.page.context.close()

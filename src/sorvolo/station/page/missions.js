@@ -17,6 +17,7 @@ const KINDS = {
 };
 const MOST_ZIP_BYTES = 4e9;
 const MOST_FINDS = 24;
+const CAMERA = /^(aov=[0-9.]+|focal_px=[0-9.]+|[A-Za-z0-9 .+-]*)$/;
 
 /** Map what a drone sends, and look for people in it: two missions. A site that is written already is watched alone. */
 export async function mapAndFind(stream, site, hasMap) {
@@ -58,7 +59,7 @@ export class Missions {
     const note = el("p.note", KINDS[this.mission][1]);
     const files = this.files = el("input", { type: "file", multiple: true, "aria-label": "Files of the flight" });
     const url = el("input", { type: "text", inputmode: "url", placeholder: "rtsp://…, udp://…", autocomplete: "off" });
-    const camera = el("input", { type: "text", maxlength: 80, placeholder: "found by itself", pattern: "(aov=[0-9.]+|focal_px=[0-9.]+|[A-Za-z0-9 .+\\-]+)" });
+    const camera = el("input", { type: "text", maxlength: 80, placeholder: "found by itself" });
     const ready = el("div");
     const input = el("div");
     const from = el("div");
@@ -116,6 +117,7 @@ export class Missions {
 
   async start(wish) {
     this.say("");
+    if (!CAMERA.test(wish.camera)) return void this.say("Give the camera's model in letters A to Z, digits, dots, + and -, or aov=78 or focal_px=2900");
     const options = wish.camera ? { camera: wish.camera } : {};
     const input = this.from === "site" ? null : await this.input(wish, options);
     if (input === undefined) return undefined;

@@ -54,26 +54,16 @@ export function duration(seconds) {
   return `${hours ? `${hours}:${two(Math.floor(whole / 60) % 60)}` : Math.floor(whole / 60)}:${two(whole % 60)}`;
 }
 
-const style = () => (choices.get("clock") === "utc" ? { timeZone: "UTC" } : {});
-const zone = () => (choices.get("clock") === "utc" ? " UTC" : "");
-
-export function time(iso) {
+function said(iso, how, zone = " UTC", unknown = "–") {
   const at = new Date(iso);
-  if (!iso || Number.isNaN(at.getTime())) return "–";
-  return at.toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "short", ...style() }) + zone();
+  const isUtc = choices.get("clock") === "utc";
+  if (!iso || Number.isNaN(at.getTime())) return unknown;
+  return at.toLocaleString("en-GB", { ...how, timeZone: isUtc ? "UTC" : undefined }) + (isUtc ? zone : "");
 }
 
-export function clock(iso) {
-  const at = new Date(iso);
-  if (!iso || Number.isNaN(at.getTime())) return "–";
-  return at.toLocaleTimeString("en-GB", style()) + zone();
-}
-
-export function day(iso) {
-  const at = new Date(iso);
-  if (!iso || Number.isNaN(at.getTime())) return "undated";
-  return at.toLocaleDateString("en-GB", { dateStyle: "medium", ...style() });
-}
+export const time = (iso) => said(iso, { dateStyle: "medium", timeStyle: "short" });
+export const clock = (iso) => said(iso, { timeStyle: "medium" });
+export const day = (iso) => said(iso, { dateStyle: "medium" }, "", "undated");
 
 const metres = (value, digits) => String(Math.round(value)).padStart(digits, "0");
 
