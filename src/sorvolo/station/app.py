@@ -9,7 +9,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import uvicorn
 from fastapi import APIRouter, Body, FastAPI, Query, Request, Response
@@ -212,12 +212,18 @@ def station_app(
     ):
         app.include_router(router)
     _serve_page(app)
-    app.add_middleware(_Heads, but=f"{_UPLOADS}/")
+    app.add_middleware(_answering_heads)
     app.add_middleware(Doorkeeper, settings=settings, state=station.state, upload_path=_UPLOADS)
     app.add_middleware(
         Observer, count=metrics.count
     )  # outermost: what the doorkeeper refuses counts, too
     return app
+
+
+_TILES: dict[int | str, dict[str, Any]] = {
+    200: {"description": "The tile", "content": {"image/webp": {}, "image/png": {}}},
+    204: {"description": "Nothing of the map"},
+}
 
 
 def _about_routes(station: Station) -> APIRouter:
@@ -245,7 +251,6 @@ def _about_routes(station: Station) -> APIRouter:
             "disk_free_gb": round(free / 1e9, 2),
             "memory_mb": None if memory is None else round(memory / 1e6, 1),
             "disk_floor_gb": station.settings.free_floor_gb,
-            "units_default": "metric",
             "last_event": station.events.last,
             "base_map_url": None if station.settings.base_map is None else _BASE_MAP,
         }
@@ -318,44 +323,22 @@ def _site_routes(station: Station) -> APIRouter:
         return {**detail, "live_revision": revision, "links": landing_links(request, site)}
 
     @router.get(
-        "/{site}/tiles/{version}/{z}/{x}/{y}.webp",
-        response_class=Response,
-        responses=_picture("webp"),
+        "/{site}/tiles/{version}/{z}/{x}/{y}.{kind}", response_class=Response, responses=_TILES
     )
-    def tile_webp(site: str, version: str, z: int, x: int, y: int) -> Response:
+    def tile(
+        site: str, version: str, z: int, x: int, y: int, kind: Literal["webp", "png"]
+    ) -> Response:
         """A Web Mercator tile, 256 px; `version` is a number, `live-REVISION` or `live`. 204 where the map is not."""
-        return _tile(station, site, version, (z, x, y), ".webp")
-
-    @router.get(
-        "/{site}/tiles/{version}/{z}/{x}/{y}.png",
-        response_class=Response,
-        responses=_picture("png"),
-    )
-    def tile_png(site: str, version: str, z: int, x: int, y: int) -> Response:
-        """The same as PNG, for programs that read no WebP."""
-        return _tile(station, site, version, (z, x, y), ".png")
+        answer = station.tiles.tile(site, version, z, x, y, f".{kind}")
+        kept = _FOR_EVER.replace("public", "private") if answer.is_final else "no-cache"
+        return Response(
+            answer.data,
+            200 if answer.data else 204,
+            {"cache-control": kept},
+            f"image/{kind}" if answer.data else None,
+        )
 
     return router
-
-
-def _picture(kind: str) -> dict[int | str, dict[str, Any]]:
-    """How a tile's answers are described."""
-    return {
-        200: {"description": "The tile", "content": {f"image/{kind}": {}}},
-        204: {"description": "Nothing of the map"},
-    }
-
-
-def _tile(
-    station: Station, site: str, version: str, place: tuple[int, int, int], ending: str
-) -> Response:
-    answer = station.tiles.tile(site, version, *place, ending)
-    headers = {
-        "cache-control": _FOR_EVER.replace("public", "private") if answer.is_final else "no-cache"
-    }
-    if not answer.data:
-        return Response(status_code=204, headers=headers)
-    return Response(answer.data, media_type=f"image/{ending[1:]}", headers=headers)
 
 
 def _serve_page(app: FastAPI) -> None:
@@ -363,43 +346,30 @@ def _serve_page(app: FastAPI) -> None:
 
     @app.get("/", include_in_schema=False)
     def page() -> Response:
-        path = PAGE_FOLDER / "index.html"
-        if not path.is_file():
-            raise Problem(
-                404, "this installation has no page; the API is described by /openapi.json"
-            )
-        return FileResponse(path, headers={"cache-control": "no-cache"})
-
-    @app.get("/sw.js", include_in_schema=False)
-    def service_worker() -> Response:
-        return FileResponse(PAGE_FOLDER / "sw.js", headers={"cache-control": "no-cache"})
+        return FileResponse(PAGE_FOLDER / "index.html", headers={"cache-control": "no-cache"})
 
     files = GZipMiddleware(_PageFiles(directory=PAGE_FOLDER), compresslevel=5)
     app.mount("/page", files, name="page")
 
 
-class _Heads:
-    """ASGI middleware: HEAD is answered as GET is, without the body; addresses below `but` answer it themselves."""
+def _answering_heads(app: ASGIApp) -> ASGIApp:
+    """ASGI middleware: HEAD is answered as GET is, without the body."""
 
-    def __init__(self, app: ASGIApp, but: str) -> None:
-        self._app, self._but = app, but
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on, a HEAD as the GET that it asks about."""
-        if scope.get("method") != "HEAD" or scope["path"].startswith(self._but):
-            await self._app(scope, receive, send)
-            return
-
+    async def answered(scope: Scope, receive: Receive, send: Send) -> None:
         async def sending(message: Message) -> None:
             if message["type"] == "http.response.start":
                 await send(message)
                 await send({"type": "http.response.body"})
 
+        if scope.get("method") != "HEAD":
+            await app(scope, receive, send)
+            return
         # the extension keeps files from being read for a body that nobody gets
-        extensions = {**scope.get("extensions", {}), "http.response.pathsend": {}}
-        asked = {**scope, "method": "GET", "extensions": extensions}
-        await self._app(asked, receive, sending)
+        asked = {**scope, "method": "GET", "extensions": {"http.response.pathsend": {}}}
+        await app(asked, receive, sending)
         scope["route"] = asked.get("route")
+
+    return answered
 
 
 class _PageFiles(StaticFiles):
@@ -411,6 +381,7 @@ class _PageFiles(StaticFiles):
         scope = kwargs.get("scope") or args[2]
         is_named = scope.get("query_string", b"").startswith(b"v=")
         response.headers["cache-control"] = _FOR_EVER if is_named else "no-cache"
+        response.headers["service-worker-allowed"] = "/"
         return response
 
 

@@ -69,16 +69,7 @@ class EventLog:
                         "INSERT INTO events (at, type, site, run, data) VALUES (?, ?, ?, ?, ?)",
                         (at, each.type, each.site, each.run, compact_json(each.data)),
                     )
-                    made.append(
-                        {
-                            "seq": cursor.lastrowid,
-                            "at": at,
-                            "type": each.type,
-                            "site": each.site,
-                            "run": each.run,
-                            "data": dict(each.data),
-                        }
-                    )
+                    made.append({"seq": cursor.lastrowid, "at": at, **vars(each)})
                 yield connection
                 if made and made[-1]["seq"] % 1000 < len(made):
                     connection.execute(
@@ -106,16 +97,7 @@ class EventLog:
         )
         found = [_event(row) for row in rows]
         if found and found[0]["seq"] > seq + 1:
-            gap = {"from": seq + 1, "to": found[0]["seq"] - 1}
-            lost = {
-                "seq": gap["to"],
-                "at": found[0]["at"],
-                "type": LOST,
-                "site": None,
-                "run": None,
-                "data": gap,
-            }
-            found = [lost, *found]
+            found = [_lost(seq + 1, found[0]["seq"] - 1), *found]
         return found
 
     def newest(self, kind: str, site: str) -> dict[str, Any] | None:
@@ -135,17 +117,7 @@ class EventLog:
                 seq > self._last
             ):  # the numbers of a station whose memory was moved away: no event would come for long
                 seq = self._last
-                gap = {"from": 1, "to": seq}
-                yield [
-                    {
-                        "seq": seq,
-                        "at": utc_now(),
-                        "type": LOST,
-                        "site": None,
-                        "run": None,
-                        "data": gap,
-                    }
-                ]
+                yield [_lost(1, seq)]
             while True:
                 arrived.clear()
                 events = await asyncio.to_thread(self.after, seq) if seq < self._last else []
@@ -159,6 +131,11 @@ class EventLog:
                     yield []
         finally:
             self._waiting.discard((loop, arrived))
+
+
+def _lost(first: int, last: int) -> dict[str, Any]:
+    data = {"from": first, "to": last}
+    return {"seq": last, "at": utc_now(), **vars(NewEvent(LOST, data))}
 
 
 def _event(row: sqlite3.Row) -> dict[str, Any]:

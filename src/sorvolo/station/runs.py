@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -252,19 +252,12 @@ class Runs(ThreadOwner):
         run = self.get(run_id)
         return _order_stream(self._folder / run.id) if "stream_url" in (run.input or {}) else ""
 
-    @contextmanager
-    def unused_stream(self, stream: str, but: str = "") -> Iterator[None]:
+    def unused_stream(self, stream: str, but: str = "") -> AbstractContextManager[None]:
         """No mission begins meanwhile. Raises Problem (423) where one that runs, `but` this one, reads the stream."""
-        with self._lock:
-            for run, _ in self._running():
-                if stream and run.id != but and stream == _order_stream(self._folder / run.id):
-                    raise Problem(
-                        423,
-                        f"a {run.mission} that {run.who} started reads this stream; wait until it ends, or stop "
-                        "it",
-                        run=run.id,
-                    )
-            yield
+        return self._unused(
+            lambda run: stream and run.id != but and stream == _order_stream(self._folder / run.id),
+            "reads this stream",
+        )
 
     def of_site(self, site_id: str) -> list[Run]:
         """All runs of a site, of however long ago."""
@@ -276,27 +269,12 @@ class Runs(ThreadOwner):
         with self._lock:
             for run in self.of_site(site_id):
                 if run.state == RUNNING or not _has_ended(self._folder / run.id):
-                    raise Problem(
-                        409,
-                        f"a {run.mission} that {run.who} started runs on the site {site_id!r}; wait until it "
-                        "ends, or stop it",
-                        run=run.id,
-                    )
+                    raise _busy(409, run, f"runs on the site {site_id!r}")
             yield
 
-    @contextmanager
-    def unused(self, upload_id: str) -> Iterator[None]:
+    def unused(self, upload_id: str) -> AbstractContextManager[None]:
         """No mission begins meanwhile. Raises Problem (423) where one that runs reads the upload."""
-        with self._lock:
-            for run, _ in self._running():
-                if upload_id in _uploads_of(run):
-                    raise Problem(
-                        423,
-                        f"a {run.mission} that {run.who} started reads this upload; wait until it ends, or stop "
-                        "it",
-                        run=run.id,
-                    )
-            yield
+        return self._unused(lambda run: upload_id in _uploads_of(run), "reads this upload")
 
     def look_at_disk(self) -> None:
         """Announce once that the free space fell below the floor, and once that it is above it again.
@@ -324,6 +302,14 @@ class Runs(ThreadOwner):
             self._events.append(NewEvent("station.disk", data))
 
     # ---- inside -----------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def _unused(self, uses: Callable[[Run], object], words: str) -> Iterator[None]:
+        with self._lock:
+            for run, _ in self._running():
+                if uses(run):
+                    raise _busy(423, run, words)
+            yield
 
     def _note_shortage(self, short: str) -> None:
         """Let the missions that run state that the disk is full (`short`: in words), or no more."""
@@ -478,12 +464,7 @@ class Runs(ThreadOwner):
             )
         for each in running if writes(wish.mission, has_input=wish.input is not None) else ():
             if each.site == wish.site and writes(each.mission, has_input=each.input is not None):
-                raise Problem(
-                    409,
-                    f"the site {wish.site!r} is being written by a {each.mission} that {each.who} started; wait "
-                    "until it ends, or stop it",
-                    run=each.id,
-                )
+                raise _busy(409, each, f"writes into the site {wish.site!r}")
 
     def _demand_room(self) -> None:
         if short := shortage(self._settings.root, self._settings.free_floor_gb):
@@ -526,6 +507,14 @@ class Runs(ThreadOwner):
 def run_row(run: Run) -> dict[str, Any]:
     """A run as the API gives it: without what is of no use to a browser."""
     return {name: value for name, value in asdict(run).items() if name not in ("pid", "kill_at")}
+
+
+def _busy(status: int, run: Run, words: str) -> Problem:
+    return Problem(
+        status,
+        f"a {run.mission} that {run.who} started {words}; wait until it ends, or stop it",
+        run=run.id,
+    )
 
 
 def _event(kind: str, run: Run, data: Mapping[str, Any]) -> NewEvent:

@@ -22,7 +22,7 @@ from sorvolo.station.tokens import Guesses, Holder, Role, has_tokens, holder_of,
 
 COOKIE = "sorvolo_session"
 _MOST_BODY_BYTES = 1_000_000  # of a request; an area of 10,000 corners has half of it
-_ANYBODY = re.compile(r"/(page/.*|sw\.js|api/session|favicon\.ico)?")
+_ANYBODY = re.compile(r"/(page/.*|api/session|favicon\.ico)?")
 _EVENTS = "/api/events"
 _SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
 _HEADERS = {

@@ -457,18 +457,13 @@ def upload_routes(
         made = uploads.create(upload_metadata, upload_length, holder.name)
         return _answer(201, {"Location": f"/api/uploads/{made.id}", "Upload-Offset": "0"})
 
-    @router.head("/{upload_id}")
-    def where(upload_id: str) -> Response:
-        """How much of an upload is here."""
-        upload = uploads.get(upload_id)
-        return _answer(
-            200, {"Upload-Offset": str(uploads.offset(upload)), "Upload-Length": str(upload.bytes)}
-        )
-
     @router.get("/{upload_id}")
-    def one(upload_id: str) -> dict[str, Any]:
-        """An upload: its state (receiving, checking, ready, refused and why)."""
-        return _row(uploads, uploads.get(upload_id))
+    def one(upload_id: str, answer: Response) -> dict[str, Any]:
+        """An upload: its state (receiving, checking, ready, refused and why); its head says how much of it is here."""
+        row = _row(uploads, uploads.get(upload_id))
+        here = {"Upload-Offset": str(row["offset"]), "Upload-Length": str(row["bytes"])}
+        answer.headers.update({"Tus-Resumable": _VERSION, **here})
+        return row
 
     @router.patch("/{upload_id}", status_code=204)
     async def send(

@@ -34,7 +34,7 @@ async function begin() {
   choices.addEventListener("change", (event) => { if (event.detail === "theme") applyTheme(); });
   session.addEventListener("needed", showLogin);
   addEventListener("hashchange", () => route());
-  if (isSecureContext) navigator.serviceWorker?.register("/sw.js").catch(() => {}); // without it the page needs the station
+  if (isSecureContext) navigator.serviceWorker?.register("/page/sw.js", { scope: "/" }).catch(() => {}); // without it the page needs the station
   await enter();
 }
 
