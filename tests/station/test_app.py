@@ -57,7 +57,7 @@ def test_status_and_sites(client: TestClient) -> None:
 def test_head_answers_as_get_without_the_body(client: TestClient) -> None:
     west, south, east, north = client.get(FIELD).json()["bounds_wgs84"]
     tile = f"{FIELD}/tiles/2/{tile_of((west + east) / 2, (south + north) / 2, 20)}.webp"
-    for path in ("/", "/sw.js", "/page/main.js", "/api/status", FIELD, tile, f"{FIELD}/exports/site.gpkg",
+    for path in ("/", "/page/sw.js", "/page/main.js", "/api/status", FIELD, tile, f"{FIELD}/exports/site.gpkg",
                  f"{FIELD}/collections/changes/items", "/api/sites/nowhere", "/api/uploads", "/nothing"):  # fmt: skip
         got, head = client.get(path), client.head(path)
         assert (head.status_code, head.content) == (got.status_code, b""), path

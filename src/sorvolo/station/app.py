@@ -274,9 +274,8 @@ def _about_routes(station: Station) -> APIRouter:
         request: Request, token: Annotated[str, Body(embed=True, max_length=200)]
     ) -> JSONResponse:
         """Exchange a token for a cookie that scripts cannot read."""
-        holder = await _doorkeeper(request).look_at(
-            token, request.client.host if request.client else ""
-        )
+        doorkeeper: Doorkeeper = request.scope["state"]["doorkeeper"]
+        holder = await doorkeeper.look_at(token, request.client.host if request.client else "")
         if holder is None:
             raise Problem(
                 401,
@@ -383,12 +382,6 @@ class _PageFiles(StaticFiles):
         response.headers["cache-control"] = _FOR_EVER if is_named else "no-cache"
         response.headers["service-worker-allowed"] = "/"
         return response
-
-
-def _doorkeeper(request: Request) -> Doorkeeper:
-    keeper = request.scope["state"]["doorkeeper"]
-    assert isinstance(keeper, Doorkeeper)
-    return keeper
 
 
 _MOST_MESSAGE_BYTES = 16_000_000  # of one WebSocket message: a key frame of 4K video takes a tenth

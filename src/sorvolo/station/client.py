@@ -235,7 +235,7 @@ class StreamClient:
 
     def _called(self, context: ssl.SSLContext | None) -> connect:
         """A new connection to the station, to be entered."""
-        headers = self._headers()
+        headers = {"Authorization": f"Bearer {self._token}"} if self._token else {}
         ways: dict[str, Any] = {
             "compression": None,
             "open_timeout": _CONNECT_S,
@@ -362,9 +362,6 @@ class StreamClient:
         taken = self._spool.acknowledge(seq)
         self.report.frames += len(taken)
         self.report.delays_s.extend((now_ns - each) / 1e9 for each in taken)
-
-    def _headers(self) -> dict[str, str]:
-        return {"Authorization": f"Bearer {self._token}"} if self._token else {}
 
     def _context(self) -> ssl.SSLContext | None:
         if not self._url.startswith("wss:"):

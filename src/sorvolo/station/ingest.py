@@ -320,7 +320,8 @@ class Ingest:
                 elif (
                     flight.last_sample is not None
                     and hub.epoch_us is None
-                    and _is_now(flight.last_sample)
+                    # of a flight that goes on, whose delay can be stated, and not of a recorded one
+                    and abs(time.time_ns() - flight.last_sample.time_ns) < _LIVE_NS
                 ):
                     hub.epoch_us = flight.zero_us
         finally:
@@ -476,11 +477,6 @@ def open_flight(folder: Path, hello: Hello) -> Flight:
 
 def _utc_us(text: Any) -> int:
     return round(datetime.fromisoformat(str(text)).timestamp() * 1e6)
-
-
-def _is_now(sample: MessageSample) -> bool:
-    """Whether telemetry is of a flight that goes on, whose delay can be stated, and not of a recorded one."""
-    return abs(time.time_ns() - sample.time_ns) < _LIVE_NS
 
 
 def _kept(path: Path) -> dict[str, Any]:

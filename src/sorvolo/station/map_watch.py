@@ -81,7 +81,8 @@ class MapWatch(ThreadOwner):
             if self._is_news(site_id, state):
                 self._announce(site_id, archive, state, None)
             return
-        if _differs(state, before.state):
+        # a map, and another one than before
+        if state is not None and (before.state is None or before.state.revision != state.revision):
             self._announce(site_id, archive, state, before.state)
         if versions != before.versions:
             self._events.append(NewEvent("site.changed", {"versions": versions}, site_id))
@@ -122,8 +123,3 @@ class MapWatch(ThreadOwner):
             except Exception as error:  # a full disk: logged, tried again
                 sys.stderr.write(f"station: maps cannot be followed: {error}\n")
                 self._ending.wait(2.0)
-
-
-def _differs(now: TilePyramid | None, before: TilePyramid | None) -> bool:
-    """Whether there is a map, and another one than before."""
-    return now is not None and (before is None or before.revision != now.revision)

@@ -209,7 +209,8 @@ class CotRelay(ThreadOwner):
         """A mission placed a frame: the drone is where its camera was, unless it sends that itself."""
         if (
             time.monotonic() - self._placed_s.get(run, -1e9) < _DRONE_EVERY_S
-            or not _is_new(event)
+            # a position that waited for a receiver is no position any more
+            or str(event.get("at", ""))[:16] != utc_now()[:16]
             or self._drones()
         ):
             return
@@ -338,8 +339,3 @@ def _middle(geometry: Mapping[str, Any]) -> tuple[float, float] | None:
         return None
     points = found if isinstance(found[0], list) else [found]
     return _mean(*((float(each[0]), float(each[1])) for each in points))
-
-
-def _is_new(event: Mapping[str, Any]) -> bool:
-    """Whether it is of the last minute: a position that waited for a receiver is no position any more."""
-    return str(event.get("at", ""))[:16] == utc_now()[:16]

@@ -1,7 +1,7 @@
 """The memory of a place: every flight and second that saw it, in order, with pictures and what was found there."""
 
 import threading
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
@@ -176,7 +176,10 @@ def place_routes(
         flights = [each.flight for each in views]
         there = videos.of(archive, flights)
         films = {
-            flight: _Film(flight in there, _began(archive, flight, there)) for flight in flights
+            flight: _Film(
+                flight in there, archive.report(flight).get("flown") if flight in there else None
+            )
+            for flight in flights
         }
         base = f"/api/sites/{quote(site, safe=':')}"
         rows = [
@@ -303,10 +306,6 @@ class _Film:
 
     is_there: bool
     began: Any
-
-
-def _began(archive: Archive, flight: str, there: Container[str]) -> Any:
-    return archive.report(flight).get("flown") if flight in there else None
 
 
 def _row(

@@ -421,15 +421,9 @@ class Runs(ThreadOwner):
         """A run whose process ended without its last line: killed, crashed, or switched off with the machine."""
         process = self._processes.get(run.id)
         code = process.poll() if process is not None else None
+        ended = replace(run, ended_at=utc_now(), exit_code=code, notice=None)
         if run.stop_asked:
-            run = replace(
-                run,
-                state=STOPPED,
-                ended_at=utc_now(),
-                exit_code=code,
-                notice=None,
-                headline=NOTHING_KEPT,
-            )
+            run = replace(ended, state=STOPPED, headline=NOTHING_KEPT)
             return run, _event("run.stopped", run, run_row(run))
         last = _tail(folder / LOG_FILE)
         words = "its process ended without a word"
@@ -440,11 +434,8 @@ class Runs(ThreadOwner):
         if short := shortage(self._settings.root, self._settings.free_floor_gb):
             words += f" while the disk was full ({short})"
         run = replace(
-            run,
+            ended,
             state=LOST if code is None else FAILED,
-            ended_at=utc_now(),
-            exit_code=code,
-            notice=None,
             error=f"{words}; the site is as it was before{': ' + last if last else ''}",
         )
         return run, _event("run.failed", run, run_row(run))

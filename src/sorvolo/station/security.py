@@ -220,7 +220,8 @@ def check_origin(connection: HTTPConnection, public_origin: str, *, is_websocket
     without one). Browsers name the page's origin with every WebSocket and every request that may change something; what
     sends none is no browser.
     """
-    origin, reads = connection.headers.get("origin"), not is_websocket and _only_reads(connection)
+    origin = connection.headers.get("origin")
+    reads = not is_websocket and connection.scope.get("method") in _SAFE_METHODS
     if origin is None:
         if reads or connection.headers.get("sec-fetch-site", "none") in ("none", "same-origin"):
             return
@@ -230,10 +231,6 @@ def check_origin(connection: HTTPConnection, public_origin: str, *, is_websocket
         return
     if origin.lower() not in (public_origin, _own_origin(connection)) or not origin:
         raise Problem(403, f"a page of {origin[:100]} asked; open the station's own page")
-
-
-def _only_reads(connection: HTTPConnection) -> bool:
-    return connection.scope.get("method") in _SAFE_METHODS
 
 
 def _own_origin(connection: HTTPConnection) -> str:
