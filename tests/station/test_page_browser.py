@@ -554,6 +554,7 @@ def test_what_hides_what_is_measured_and_what_is_wrong_is_said_where_it_is(
     """Filters are chips, measures stay with their author, faults stand at their button, a route is one row."""
     page = opened.page
     assert "83 % of the ground looked at" in page.locator("#sentence").inner_text()
+    assert "other object" not in page.locator("#sentence").inner_text()  # changes count once
     page.locator("#sentence button", has_text="83 %").click()
     expect(page.locator(".ramp li")).to_have_count(5)
     ground = page.locator(".map-canvas").bounding_box()

@@ -22,7 +22,7 @@ export class SiteData extends EventTarget {
   async load(names = NAMES) {
     await Promise.all(names.map(async (name) => {
       const mine = this.turns[name] = (this.turns[name] ?? 0) + 1;
-      const kept = await features(this.id, name === "objects" ? "findings" : name);
+      const kept = (await features(this.id, name === "objects" ? "findings" : name)).filter(({ properties }) => properties.class !== "thing"); // that is among the changes
       if (mine !== this.turns[name]) return;
       for (const { properties } of kept) if (properties.review === "none") properties.review = null; // withdrawn: open again
       const watched = this.all[name].filter((each) => each.properties.watched && !kept.some((other) => isOf(other, each.id)));
@@ -51,7 +51,6 @@ export class SiteData extends EventTarget {
     }
     if (name === "objects") { // of the versions that are compared, else of the newest look at each place
       const dates = (this.detail.versions ?? []).filter(({ n }) => this.versions?.includes(n)).map(({ flight }) => flight);
-      list = list.filter(({ properties }) => properties.class !== "thing"); // it is among the changes
       list = list.filter(({ properties: { flights, gone } }) => !flights || (this.versions ? flights.some((each) => dates.includes(each)) : !gone));
     }
     return name === "objects" || name === "changes" ? passing(list, this.filters) : list;
