@@ -334,7 +334,7 @@ def test_files_that_cannot_be_read(tmp_path):
         read_area(tmp_path / "c.geojson")
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(
     st.sampled_from(
         [json.dumps(polygon(FIELD, POND)), kml(FIELD, POND), "45 12\n45 12.01\n45.01 12.01\n"]

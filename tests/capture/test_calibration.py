@@ -224,7 +224,7 @@ def test_fisheye_zero_is_opencvs_way_of_none(read):
     assert_same(read(xml(extra="<fisheye_model>0</fisheye_model>")).camera, CAMERA)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(st.data())
 def test_damaged_files_are_read_or_refused_never_worse(tmp_path_factory, data):
     good = data.draw(

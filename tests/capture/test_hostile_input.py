@@ -359,7 +359,7 @@ KML = (
 )
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.data())
 def test_any_kmz_is_read_or_refused(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
@@ -390,7 +390,7 @@ NUMBERS = st.one_of(
 )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(st.data())
 def test_any_xmp_is_read_or_named_as_damaged(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
@@ -449,7 +449,7 @@ CRS_LINES = st.one_of(
 )
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.data())
 def test_any_control_points_are_read_or_refused(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
@@ -475,7 +475,7 @@ def test_any_control_points_are_read_or_refused(
     assert all(words for words, _ in read.other_readings())
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(st.lists(st.binary(max_size=80), max_size=8), st.integers(0, 2**62))
 def test_any_bytes_from_a_receiver_are_counted(parts: list[bytes], now_ns: int) -> None:
     good = b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n"
@@ -485,7 +485,7 @@ def test_any_bytes_from_a_receiver_are_counted(parts: list[bytes], now_ns: int) 
             assert all(isinstance(value, float) for value in epoch.values.values())
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(
     st.one_of(
         st.text(max_size=40),

@@ -148,7 +148,7 @@ def test_what_is_written_is_read_again_within_half_a_step(
             assert abs(found[item.name] - values[item.name]) <= step * 0.51 + 1e-12
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(st.binary(max_size=80), st.binary(max_size=80), st.integers(0, 60), st.integers(0, 255))
 def test_no_bytes_make_it_fail(before: bytes, after: bytes, place: int, value: int) -> None:
     damaged = bytearray(encode(_TIME_NS, {"sensor_latitude_deg": 1.0, "slant_range_m": 3.0}))
@@ -161,7 +161,7 @@ def test_no_bytes_make_it_fail(before: bytes, after: bytes, place: int, value: i
 _TAGS = st.one_of(st.sampled_from(sorted(ITEMS)), st.integers(0, 200))
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(
     st.lists(
         st.lists(st.tuples(_TAGS, st.binary(max_size=12)), max_size=12), min_size=1, max_size=4

@@ -135,7 +135,7 @@ def test_a_folder_of_photos(tmp_path):
     assert find_telemetry_beside(tmp_path / "nowhere" / "a.mp4") is None
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(
     st.one_of(
         st.binary(max_size=200),

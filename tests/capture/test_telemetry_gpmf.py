@@ -138,7 +138,7 @@ def test_a_payload_that_is_cut_is_counted_and_the_others_are_read() -> None:
     assert {notice.code: notice.count for notice in telemetry.notices}["unreadable_line"] == 1
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(data=st.data())
 def test_mutated_payloads_raise_only_input_errors(data: st.DataObject) -> None:
     valid = bytearray(data.draw(st.sampled_from([gps5(0), gps9(0)])))
@@ -158,7 +158,7 @@ def test_mutated_payloads_raise_only_input_errors(data: st.DataObject) -> None:
     assert not np.isinf(telemetry["latitude_deg"]).any()
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.binary(max_size=300))
 def test_any_bytes_raise_only_input_errors(noise: bytes) -> None:
     is_gpmf(noise)

@@ -66,7 +66,7 @@ def is_simple(corners):
     return True
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(corner_lists)
 def test_crossings_are_those_of_exact_arithmetic(corners):
     assert (first_crossing(np.array(corners, dtype=float)) is None) == is_simple(corners)

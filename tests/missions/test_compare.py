@@ -503,15 +503,14 @@ def elsewhere(
         like.scene, origin=Geodetic(41.8923127, 12.6035418 + metres_east / 83_000, 83.3)
     )
     moved = replace(
-        like, flights=1, scene=scene, path=replace(like.path, length_m=12, strips=1), seed=77
+        like, flights=1, scene=scene, path=replace(like.path, length_m=8, strips=1), seed=77
     )
     simulate_into(tmp_path / "elsewhere", moved)
     yield tmp_path / "elsewhere"
 
 
-@pytest.mark.parametrize("metres_east", [3_000, 60_000])
-def test_a_flight_over_another_place_is_refused(site, tmp_path, metres_east):
-    folder = next(elsewhere(tmp_path, metres_east))
+def test_a_flight_over_another_place_is_refused(site, tmp_path):
+    folder = next(elsewhere(tmp_path, 3_000))
     with pytest.raises(InputError, match="km from the site"):
         list(compare_flights([folder / "flight1"], site, _COMPARE, camera=folder / "camera.xml"))
 

@@ -32,9 +32,9 @@ class Flown:
         settings = small_flight(
             21,
             speed_m_s=8,
-            length_m=80,
+            length_m=64,
             height_m=60,
-            size_px=(480, 360),
+            size_px=(400, 300),
             fps=1 if photos else 3,
             cars=4,
             output=OutputSettings(photos=photos),
