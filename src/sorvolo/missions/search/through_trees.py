@@ -89,13 +89,13 @@ def search_under_trees(
         radial = (0.0, 0.0)
         if solved is not None:
             views, radial = solved.views, solved.radial
-            keyframes = [each for each in keyframes if each.name not in set(solved.lost)]
+            by_name = {each.name: each for each in keyframes}
+            keyframes = [by_name[view.name] for view in views]
         yield UnderTreesUpdate(name, "floor", 1)
         pictures = FlightPictures(archive, keyframes, radial)
         views, cell_m = _at_body_size(views)
         colours = pictures.colour(0).astype(np.int16)
         is_thermal = int(np.ptp(colours, axis=2).max()) <= _GRAY
-
         stored = pictures.gray if is_thermal else pictures.colour
 
         def load(number: int) -> Any:
