@@ -49,7 +49,7 @@ _SURVEY = SimulationSettings(
     flights=1,
     scene=SceneSettings(people=0, cars=2, small_objects=2, has_scenery=True),
     path=PathSettings(height_m=25, speed_m_s=4, length_m=20, strips=2, strip_spacing_m=8),
-    imaging=ImagingSettings(width_px=480, height_px=360, fps=6, noise=1.0),
+    imaging=ImagingSettings(width_px=400, height_px=300, fps=6, noise=1.0),
     sensor=SensorSettings(noise_m=(0.1, 0.1, 0.1)),
     output=OutputSettings(photos=True, photo_overlap=0.8),
 )
