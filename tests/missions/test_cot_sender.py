@@ -238,7 +238,7 @@ def test_a_receiver_that_breaks_the_connection_is_no_receiver() -> None:
         assert taken.recv(100) == b"<event n='2'/>"
         began_s = time.monotonic()
         sender.finish()  # a server that holds its half open is not waited for without end
-        assert time.monotonic() - began_s < 3
+        assert time.monotonic() - began_s < 10
         assert taken.recv(100) == b""
         taken.close()
 
@@ -288,7 +288,7 @@ def test_a_receiver_that_does_not_answer_is_waited_for_once() -> None:
         began_s = time.monotonic()
         with pytest.raises(InputError, match=r"nothing could be sent \(timed out\)"):
             send_all([b"<event/>"] * 5, place)
-        assert time.monotonic() - began_s < 5
+        assert time.monotonic() - began_s < 10  # three seconds for each event otherwise
         for each in waiting:
             each.close()
 
