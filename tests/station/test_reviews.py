@@ -115,8 +115,8 @@ def test_of_many_at_once_all_are_kept(client: TestClient) -> None:
     codes: list[int] = []
     threads = [
         threading.Thread(
-            target=lambda label: codes.append(
-                verdict(client, "b-2", "confirmed", label=label).status_code
+            target=lambda note: codes.append(
+                verdict(client, "b-2", "confirmed", note=note).status_code
             ),
             args=(str(number),),
         )
@@ -129,7 +129,7 @@ def test_of_many_at_once_all_are_kept(client: TestClient) -> None:
     assert codes == [201] * 6
     given = client.get(REVIEWS, params={"id": "b-2"}).json()
     assert [each["revision"] for each in given] == [6, 5, 4, 3, 2, 1]
-    again = verdict(client, "b-2", "confirmed", label=given[0]["label"]).json()
+    again = verdict(client, "b-2", "confirmed", note=given[0]["note"]).json()
     assert again["revision"] == 6 and len(client.get(REVIEWS, params={"id": "b-2"}).json()) == 6
 
 

@@ -72,7 +72,7 @@ class Reviews:
     ) -> None:
         self._state, self._shelf, self._events = state, shelf, events
         self._collections = collections
-        self._settling = threading.Lock()
+        self._settling = threading.RLock()
         self._unsettled: set[str] = set()
 
     def current(self, site_id: str, kind: str) -> dict[str, Review]:
@@ -110,37 +110,40 @@ class Reviews:
 
     def give(self, site_id: str, wish: ReviewWish, who: str) -> Review:
         """Add a vote, once where it is sent again; how all stand then. Raises Problem (404) for an unknown thing."""
-        thing = self._ids(site_id, wish.kind).get(wish.id)
-        if thing is None:
-            raise Problem(404, f"the site has no {wish.kind} {wish.id[:80]!r}; load the list again")
-        votes = [each for each in self.history(site_id, wish.kind) if each.id == thing][::-1]
-        if wish.kind == "change":
-            votes += filter(None, [self._from_site(site_id, _by_id(votes)).get(thing)])
-        made = Review(
-            wish.kind,
-            thing,
-            max((each.revision for each in votes), default=0) + 1,
-            wish.verdict or next((v.verdict for v in votes[::-1] if v.who == who), NO_VERDICT),
-            wish.label,
-            wish.note,
-            who,
-            utc_now(),
-        )
-        if votes and replace(made, revision=votes[-1].revision, at=votes[-1].at) == votes[-1]:
-            return _standing(thing, votes)
-        standing = _standing(thing, [*votes, made])
-        key, kept = self._key(site_id), self._kept_as(site_id, made)
-        event = NewEvent("review.changed", asdict(standing), site_id)
-        try:
-            with self._events.appending([event]) as connection:
-                for vote in (*votes[-1:], made):
-                    if vote is made or vote.who == _ELSEWHERE:
-                        _keep(connection, key, replace(vote, id=kept))
-        except sqlite3.IntegrityError:  # another vote was quicker: this one is the next
-            return self.give(site_id, wish, who)
-        if wish.kind == "change":
-            self.settle(site_id)
-        return standing
+        with self._settling:  # what another vote is settling is no command's
+            thing = self._ids(site_id, wish.kind).get(wish.id)
+            if thing is None:
+                raise Problem(
+                    404, f"the site has no {wish.kind} {wish.id[:80]!r}; load the list again"
+                )
+            votes = [each for each in self.history(site_id, wish.kind) if each.id == thing][::-1]
+            if wish.kind == "change":
+                votes += filter(None, [self._from_site(site_id, _by_id(votes)).get(thing)])
+            made = Review(
+                wish.kind,
+                thing,
+                max((each.revision for each in votes), default=0) + 1,
+                wish.verdict or next((v.verdict for v in votes[::-1] if v.who == who), NO_VERDICT),
+                wish.label,
+                wish.note,
+                who,
+                utc_now(),
+            )
+            if votes and replace(made, revision=votes[-1].revision, at=votes[-1].at) == votes[-1]:
+                return _standing(thing, votes)
+            standing = _standing(thing, [*votes, made])
+            key, kept = self._key(site_id), self._kept_as(site_id, made)
+            event = NewEvent("review.changed", asdict(standing), site_id)
+            try:
+                with self._events.appending([event]) as connection:
+                    for vote in (*votes[-1:], made):
+                        if vote is made or vote.who == _ELSEWHERE:
+                            _keep(connection, key, replace(vote, id=kept))
+            except sqlite3.IntegrityError:  # another vote was quicker: this one is the next
+                return self.give(site_id, wish, who)
+            if wish.kind == "change":
+                self.settle(site_id)
+            return standing
 
     def forget(self, site_id: str) -> None:
         """Drop all verdicts of a site that was deleted."""
