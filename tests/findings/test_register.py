@@ -98,6 +98,10 @@ def test_silence_is_no_absence() -> None:
     left = sighting(0, "left", 0.1, order=1.0, gone="flight1", origin=KnownBy.CHANGED)
     (first, _) = associate([*seen, left]).findings
     assert first.gone == "flight1" and len(first.sightings) == 2
+    left = replace(sighting(1, "left", 0.1, order=2.0, gone="flight2"), origin=KnownBy.CHANGED)
+    (first, _) = associate([*seen, left]).findings  # from a map whose newest flight was elsewhere
+    assert (first.dates, first.gone) == (("flight0",), "flight2")
+    assert (first.first_ns, first.last_ns) == (seen[0].first_ns, seen[0].last_ns)
 
 
 def test_looks_from_above_neither_miss_nor_bring_what_lies_under_trees() -> None:

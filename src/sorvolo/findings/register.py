@@ -127,12 +127,17 @@ class GroundFinding:
     @property
     def first_ns(self) -> int:
         """When it was first seen."""
-        return min(each.first_ns for each in self.sightings)
+        return min(each.first_ns for each in self._looked)
 
     @property
     def last_ns(self) -> int:
         """When it was last seen."""
-        return max(each.last_ns for each in self.sightings)
+        return max(each.last_ns for each in self._looked)
+
+    @property
+    def _looked(self) -> Sequence[MissionSighting]:
+        """The sightings with times of their own: one that left by a comparison alone has its flight's."""
+        return [each for each in self.sightings if not each.gone] or self.sightings
 
 
 @dataclass(frozen=True, eq=False)
