@@ -184,7 +184,7 @@ def through_trees(settings: PlanSettings, hidden: float) -> PlanSettings:
     return replace(
         settings,
         model="none",
-        forward_overlap=_MOST_OVERLAP,
+        forward_overlap=max(settings.forward_overlap, _MOST_OVERLAP),
         side_overlap=max(settings.side_overlap, 1 - apart),
     )
 
