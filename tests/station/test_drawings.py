@@ -1,5 +1,6 @@
 """Drawings that all pages of a site share: kept, numbered, never overwritten unseen."""
 
+import re
 import shutil
 import time
 from pathlib import Path
@@ -51,6 +52,14 @@ def test_what_a_person_marks_as_found_is_a_finding(client: TestClient) -> None:
     assert client.post(reviews, json=vote).json()["id"] == person["id"]
     assert client.put(URL, json={"revision": 1, "features": []}).status_code == 200
     assert client.get(items).json()["features"] == []
+
+
+def test_what_an_earlier_station_drew_can_be_kept_on(client: TestClient, root: Path) -> None:
+    """It knew no time of drawing."""
+    client.put(URL, json={"revision": 0, "features": [zone("a")]})
+    (kept,) = (path for path in root.rglob("*.json") if '"purpose"' in path.read_text())
+    kept.write_text(re.sub(r',"at":"[^"]*"', "", kept.read_text()))
+    assert client.put(URL, json={"revision": 1, "features": [zone("a")]}).status_code == 200
 
 
 def test_what_somebody_drew_meanwhile_is_not_overwritten(client: TestClient) -> None:

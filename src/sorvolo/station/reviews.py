@@ -376,8 +376,9 @@ class Drawings:
                 )
             drawn = {each["id"]: each["properties"] for each in there.get("features", [])}
             for each in wish.features:
-                first = drawn.get(each.id, {"by": who, "at": utc_now()})
-                each.properties.by, each.properties.at = first["by"], first["at"]
+                first = drawn.get(each.id, {"by": who})
+                each.properties.by = first.get("by", "")
+                each.properties.at = first.get("at") or utc_now()
             kept = {"revision": now + 1, "features": [each.model_dump() for each in wish.features]}
             path = self._path(site_id)
             make_folder(path.parent)
