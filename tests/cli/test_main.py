@@ -222,6 +222,7 @@ def test_classes_that_name_none_are_an_error(
             "leave out --preset, --strips",
         ),
         (["--pictures", "3", "--relief", "0"], "leave out --relief"),
+        (["--pictures", "3", "--ground", "."], "leave out --ground ."),
     ],
 )
 def test_simulate_leaves_no_option_unheard(

@@ -120,6 +120,7 @@ def simulate(
         "--strips": strips,
         "--photos": photos,
         "--ground-gsd": ground_gsd,
+        f"--ground {ground_file}": ground_file,
     }
     # 0 is a value that was given
     if given := [
