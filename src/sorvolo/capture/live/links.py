@@ -56,7 +56,9 @@ class TelemetryLink:
         self.outages = Outages(address)
         self.failure = ""
         self._counts: Counter[str] = Counter()
-        self._buffer()  # what it needs is missed at once
+        is_mavlink = address.startswith(_MAVLINK)
+        # a link that breaks stays with the vehicle and the clock that it had
+        self._packets = MavlinkBuffer(self._counts) if is_mavlink else None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"reading {address}", daemon=True)
 
@@ -84,6 +86,9 @@ class TelemetryLink:
             ),
             *notice("no_time", counts["no_time"], "{} sentences dropped: no readable time"),
             *notice("bad_packet", counts["bad_packet"], "{} packets dropped: damaged"),
+            *notice(
+                "other_vehicle", counts["other_vehicle"], "other vehicles on the link, not used: {}"
+            ),
             *self.outages.notices("telemetry_outage"),
         ]
 
@@ -101,14 +106,9 @@ class TelemetryLink:
                 self.outages.lost(heard_s, self.failure)
                 self._stop.wait(backoff.next_s())
 
-    def _buffer(self) -> "SentenceBuffer | MavlinkBuffer":
-        if self._address.startswith(_MAVLINK):
-            return MavlinkBuffer(self._counts)
-        return SentenceBuffer(self._counts)
-
     def _listen(self, wire: Wire, backoff: Backoff) -> float:
         """Read until the wire ends; when something came last (monotonic clock)."""
-        buffer = self._buffer()
+        buffer = self._packets or SentenceBuffer(self._counts)
         heard_s, arrived_ns = time.monotonic(), time.time_ns()
         while not self._stop.is_set() and (data := wire.read()) is not None:
             if data:

@@ -25,6 +25,10 @@ _MARKERS = {0xFE: (8, 0), 0xFD: (12, 13)}  # MAVLink 1, 2: bytes but the payload
 _DATED_US = 946_684_800_000_000, 4_102_444_800_000_000  # a ground station's clock, 2000 to 2100
 _FIX_3D = 3  # of both autopilots
 _NEAR_S = 0.5  # from a fix to the attitude and height beside it
+_TIMED_MS = 3000  # of positions without a date, then the vehicle states none: autopilots send it each second
+
+_Sender = tuple[int, int]
+"""A MAVLink system and its component: beside an autopilot, a gimbal or a computer may be of its system."""
 
 
 @dataclass
@@ -241,27 +245,34 @@ class TlogReader:
         except ImportError as error:
             raise _needed(name, "a MAVLink log (.tlog)") from error
         fixes, attitude = _Rows(), _Rows()
-        ahead_s: list[float] = []
+        clocks_s: dict[_Sender, list[float]] = {}
         vehicle = None
-        others: set[int] = set()
+        others: set[_Sender] = set()
         for message in _messages(data, ardupilotmega):
-            kind = message.get_type()
-            if kind == "GLOBAL_POSITION_INT" and vehicle is None and message.lat:
-                vehicle = message.get_srcSystem()  # one log may hold several
+            kind, sender = message.get_type(), _sender(message)
+            is_position = kind == "GLOBAL_POSITION_INT"
+            if is_position and vehicle is None and message.lat:
+                vehicle = sender  # one log may hold several
             if kind == "SYSTEM_TIME" and message.time_unix_usec > _DATED_US[0]:
-                ahead_s.append(message.time_unix_usec / 1e6 - message.time_boot_ms / 1e3)
-            elif message.get_srcSystem() != vehicle:
-                others |= {message.get_srcSystem()} if vehicle is not None else set()
+                ahead_s = message.time_unix_usec / 1e6 - message.time_boot_ms / 1e3
+                clocks_s.setdefault(sender, []).append(ahead_s)
+            elif sender != vehicle:
+                others |= {sender} if is_position and vehicle is not None else set()
             elif kind == "GLOBAL_POSITION_INT":
                 fixes.add(message.time_boot_ms / 1e3, **_position(message))
             elif kind == "ATTITUDE":
                 attitude.add(message.time_boot_ms / 1e3, **_attitude(message))
-        zero_s = float(np.median(ahead_s)) if ahead_s else 0.0
+        own_s = clocks_s.get(vehicle) if vehicle else None
+        zero_s = float(np.median(own_s)) if own_s else 0.0
         for rows in (fixes, attitude):
             rows.time_s = [each + zero_s for each in rows.time_s]
         words = "other vehicles in the log, not used: {}"
         more = notice("other_vehicle", len(others), words)
-        return _telemetry("tlog", name, fixes, attitude, dated=bool(ahead_s), notices=more)
+        return _telemetry("tlog", name, fixes, attitude, dated=bool(own_s), notices=more)
+
+
+def _sender(message: Any) -> _Sender:
+    return message.get_srcSystem(), message.get_srcComponent()
 
 
 def _position(message: Any) -> dict[str, float]:
@@ -284,7 +295,8 @@ def _attitude(message: Any) -> dict[str, float]:
 class MavlinkBuffer:
     """A vehicle's MAVLink as it comes, to moments. `take` changes it; what is damaged is counted in `counts`.
 
-    The first vehicle that states a position is the one; a moment without SYSTEM_TIME has the time at which it came.
+    The first vehicle that states a position is the one; others are counted. Its own clock counts the time, tied once:
+    by its SYSTEM_TIME or, where none comes with its first positions, by when one of these came.
     """
 
     def __init__(self, counts: Counter[str]) -> None:
@@ -294,8 +306,10 @@ class MavlinkBuffer:
             raise _needed("mavlink:...", "a MAVLink link") from error
         self._counts, self._link = counts, ardupilotmega.MAVLink(None)
         self._link.robust_parsing = True
-        self._vehicle: int | None = None
-        self._zero_ns: int | None = None  # UTC of the vehicle's start
+        self._vehicle: _Sender | None = None
+        self._others: set[_Sender] = set()
+        self._first_ms = self._last_ms = 0  # of the vehicle's clock, since it was switched on
+        self._zero_ns: int | None = None  # UTC of that moment
         self._attitude: tuple[int, dict[str, float]] = (-(10**6), {})  # ms of the vehicle
 
     def take(self, data: bytes, utc_ns: int) -> list[Epoch]:
@@ -306,24 +320,35 @@ class MavlinkBuffer:
             if kind == "BAD_DATA":
                 self._counts["bad_packet"] += 1
                 continue
+            sender = _sender(message)
             if kind == "GLOBAL_POSITION_INT" and self._vehicle is None and message.lat:
-                self._vehicle = message.get_srcSystem()
-            if message.get_srcSystem() != self._vehicle:
-                continue
-            if kind == "SYSTEM_TIME" and message.time_unix_usec > _DATED_US[0]:
-                self._zero_ns = message.time_unix_usec * 1000 - message.time_boot_ms * 10**6
+                self._vehicle, self._first_ms = sender, message.time_boot_ms
+            if sender != self._vehicle:
+                if kind == "GLOBAL_POSITION_INT" and self._vehicle is not None:
+                    self._others.add(sender)
+                    self._counts["other_vehicle"] = len(self._others)
+            elif kind == "SYSTEM_TIME" and message.time_unix_usec > _DATED_US[0]:
+                if self._zero_ns is None:
+                    self._zero_ns = message.time_unix_usec * 1000 - message.time_boot_ms * 10**6
             elif kind == "ATTITUDE":
                 self._attitude = message.time_boot_ms, _attitude(message)
             elif kind == "GLOBAL_POSITION_INT":
-                at_ms, angles = self._attitude
-                is_near = abs(message.time_boot_ms - at_ms) <= _NEAR_S * 1e3
-                time_ns = (
-                    utc_ns
-                    if self._zero_ns is None
-                    else self._zero_ns + message.time_boot_ms * 10**6
-                )
-                epochs.append(Epoch(time_ns, _position(message) | (angles if is_near else {})))
+                epochs += self._epoch(message, utc_ns)
         return epochs
+
+    def _epoch(self, message: Any, utc_ns: int) -> list[Epoch]:
+        """A position with its time; none while its clock is not tied yet."""
+        boot_ms, (at_ms, angles) = message.time_boot_ms, self._attitude
+        if boot_ms < self._last_ms - 1000 * _NEAR_S:  # switched on anew
+            self._zero_ns, self._first_ms = None, boot_ms
+        self._last_ms = boot_ms
+        if self._zero_ns is None:
+            if boot_ms - self._first_ms < _TIMED_MS:
+                return []
+            self._zero_ns = utc_ns - boot_ms * 10**6
+        is_near = abs(boot_ms - at_ms) <= _NEAR_S * 1e3
+        values = _position(message) | (angles if is_near else {})
+        return [Epoch(self._zero_ns + boot_ms * 10**6, values)]
 
 
 def _packets(data: bytes, limit: int | None = None) -> Iterator[tuple[int, int, int]]:
