@@ -2,6 +2,7 @@
 
 import json
 import sqlite3
+from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -167,9 +168,13 @@ def test_the_map_is_written_as_it_was(site: Path, tmp_path: Path) -> None:
         assert web.crs.to_epsg() == 3857 and len(web.overviews(1)) >= 2
         middle = warp_transform(map_.crs, web.crs, *([each] for each in map_.xy(256, 768)))
         assert abs(next(web.sample([(middle[0][0], middle[1][0])]))[0] - 21) <= 1
+    with closing(sqlite3.connect(tmp_path / "map.mbtiles")) as table:
+        words = dict(table.execute("SELECT name, value FROM metadata"))
+    assert words["name"] == words["description"] == SITE.name
     export_version(site, "1", tmp_path / "map.pdf")
     written = (tmp_path / "map.pdf").read_bytes()
     assert written[:5] == b"%PDF-" and b"/GPTS" in written
+    assert b"/Title (" + SITE.name.encode() + b")" in written
     names = {"site", "map.tif", "map.png", "map.KMZ", "map.mbtiles", "map.pdf"}
     assert {path.name for path in tmp_path.iterdir()} == names
 

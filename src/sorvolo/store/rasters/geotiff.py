@@ -7,9 +7,10 @@ starts at that pixel's outer corner.
 import math
 import re
 import shutil
+import sqlite3
 import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from xml.sax.saxutils import escape
@@ -234,14 +235,20 @@ def write_mbtiles_or_pdf(
         write_cog(tiles, site_grid, plain := scratch / "map.tif")
         with atomic_path(path) as temporary:
             if path.suffix.lower() == ".pdf":
-                rasterio.shutil.copy(plain, temporary, driver="PDF", title=name)
+                with rasterio.open(
+                    plain, "r+", driver="GTiff", IGNORE_COG_LAYOUT_BREAK="YES"
+                ) as map_:
+                    map_.update_tags(TITLE=name)
+                rasterio.shutil.copy(plain, temporary, driver="PDF")
                 return
-            rasterio.shutil.copy(
-                plain, temporary, driver="MBTiles", tile_format="PNG", name=name, description=name
-            )
+            rasterio.shutil.copy(plain, temporary, driver="MBTiles", tile_format="PNG")
             with rasterio.open(temporary, "r+", driver="MBTiles") as made:
                 levels = range(1, max(1, max(made.shape) // 128).bit_length() + 1)
                 made.build_overviews([2**each for each in levels], Resampling.average)
+            with closing(sqlite3.connect(temporary)) as table, table:  # an option ends in capitals
+                table.execute(
+                    "UPDATE metadata SET value=? WHERE name IN ('name','description')", [name]
+                )
 
 
 def parse_crs(crs: str, grid: Grid) -> CRS:
