@@ -262,7 +262,7 @@ def test_a_flight_is_searched_once(site: Path, tmp_path: Path) -> None:
 
 
 def test_plants_serve_another_search_of_the_same_frames_alone() -> None:
-    basis = Basis("1", "model", "frames", "", 0.0, None, ("person", "car"), 80, 1, "")
+    basis = Basis("1", "model", "frames", "", None, ("person", "car"), 80, 1, "")
     assert basis.serves(replace(basis, plants=20, seed=4, area="field"))
     assert basis.serves(replace(basis, classes=("car",)))
     for other in (
@@ -270,7 +270,6 @@ def test_plants_serve_another_search_of_the_same_frames_alone() -> None:
         {"frames": "x"},
         {"program": "2"},
         {"heights": "x"},
-        {"through_crowns": 0.3},
         {"sun_deg": (1.0, 2.0)},
         {"classes": ("small object",)},
     ):

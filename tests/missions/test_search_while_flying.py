@@ -281,7 +281,7 @@ def test_a_flight_that_an_earlier_search_measured_counts_once_it_was_looked_at(
             cells_of([each + np.array([25.0, 0.0]) for each in frames_m], archive.site(), None)
         )
         blind = EarlierFlights(
-            archive, "other", prepared, replace(settings, through_crowns=0.5), outputs
+            archive, "other", prepared, replace(settings, sun_deg=(200.0, 30.0)), outputs
         )
         assert (
             not blind.look() and len(blind.uncounted_m) == len(frames_m) and not earlier.uncounted_m

@@ -52,12 +52,6 @@ Plants = Annotated[
     int, typer.Option(help="People, and cars, to plant: more take longer and are surer.")
 ]
 Enough = Annotated[float, typer.Option(help="Ground with a lower probability is a hole.")]
-ThroughCrowns = Annotated[
-    float,
-    typer.Option(
-        help="Share of a body that crowns leave free: 0 counts ground under trees as not seen."
-    ),
-]
 ThroughTrees = Annotated[
     bool,
     typer.Option(
@@ -82,7 +76,6 @@ def search_command(
     classes: Classes = None,
     plants: Plants = 80,
     enough: Enough = 0.5,
-    through_crowns: ThroughCrowns = 0.0,
     through_trees: ThroughTrees = False,
     refly: Refly = None,
     dji_drone: DjiDrone = "fly",
@@ -124,7 +117,7 @@ def search_command(
         raise SettingsError(
             f"{', '.join(unused)}: --through-trees looks below all that the flight saw, and measures nothing; leave it out"
         )
-    settings = SearchSettings(plants, wanted_classes(classes), model, enough, through_crowns)
+    settings = SearchSettings(plants, wanted_classes(classes), model, enough)
     with opened_site(site or _map_of(inputs), writes=bool(site) or through_trees) as place:
         outputs = SearchOutputs(
             out or place.results("search"),

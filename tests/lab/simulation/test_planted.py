@@ -40,7 +40,7 @@ def _ground(seed: int = 1) -> np.ndarray:
 
 def test_a_car_stands_where_it_is_planted_as_large_as_it_is() -> None:
     car = new_plant(1, "car", np.array([4.0, -3.0]), 7)
-    box = plant(_grey(), CAMERA, POSE, [car], _light(), None, [1.0], 1).boxes_px[0]
+    box = plant(_grey(), CAMERA, POSE, [car], _light(), None, 1).boxes_px[0]
     middle = (box[:2] + box[2:]) / 2
     assert np.hypot(*(middle - [319.5 + 4 * 20, 239.5 + 3 * 20])) < 8
     longest_m = float((box[2:] - box[:2]).max()) / 20
@@ -49,7 +49,7 @@ def test_a_car_stands_where_it_is_planted_as_large_as_it_is() -> None:
 
 def test_shadows_fall_away_from_the_sun_and_an_overcast_sky_throws_none() -> None:
     person = [new_plant(3, "car", np.array([0.0, 0.0]), 2)]
-    sunny = plant(_grey(), CAMERA, POSE, person, _light(), direction_from_angles(180, 30), [1.0], 1)
+    sunny = plant(_grey(), CAMERA, POSE, person, _light(), direction_from_angles(180, 30), 1)
     box = sunny.boxes_px[0].astype(int)
     above = sunny.image[box[1] - 12 : box[1] - 4, box[0] + 5 : box[2] - 5].mean()
     below = sunny.image[box[3] + 6 : box[3] + 14, box[0] + 5 : box[2] - 5].mean()
@@ -57,22 +57,11 @@ def test_shadows_fall_away_from_the_sun_and_an_overcast_sky_throws_none() -> Non
         110, abs=2
     )  # the sun stands in the south: shadows fall north, upwards
     cloudy = plant(
-        _grey(), CAMERA, POSE, person, _light(shadow=0.0), direction_from_angles(180, 30), [1.0], 1
+        _grey(), CAMERA, POSE, person, _light(shadow=0.0), direction_from_angles(180, 30), 1
     )
     assert cloudy.image[box[1] - 12 : box[1] - 4, box[0] + 5 : box[2] - 5].mean() == pytest.approx(
         110, abs=2
     )
-
-
-def test_crowns_hide_all_but_their_gaps() -> None:
-    car = [new_plant(1, "car", np.array([0.0, 0.0]), 7)]
-
-    def changed(share: float) -> int:
-        planted = plant(_grey(), CAMERA, POSE, car, _light(), None, [share], 1).image
-        return int((np.abs(planted.astype(int) - 110).max(axis=2) > 8).sum())
-
-    assert changed(0.0) == 0
-    assert 0.15 < changed(0.3) / changed(1.0) < 0.6
 
 
 def test_what_is_out_of_sight_has_no_box_and_leaves_the_picture() -> None:
@@ -83,7 +72,6 @@ def test_what_is_out_of_sight_has_no_box_and_leaves_the_picture() -> None:
         [new_plant(1, "car", np.array([90.0, 0.0]), 7)],
         _light(),
         None,
-        [1.0],
         1,
     )
     assert np.isnan(planted.boxes_px).all() and (planted.image == 110).all()
@@ -119,9 +107,7 @@ def test_dark_noisy_and_thermal_frames_are_distinguished() -> None:
 def test_a_person_is_warm_in_a_thermal_frame() -> None:
     person = [new_plant(1, "person", np.array([0.0, 0.0]), 3)]
     light = _light(gain=np.ones(3), haze=np.full(3, 90.0), is_thermal=True, shadow=0.0)
-    planted = plant(
-        _grey(90), CAMERA, POSE, person, light, direction_from_angles(180, 30), [1.0], 1
-    )
+    planted = plant(_grey(90), CAMERA, POSE, person, light, direction_from_angles(180, 30), 1)
     box = planted.boxes_px[0].astype(int)
     assert planted.image[box[1] : box[3], box[0] : box[2]].max() > 120
     assert planted.image.min() >= 85  # no shadow

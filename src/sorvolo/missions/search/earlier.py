@@ -52,7 +52,6 @@ class Basis:
     model: str
     frames: str
     heights: str
-    through_crowns: float
     sun_deg: tuple[float, float] | None
     classes: tuple[str, ...]
     plants: int
@@ -76,7 +75,6 @@ class Basis:
             content_sha256(prepared.detector.info),
             content_sha256(places),
             heights,
-            settings.through_crowns,
             settings.sun_deg,
             planted_classes(prepared.detector, settings),
             settings.plants,
@@ -239,7 +237,7 @@ class _Flight:
         settings: SearchSettings,
     ) -> None:
         self.name, self.frames, self._labels = name, frames, labels
-        self._searched, self._settings = searched, settings
+        self._searched = searched
         self.cells = cells_of([each.placed.outline_m for each in frames], site, None)
         self._sun = sun_at(frames[len(frames) // 2], site, settings)
         self._looks = FlightLooks(above)
@@ -255,9 +253,7 @@ class _Flight:
     def measured(self) -> MeasuredFlight:
         """Return what its plants state of its own cells."""
         seen = self._looks.of_cells(self.cells, self._labels)
-        return self._looks.measured(
-            self.name, seen, self._searched, self._settings, is_earlier=True
-        )
+        return self._looks.measured(self.name, seen, self._searched, is_earlier=True)
 
 
 def _frames_of(archive: Archive, name: str) -> list[SearchFrame]:

@@ -162,7 +162,6 @@ class FlightLooks:
         name: str,
         seen: Mapping[str, Conditions],
         searched: "SearchedPlants",
-        settings: SearchSettings,
         *,
         is_earlier: bool = False,
     ) -> "MeasuredFlight":
@@ -175,9 +174,7 @@ class FlightLooks:
                 places_m, self.at(places_m, reach_m(label)), [hit for _, hit in own]
             )
             recall = fit_recall(outcomes.columns, outcomes.found) if len(outcomes) else None
-            hidden = conditions.roofs
-            if settings.through_crowns == 0:
-                hidden = hidden | conditions.under_trees
+            hidden = conditions.roofs | conditions.under_trees
             chances = map_chances(recall, conditions.columns, hidden)
             classes.append(MeasuredClass(label, conditions, outcomes, recall, chances))
         return MeasuredFlight(
@@ -217,11 +214,8 @@ def measure_flight(
     seen = looks.of_cells(cells, wanted)
     searched = before
     if searched is None:
-        # under trees plants stand only where some of them would show
         first = seen[wanted[0]]
-        usable = cells.wanted & first.seen & ~first.roofs
-        if settings.through_crowns == 0:
-            usable &= ~first.beside_trees
+        usable = cells.wanted & first.seen & ~first.roofs & ~first.beside_trees
         rounds = plant_places(
             cells,
             first,
@@ -233,7 +227,7 @@ def measure_flight(
             usable=usable,
         )
         searched = yield from _searched(name, looks, rounds, sun, detector, wanted, settings)
-    return looks.measured(name, seen, searched, settings, is_earlier=before is not None)
+    return looks.measured(name, seen, searched, is_earlier=before is not None)
 
 
 def _searched(
@@ -254,8 +248,6 @@ def _searched(
             new_plant(len(gathered) + k, each.label, each.place_m, settings.seed)
             for k, each in enumerate(places)
         ]
-        under = flight.at([each.place_m(0)[:2] for each in things], 0.5).under_trees
-        shown = [settings.through_crowns if hidden else 1.0 for hidden in under]
         laid: list[LaidSighting] = []
         boxes_px: dict[int, BoxesPx] = {}
         least: dict[str, float] = {}
@@ -267,7 +259,6 @@ def _searched(
                 light,
                 things,
                 sun,
-                shown,
                 settings.seed + number,
                 detector,
                 wanted,
@@ -328,7 +319,6 @@ def search_planted(
     light: FrameLight,
     things: Sequence[Thing],
     sun: Vector3 | None,
-    shown: Sequence[float],
     seed: int,
     detector: ObjectDetector,
     wanted: Sequence[str],
@@ -337,13 +327,13 @@ def search_planted(
 ) -> SearchedPicture | None:
     """Plant things into a frame's picture and have it searched as a map's is; None where it shows none of them.
 
-    `light` is the picture's; `sun`, `shown` and `seed` as `plant` takes them. `is_again`: the frame was searched with
+    `light` is the picture's; `sun` and `seed` as `plant` takes them. `is_again`: the frame was searched with
     other plants in it, and the detector's notices count it once.
     """
     pose = pose_of(frame.placed)
     assert pose is not None  # frames without a place are none of these
     camera = frame.placed.camera
-    planted = plant(image, camera, pose, things, light, sun, shown, seed)
+    planted = plant(image, camera, pose, things, light, sun, seed)
     if not any_of(planted.boxes_px):
         return None
     from_above = is_from_above(pose.rotation)
@@ -383,8 +373,7 @@ class GrowingMeasure:
     `add` takes one frame after another, `measured` gives what all of them state together. Plants stand in a field that
     was sown before anybody saw it (`PlantField`), so that all frames of a place show the same; a frame is planted on
     the place that it has when it is added, and its sightings are laid by that. What turns out to be under trees or
-    roofs does not count as planted, but where `through_crowns` is given. `keep_off_m` and `above` as `measure_flight`
-    takes them. A flight that climbs shows too many plants at once: a wider field is sown then, and what was measured
+    roofs does not count as planted. `keep_off_m` and `above` as `measure_flight` takes them. A flight that climbs shows too many plants at once: a wider field is sown then, and what was measured
     from below is forgotten.
     """
 
@@ -432,21 +421,12 @@ class GrowingMeasure:
             )
         sun = sun_at(frame, self._site, self._settings)
         image = self._looks.add(frame, sun)
-        light, look = self._looks.lights[-1], self._looks.looks[-1]
+        light = self._looks.lights[-1]
         numbers = self._field.near(outline_m, _REACH_M)
         self._grow(self._field)
         things = [self._things[each] for each in numbers]
-        under = gather(
-            [look], [each.place_m(0)[:2] for each in things], 0.5, self._looks.above
-        ).under_trees
-        shown = [
-            self._settings.through_crowns if hidden and self._settings.through_crowns else 1.0
-            for hidden in under
-        ]
         seed = self._settings.seed + frame.placed.index
-        seen = search_planted(
-            frame, image, light, things, sun, shown, seed, self._detector, self._wanted
-        )
+        seen = search_planted(frame, image, light, things, sun, seed, self._detector, self._wanted)
         if seen is not None:
             self._pictures[frame.placed.index] = frame.placed, numbers, seen
             self._fresh.update(numbers)
@@ -463,15 +443,14 @@ class GrowingMeasure:
         places = [] if self._field is None else self._field.places
         self._judge_fresh(places)
         at = self._looks.at([each.place_m for each in places], 0.5)
-        hides = at.roofs if self._settings.through_crowns > 0 else at.roofs | at.beside_trees
         gathered = [
             (place, number in self._reported)
-            for number, (place, hidden) in enumerate(zip(places, hides))
+            for number, (place, hidden) in enumerate(zip(places, at.roofs | at.beside_trees))
             if not hidden
         ]
         searched = SearchedPlants(len(self._pictures), 1, self._seconds, tuple(gathered))
         seen = self._looks.of_cells(cells, self._wanted)
-        return cells, self._looks.measured(self._name, seen, searched, self._settings)
+        return cells, self._looks.measured(self._name, seen, searched)
 
     def _judge_fresh(self, places: Sequence[PlantPlace]) -> None:
         """Find out anew which plants are reported, of those that were shown since: what is far from them stays."""

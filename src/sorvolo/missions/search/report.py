@@ -334,10 +334,9 @@ def _warnings(searched: Searched, settings: SearchSettings, *, is_over: bool) ->
                 "{}: {area_m2:,.0f} m2 below crowns count by its look through the trees: {pod:.2f} (90 % interval "
                 "{pod_low:.2f} to {pod_high:.2f})".format(flight.name, **flight.floor)
             )
-    if settings.through_crowns == 0 and any(each.floor is None for each in searched.flights):
+    if any(each.floor is None for each in searched.flights):
         warnings.append(
-            "ground under trees counts as not found at all; --through-trees looks below them, --through-crowns assumes "
-            "gaps in crowns"
+            "ground under trees counts as not found at all; --through-trees looks below them"
         )
     if "person" in searched.labels:
         warnings.append(

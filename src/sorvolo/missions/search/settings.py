@@ -21,15 +21,13 @@ class SearchSettings:
     """How the probability of detection is measured (`sorvolo search`).
 
     `plants` of each class are planted in all; no `classes` means those that the model usually reports. Where less than
-    `enough` would have been found the ground is a hole. `through_crowns` is the share of a body that crowns are assumed
-    to leave free (0: nothing under trees is seen). `sun_deg` is its azimuth and elevation; None: by time and place.
+    `enough` would have been found the ground is a hole. `sun_deg` is its azimuth and elevation; None: by time and place.
     """
 
     plants: int = 80
     classes: tuple[str, ...] = ()
     model: str = "default"
     enough: float = 0.5
-    through_crowns: float = 0.0
     sun_deg: tuple[float, float] | None = None
     seed: int = 1
 
@@ -40,9 +38,8 @@ class SearchSettings:
             )
         if self.seed < 0:
             raise SettingsError(f"the seed must be 0 or more, got {self.seed}")
-        for name, value in (("--enough", self.enough), ("--through-crowns", self.through_crowns)):
-            if not 0 <= value <= 1:
-                raise SettingsError(f"{name} must lie in 0 to 1, got {value}")
+        if not 0 <= self.enough <= 1:
+            raise SettingsError(f"--enough must lie in 0 to 1, got {self.enough}")
         if self.sun_deg is not None and not (
             0 <= self.sun_deg[0] <= 360 and -90 <= self.sun_deg[1] <= 90
         ):

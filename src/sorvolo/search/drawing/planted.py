@@ -11,7 +11,6 @@ from sorvolo.geometry.arrays import BoxesPx, Floats, ImageRGB, ImageRGBA, Vector
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.pose import Pose
 from sorvolo.search.drawing.bodies import build_body
-from sorvolo.search.drawing.noise import fractal
 from sorvolo.search.drawing.objects import (
     GROUND_LEVEL,
     POSES,
@@ -222,13 +221,12 @@ def plant(
     things: Sequence[Thing],
     light: FrameLight,
     sun: Vector3 | None,
-    shown: Sequence[float],
     seed: int,
 ) -> PlantedThing:
     """The frame with these things in it, far ones first.
 
-    `camera` is the frame's own, `sun` (3,) the direction to the sun, None for none; `shown` the share of each thing
-    that crowns leave free. Grain and gaps follow from `seed`; a thing looks alike in all frames of one light.
+    `camera` is the frame's own, `sun` (3,) the direction to the sun, None for none. Grain follows from `seed`; a thing
+    looks alike in all frames of one light.
     """
     canvas = np.array(image, np.uint8)
     view = camera_view(camera, site_from_camera, ray_grid(camera) if camera.is_distorted else None)
@@ -249,17 +247,8 @@ def plant(
         boxes[k] = _box(window, overlay)
         rng = np.random.default_rng([seed, thing.id])
         if shadow is not None and (cast := _drawn(view, [shadow])) is not None:
-            _lay(
-                canvas,
-                cast[0],
-                _gapped(cast[1], shown[k], m_per_px, thing),
-                light,
-                rng,
-                is_shadow=True,
-            )
-        _lay(
-            canvas, window, _gapped(overlay, shown[k], m_per_px, thing), light, rng, is_shadow=False
-        )
+            _lay(canvas, *cast, light, rng, is_shadow=True)
+        _lay(canvas, window, overlay, light, rng, is_shadow=False)
     return PlantedThing(canvas, boxes)
 
 
@@ -311,16 +300,6 @@ def _box(window: Window, overlay: _Overlay) -> Floats:
         [x0 + columns.min(), y0 + rows.min(), x0 + columns.max() + 1, y0 + rows.max() + 1],
         np.float64,
     )
-
-
-def _gapped(overlay: _Overlay, shown: float, m_per_px: float, thing: Thing) -> _Overlay:
-    """What gaps in a crown leave of it: patches of leaves some decimetres wide hide the rest."""
-    if shown >= 1:
-        return overlay
-    rng = np.random.default_rng([thing.seed, 11])
-    leaves = fractal(rng, overlay.shape[:2], m_per_px, (0.15, 0.4), (0.7, 1.0))
-    gaps = leaves >= np.quantile(leaves, 1 - shown) if shown > 0 else np.zeros(leaves.shape, bool)
-    return overlay * gaps[..., None].astype(np.float32)
 
 
 def _lay(
