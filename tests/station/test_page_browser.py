@@ -1296,8 +1296,16 @@ def test_what_is_drawn_is_measured_and_shared(
     other.page.context.close()
 
 
-def test_what_is_shown_can_be_taken_away(opened: Watched, tmp_path: Path) -> None:
-    page = opened.page
+def test_what_is_shown_can_be_taken_away(
+    opened: Watched, served: Served, tmp_path: Path
+) -> None:
+    page, url = opened.page, "/api/sites/field/drawings"
+    kept = served.ask(url)
+    mark = {"type": "Feature", "id": "seen", "properties": {"purpose": "found"}}
+    mark["geometry"] = {"type": "Point", "coordinates": [13.2503, 46.5003]}
+    wish = {"revision": kept["revision"], "features": [*kept["features"], mark]}
+    revision = served.ask(url, "PUT", wish)["revision"]
+    page.reload()
     page.locator("[data-panel=share]").click()
     page.locator(".files a", has_text="GeoPackage").wait_for()
     taken = {}
@@ -1306,6 +1314,9 @@ def test_what_is_shown_can_be_taken_away(opened: Watched, tmp_path: Path) -> Non
             page.get_by_role("button", name=name).click()
         taken[name] = Path(shutil.copy(download.value.path(), tmp_path / name))
     features = json.loads(taken["GeoJSON"].read_text())["features"]
+    served.ask(url, "PUT", {"revision": revision, "features": kept["features"]})
+    marks = [each for each in features if each["geometry"]["coordinates"] == [13.2503, 46.5003]]
+    assert [each["properties"]["class"] for each in marks] == ["person"]
     assert sum("kind" in each["properties"] for each in features) == 4
     rows = taken["CSV"].read_text().splitlines()
     assert rows[0].startswith("id,what,kind,class")

@@ -58,7 +58,7 @@ export function exportPanel(screen, body) {
 function shownFeatures(screen) {
   const { data, view } = screen;
   const on = (group) => !view || view.isShown(group);
-  return [...(on("changes") ? data.shown("changes") : []), ...(on("objects") ? data.shown("objects") : []), ...(screen.zones ?? [])];
+  return [...(on("changes") ? data.shown("changes") : []), ...(on("objects") ? data.shown("objects") : []), ...(screen.zones ?? []).filter((each) => each.properties.purpose !== "found")]; // that is among the objects
 }
 
 function download(blob, name) {
