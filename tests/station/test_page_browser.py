@@ -1296,9 +1296,7 @@ def test_what_is_drawn_is_measured_and_shared(
     other.page.context.close()
 
 
-def test_what_is_shown_can_be_taken_away(
-    opened: Watched, served: Served, tmp_path: Path
-) -> None:
+def test_what_is_shown_can_be_taken_away(opened: Watched, served: Served, tmp_path: Path) -> None:
     page, url = opened.page, "/api/sites/field/drawings"
     kept = served.ask(url)
     mark = {"type": "Feature", "id": "seen", "properties": {"purpose": "found"}}
