@@ -32,7 +32,7 @@ async function begin() {
   applyTheme();
   document.getElementById("settings-button").addEventListener("click", showSettings);
   choices.addEventListener("change", (event) => { if (event.detail === "theme") applyTheme(); });
-  session.addEventListener("needed", showLogin);
+  session.addEventListener("needed", () => { if (!declined) showLogin(); });
   addEventListener("hashchange", () => route());
   if (isSecureContext) navigator.serviceWorker?.register("/page/sw.js", { scope: "/" }).catch(() => {}); // without it the page needs the station
   await enter();
@@ -84,6 +84,7 @@ function disk({ is_low: isLow, free_gb: free, floor_gb: floor }) {
 
 async function route() {
   turn += 1;
+  declined = false;
   const mine = turn;
   const [path, query] = location.hash.split("?");
   const [, kind, id, view] = path.split("/").map(decodeURIComponent);
@@ -125,6 +126,7 @@ function whenMade(id, then) {
 }
 
 let loginBox = null;
+let declined = false; // by Escape: answers that come late do not ask again, another screen does
 
 function showLogin() {
   if (loginBox?.isConnected) return;
@@ -150,7 +152,8 @@ function showLogin() {
   loginBox = dialog("Log in", form);
   loginBox.addEventListener("close", () => { // by Escape: the way in stays
     if (isLoggedIn) return;
-    screen?.close?.(); // its questions would bring the dialog back
+    declined = true;
+    screen?.close?.();
     screen = null;
     blank("You are not logged in", "This station shows its sites to those who have a token.", button("Log in", showLogin, { class: "main" }));
   });
