@@ -85,6 +85,6 @@ $(VENV)/.built: pyproject.toml setup.py $(wildcard src/sorvolo/kernels/*.?pp) | 
 	$(BIN)/python -m $(PIP) -e .
 	touch $@
 
-$(VENV)/.training: requirements-training.lock requirements-notebooks.lock | $(VENV)/.locked
-	$(BIN)/python -m $(PIP) -r requirements-training.lock -r requirements-notebooks.lock
+$(VENV)/.training: requirements-test.lock requirements-training.lock requirements-notebooks.lock | $(VENV)/.locked
+	$(BIN)/python -m $(PIP) -r requirements-test.lock -r requirements-training.lock -r requirements-notebooks.lock
 	touch $@
