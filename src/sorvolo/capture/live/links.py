@@ -155,13 +155,9 @@ class SentenceBuffer:
 
 def is_link(text: str) -> bool:
     """Whether `--telemetry` names a link rather than a file."""
-    scheme, colon, _ = text.removeprefix(_MAVLINK).partition(":")
-    schemes = (
-        ("serial", "tcp", "udp")
-        if text.startswith(_MAVLINK)
-        else ("serial", "tcp", "udp", "follow")
+    return text.startswith("follow:") or text.removeprefix(_MAVLINK).startswith(
+        ("serial:", "tcp:", "udp:")
     )
-    return bool(colon) and scheme in schemes
 
 
 def link_format(text: str) -> str:

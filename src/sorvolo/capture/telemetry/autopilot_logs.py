@@ -246,33 +246,46 @@ class TlogReader:
             raise _needed(name, "a MAVLink log (.tlog)") from error
         fixes, attitude = _Rows(), _Rows()
         clocks_s: dict[_Sender, list[float]] = {}
-        vehicle = None
-        others: set[_Sender] = set()
+        vehicle = _Vehicle()  # one log may hold several
         for message in _messages(data, ardupilotmega):
-            kind, sender = message.get_type(), _sender(message)
-            is_position = kind == "GLOBAL_POSITION_INT"
-            if is_position and vehicle is None and message.lat:
-                vehicle = sender  # one log may hold several
+            kind, is_own = message.get_type(), vehicle.owns(message)
             if kind == "SYSTEM_TIME" and message.time_unix_usec > _DATED_US[0]:
                 ahead_s = message.time_unix_usec / 1e6 - message.time_boot_ms / 1e3
-                clocks_s.setdefault(sender, []).append(ahead_s)
-            elif sender != vehicle:
-                others |= {sender} if is_position and vehicle is not None else set()
+                clocks_s.setdefault(_sender(message), []).append(ahead_s)
+            elif not is_own:
+                continue
             elif kind == "GLOBAL_POSITION_INT":
                 fixes.add(message.time_boot_ms / 1e3, **_position(message))
             elif kind == "ATTITUDE":
                 attitude.add(message.time_boot_ms / 1e3, **_attitude(message))
-        own_s = clocks_s.get(vehicle) if vehicle else None
+        own_s = clocks_s.get(vehicle.sender) if vehicle.sender else None
         zero_s = float(np.median(own_s)) if own_s else 0.0
         for rows in (fixes, attitude):
             rows.time_s = [each + zero_s for each in rows.time_s]
         words = "other vehicles in the log, not used: {}"
-        more = notice("other_vehicle", len(others), words)
+        more = notice("other_vehicle", len(vehicle.others), words)
         return _telemetry("tlog", name, fixes, attitude, dated=bool(own_s), notices=more)
 
 
 def _sender(message: Any) -> _Sender:
     return message.get_srcSystem(), message.get_srcComponent()
+
+
+class _Vehicle:
+    """The first sender of a position; `owns` finds it, and counts others that send positions as well."""
+
+    def __init__(self) -> None:
+        self.sender: _Sender | None = None
+        self.others: set[_Sender] = set()
+
+    def owns(self, message: Any) -> bool:
+        """Whether it sent this message."""
+        sender, is_position = _sender(message), message.get_type() == "GLOBAL_POSITION_INT"
+        if is_position and self.sender is None and message.lat:
+            self.sender = sender
+        if is_position and self.sender not in (None, sender):
+            self.others.add(sender)
+        return sender == self.sender
 
 
 def _position(message: Any) -> dict[str, float]:
@@ -306,9 +319,8 @@ class MavlinkBuffer:
             raise _needed("mavlink:...", "a MAVLink link") from error
         self._counts, self._link = counts, ardupilotmega.MAVLink(None)
         self._link.robust_parsing = True
-        self._vehicle: _Sender | None = None
-        self._others: set[_Sender] = set()
-        self._first_ms = self._last_ms = 0  # of the vehicle's clock, since it was switched on
+        self._vehicle = _Vehicle()
+        self._first_ms, self._last_ms = 0, 2**32  # of the vehicle's clock, since it was switched on
         self._zero_ns: int | None = None  # UTC of that moment
         self._attitude: tuple[int, dict[str, float]] = (-(10**6), {})  # ms of the vehicle
 
@@ -320,13 +332,8 @@ class MavlinkBuffer:
             if kind == "BAD_DATA":
                 self._counts["bad_packet"] += 1
                 continue
-            sender = _sender(message)
-            if kind == "GLOBAL_POSITION_INT" and self._vehicle is None and message.lat:
-                self._vehicle, self._first_ms = sender, message.time_boot_ms
-            if sender != self._vehicle:
-                if kind == "GLOBAL_POSITION_INT" and self._vehicle is not None:
-                    self._others.add(sender)
-                    self._counts["other_vehicle"] = len(self._others)
+            if not self._vehicle.owns(message):
+                self._counts["other_vehicle"] = len(self._vehicle.others)
             elif kind == "SYSTEM_TIME" and message.time_unix_usec > _DATED_US[0]:
                 if self._zero_ns is None:
                     self._zero_ns = message.time_unix_usec * 1000 - message.time_boot_ms * 10**6
@@ -339,7 +346,7 @@ class MavlinkBuffer:
     def _epoch(self, message: Any, utc_ns: int) -> list[Epoch]:
         """A position with its time; none while its clock is not tied yet."""
         boot_ms, (at_ms, angles) = message.time_boot_ms, self._attitude
-        if boot_ms < self._last_ms - 1000 * _NEAR_S:  # switched on anew
+        if boot_ms < self._last_ms - 1000 * _NEAR_S:  # its first position, or switched on anew
             self._zero_ns, self._first_ms = None, boot_ms
         self._last_ms = boot_ms
         if self._zero_ns is None:

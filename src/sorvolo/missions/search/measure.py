@@ -373,8 +373,8 @@ class GrowingMeasure:
     `add` takes one frame after another, `measured` gives what all of them state together. Plants stand in a field that
     was sown before anybody saw it (`PlantField`), so that all frames of a place show the same; a frame is planted on
     the place that it has when it is added, and its sightings are laid by that. What turns out to be under trees or
-    roofs does not count as planted. `keep_off_m` and `above` as `measure_flight` takes them. A flight that climbs shows too many plants at once: a wider field is sown then, and what was measured
-    from below is forgotten.
+    roofs does not count as planted. `keep_off_m` and `above` as `measure_flight` takes them. A flight that climbs shows
+    too many plants at once: a wider field is sown then, and what was measured from below is forgotten.
     """
 
     def __init__(

@@ -19,7 +19,9 @@ _STEPS = {
     4: timedelta(minutes=1),
     6: timedelta(seconds=1),
 }  # by digits of a time of day
-_ENDINGS = (".tif", ".tiff", ".png", ".kmz", ".mbtiles", ".pdf")
+_FOR_TABLETS = (".mbtiles", ".pdf")
+_ON_EARTH = (".kmz", *_FOR_TABLETS)  # a map without a place cannot be these
+_ENDINGS = (".tif", ".tiff", ".png", *_ON_EARTH)
 
 
 @dataclass(frozen=True)
@@ -159,7 +161,7 @@ def _write_map(archive: Archive, version: VersionEntry, path: Path, compress: st
             f"version {version.id} of the map of {archive.folder} is empty; there is nothing to write"
         )
     ending = path.suffix.lower()
-    if ending in _ENDINGS[3:] and site.is_local:
+    if ending in _ON_EARTH and site.is_local:
         raise SettingsError(
             f"{archive.folder} has no place on Earth, so its map cannot be a {ending}; write .tif or .png"
         )
@@ -167,7 +169,7 @@ def _write_map(archive: Archive, version: VersionEntry, path: Path, compress: st
         write_preview(tiles, path)
     elif ending == ".kmz":
         write_kmz(tiles, archive.site_grid(), site.name, path)
-    elif ending in _ENDINGS[4:]:
+    elif ending in _FOR_TABLETS:
         write_mbtiles_or_pdf(tiles, archive.site_grid(), site.name, path)
     else:
         write_cog(
