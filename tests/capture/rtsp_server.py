@@ -13,12 +13,15 @@ _SDP = (
 
 
 class RtspServer(threading.Thread):
-    """Serves `rtsp://127.0.0.1:PORT/live`; who gives no password, where one is set, is sent away."""
+    """Serves `rtsp://127.0.0.1:PORT/live`; who gives no password, where one is set, is sent away.
 
-    def __init__(self, *, password: bool = False) -> None:
+    `says`: what it answers to every request in place of that, as it is; `{cseq}` is the request's number.
+    """
+
+    def __init__(self, *, password: bool = False, says: str = "") -> None:
         super().__init__(daemon=True)
         self._listener = socket.create_server(("127.0.0.1", 0))
-        self._password = password
+        self._password, self._says = password, says
         self.address = f"rtsp://127.0.0.1:{self._listener.getsockname()[1]}/live"
         self.methods: list[str] = []
         self.playing = 0  # connections that get the film now
@@ -66,6 +69,9 @@ class RtspServer(threading.Thread):
             return
 
     def _answer(self, connection: socket.socket, method: str, headers: dict[str, str]) -> None:
+        if self._says:
+            connection.sendall(self._says.replace("{cseq}", headers["cseq"]).encode())
+            return
         status, extra, body = "200 OK", "", ""
         if self._password:
             status = "401 Unauthorized"

@@ -23,6 +23,7 @@ from live_sender import (
 from rtsp_server import RtspServer
 
 from sorvolo.capture.live.addresses import StreamAddress, live_address
+from sorvolo.capture.live.opening import open_stream
 from sorvolo.capture.live.reader import StreamReader
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.stream import LiveStream
@@ -343,3 +344,58 @@ def test_nothing_there_is_an_error_with_a_reason() -> None:
         open_live(f"udp://:{port}", short, telemetry="log.srt")
     with pytest.raises(InputError, match="recorded flight's telemetry is a file"):
         open_sources([__file__], telemetry="udp://:1")
+
+
+MOVED = "302 Found\r\nCSeq: {cseq}\r\nLocation: INNER\r\n\r\n"
+
+
+@pytest.fixture
+def inner() -> Iterator[RtspServer]:
+    server = RtspServer()
+    server.start()
+    yield server
+    server.close()
+
+
+def opened_at(server: RtspServer, *, follows: bool) -> bytes:
+    """The first picture of a camera, as it was sent."""
+    address = live_address(server.address)
+    assert isinstance(address, StreamAddress)
+    with open_stream(address, 5.0, LiveSettings(follows_redirects=follows)) as container:
+        return bytes(next(container.demux(video=0)))
+
+
+@pytest.mark.parametrize(
+    "says",
+    [
+        "RTSP/1.0 " + MOVED,
+        "R\rTSP/1.0   " + MOVED,
+        "RTSP/1.0 200 OK\r\nCSeq: {cseq}\r\nContent-Length: 1\r\n\r\nxRTSP/1.0 " + MOVED,
+        "$\0\0\1xRTSP/1.0 " + MOVED,
+    ],
+    ids=["plain", "veiled", "behind a body", "behind a picture"],
+)
+def test_a_camera_that_redirects_leads_nowhere_else(inner: RtspServer, says: str) -> None:
+    """FFmpeg by itself goes wherever it is sent: to addresses that nobody checked."""
+    camera = RtspServer(says=says.replace("INNER", inner.address))
+    camera.start()
+    with pytest.raises((av.FFmpegError, OSError)) as refused:
+        opened_at(camera, follows=False)
+    assert camera.methods and not inner.methods
+    if says.startswith("RTSP/1.0 302"):
+        assert f"redirects to {inner.address}" in str(refused.value)
+    assert opened_at(camera, follows=True) and "PLAY" in inner.methods
+    camera.close()
+
+
+def test_a_camera_is_read_over_its_own_connection_alone(inner: RtspServer) -> None:
+    assert opened_at(inner, follows=False)[:3] == opened_at(inner, follows=True)[:3]
+    transport = "Transport: RTP/AVP;unicast;client_port=4000-4001;source=10.0.0.1"
+    camera = RtspServer(says=f"RTSP/1.0 200 OK\r\nCSeq: {{cseq}}\r\n{transport}\r\n\r\n")
+    camera.start()
+    with pytest.raises(PermissionError, match="by UDP"):
+        opened_at(camera, follows=False)
+    camera.address = f"rtsp://127.0.0.1:{free_port()}/live"
+    with pytest.raises(ConnectionRefusedError):
+        opened_at(camera, follows=False)
+    camera.close()

@@ -231,6 +231,19 @@ def test_a_camera_that_refuses_the_password_fails_the_mission_in_words(tmp_path:
     )  # asked, and asked with the password: not again and again
 
 
+def test_a_camera_that_redirects_fails_the_mission_in_words(
+    camera: RtspServer, tmp_path: Path
+) -> None:
+    moved = f"RTSP/1.0 302 Found\r\nCSeq: {{cseq}}\r\nLocation: {camera.address}\r\n\r\n"
+    public = RtspServer(says=moved)
+    public.start()
+    with Served(tmp_path, free_floor_gb=0.0, stream_ranges=LOOPBACK) as station:
+        done = ended(station, watched(station, public.address))
+    public.close()
+    assert done["state"] == "failed" and f"redirects to {camera.address}" in done["error"]
+    assert not camera.methods
+
+
 @pytest.mark.long
 def test_pictures_that_no_browser_plays_are_read_by_the_mission_itself(tmp_path: Path) -> None:
     """No video then, and no failure: the watch sees its frames."""

@@ -363,7 +363,7 @@ def _live_settings(order: Order, *, keeps_all: bool = False) -> Any:
     """How a live source is read. A drone that sends to a station comes back, and states when its flight is over."""
     from sorvolo.capture.live.reconnect import LiveSettings
 
-    settings = LiveSettings(keeps_all=keeps_all)
+    settings = LiveSettings(keeps_all=keeps_all, follows_redirects=False)
     return replace(settings, give_up_s=order.away_s) if order.stream else settings
 
 

@@ -184,7 +184,8 @@ def _send(job: CameraJob, stop: threading.Event) -> int:
     if not is_live_address(job.source):
         raise InputError("a camera's address was needed")
     try:
-        footage = open_footage(job.source, job.telemetry or None, None, LiveSettings(), stop)
+        live = LiveSettings(follows_redirects=False)
+        footage = open_footage(job.source, job.telemetry or None, None, live, stop)
     except UnsendableInput as error:
         _state({"unsendable": without_secret(str(error), job.source)})
         return 0

@@ -22,6 +22,7 @@ from sorvolo.capture.live.addresses import (
 from sorvolo.capture.live.klv import LocalSet, local_sets
 from sorvolo.capture.live.klv_telemetry import columns_of, klv_streams
 from sorvolo.capture.live.links import LINK_FORMS, TelemetryLink, is_link
+from sorvolo.capture.live.opening import open_stream
 from sorvolo.capture.live.reader import REFUSALS
 from sorvolo.capture.live.reconnect import Backoff, LiveSettings, Outages
 from sorvolo.capture.source import Source, open_sources, safe_name
@@ -310,12 +311,8 @@ class LiveFootage:
         )
 
     def _open(self, left_s: float) -> Any:
-        container = av.open(
-            self._address.url,
-            format=self._address.container,
-            options=dict(self._address.options),
-            timeout=(min(self._address.opens_s, left_s), self._settings.silent_s),
-        )
+        within_s = min(self._address.opens_s, left_s)
+        container = open_stream(self._address, within_s, self._settings)
         if not container.streams.video:
             container.close()
             raise ValueError("a stream without video")

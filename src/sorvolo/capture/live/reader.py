@@ -13,6 +13,7 @@ import av
 from sorvolo.capture.live.addresses import StreamAddress
 from sorvolo.capture.live.klv import LocalSet, local_sets
 from sorvolo.capture.live.klv_telemetry import klv_streams
+from sorvolo.capture.live.opening import open_stream
 from sorvolo.capture.live.reconnect import Backoff, LiveSettings, Outages
 from sorvolo.capture.telemetry.cleaning import notice
 from sorvolo.capture.video_stream import PIXEL_LIMIT
@@ -86,7 +87,7 @@ REFUSALS = (
     av.error.HTTPUnauthorizedError,
     av.error.HTTPForbiddenError,
     av.error.HTTPNotFoundError,
-    av.error.PermissionError,
+    PermissionError,
 )
 """FFmpeg's errors for an other side that will not have us, however often it is asked."""
 
@@ -272,14 +273,7 @@ class StreamReader:
             file = stack.enter_context(closing(self._file(self.outages)))
             return stack.enter_context(av.open(file, options=dict(self._address.options)))
         open_s = min(self._address.opens_s, max(0.2, self._left_s()))
-        return stack.enter_context(
-            av.open(
-                self._address.url,
-                format=self._address.container,
-                options=dict(self._address.options),
-                timeout=(open_s, self._settings.silent_s),
-            )
-        )
+        return stack.enter_context(open_stream(self._address, open_s, self._settings))
 
     def _lost(self, reason: str) -> None:
         self.failure = reason

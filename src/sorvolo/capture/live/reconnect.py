@@ -36,6 +36,8 @@ class LiveSettings:
         900.0  # a run that was killed goes on with a stream that returns within so long
     )
 
+    follows_redirects: bool = True  # of an RTSP camera; else it is read over its connection alone
+
     def __post_init__(self) -> None:
         for name in ("silent_s", "first_s", "give_up_s"):
             if not 0.05 <= getattr(self, name) <= 86_400:
