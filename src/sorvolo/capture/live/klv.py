@@ -1,8 +1,10 @@
 """MISB ST 0601: the UAS Datalink Local Set inside MPEG-TS, from bytes to numbers and back."""
 
+import tomllib
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from importlib.resources import files
 from math import isfinite, nan
 
 from sorvolo.errors import InputError
@@ -31,36 +33,10 @@ class Item:
     is_imapb: bool = False
 
 
-ITEMS: Mapping[int, Item] = {
-    5: Item("platform_heading_deg", 0, 360, 2),
-    6: Item("platform_pitch_deg", -20, 20, 2, is_signed=True),
-    7: Item("platform_roll_deg", -50, 50, 2, is_signed=True),
-    13: Item("sensor_latitude_deg", -90, 90, 4, is_signed=True),
-    14: Item("sensor_longitude_deg", -180, 180, 4, is_signed=True),
-    15: Item("sensor_true_altitude_m", -900, 19_000, 2),
-    16: Item("sensor_horizontal_fov_deg", 0, 180, 2),
-    17: Item("sensor_vertical_fov_deg", 0, 180, 2),
-    18: Item("sensor_relative_azimuth_deg", 0, 360, 4),
-    19: Item("sensor_relative_elevation_deg", -180, 180, 4, is_signed=True),
-    20: Item("sensor_relative_roll_deg", 0, 360, 4),
-    21: Item("slant_range_m", 0, 5_000_000, 4),
-    23: Item("frame_center_latitude_deg", -90, 90, 4, is_signed=True),
-    24: Item("frame_center_longitude_deg", -180, 180, 4, is_signed=True),
-    25: Item("frame_center_elevation_m", -900, 19_000, 2),
-    75: Item("sensor_ellipsoid_height_m", -900, 19_000, 2),
-    78: Item("frame_center_ellipsoid_height_m", -900, 19_000, 2),
-    90: Item("platform_pitch_full_deg", -90, 90, 4, is_signed=True),
-    91: Item("platform_roll_full_deg", -90, 90, 4, is_signed=True),
-    104: Item("sensor_ellipsoid_height_extended_m", -900, 40_000, 3, is_imapb=True),
-    # ST 0601 has no tags for these: numbers that it does not use, which other receivers pass over
-    200: Item("height_above_takeoff_m", -20_000, 20_000, 4, is_signed=True),
-    201: Item("horizontal_sigma_m", 0, 10_000, 4),
-    202: Item("vertical_sigma_m", 0, 10_000, 4),
-    203: Item("tilt_sigma_deg", 0, 180, 2),
-    204: Item("heading_sigma_deg", 0, 180, 2),
-    205: Item("course_deg", 0, 360, 2),
-    206: Item("speed_m_s", 0, 1000, 4),
-}
+_STORED = tomllib.loads(
+    files("sorvolo.capture.live").joinpath("klv.toml").read_text(encoding="utf-8")
+)
+ITEMS: Mapping[int, Item] = {int(tag): Item(*stored) for tag, stored in _STORED.items()}
 """The tags that are read, by number; those from 200 on are Sorvolo's own, in the flights that a station keeps."""
 
 
