@@ -10,7 +10,7 @@ import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
-from xml.etree.ElementTree import Element, SubElement, register_namespace, tostring
+from xml.etree.ElementTree import register_namespace
 
 import simplekml
 
@@ -20,11 +20,10 @@ from sorvolo.geometry.planning import FlightPlan
 from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.store.exports.places import kml_from_one
 from sorvolo.store.exports.plain import feature
+from sorvolo.store.pages.words import xml_of
 
-_KML, _WPML = "http://www.opengis.net/kml/2.2", "http://www.dji.com/wpmz/1.0.2"
 _SAFE_HEIGHT_M = 20.0  # at least so high before the way to the first waypoint begins
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)  # the same plan makes the same bytes
-_Texts = Mapping[str, str | int | float]
 
 
 class DjiDrone(NamedTuple):
@@ -65,206 +64,25 @@ def wpml_kmz(plan: FlightPlan, lonlat: Sequence[Sequence[float]], drone: str) ->
     Raises SettingsError for another drone's name.
     """
     check_drone(drone)
-    register_namespace("", _KML)
-    register_namespace("wpml", _WPML)
+    register_namespace("", "http://www.opengis.net/kml/2.2")
+    register_namespace("wpml", "http://www.dji.com/wpmz/1.0.2")
+    height_m = round(plan.height_m, 2)
+    values = {
+        "package": "sorvolo.store.exports",
+        "drone": DJI_DRONES[drone],
+        "lonlat": lonlat,
+        "speed": f"{plan.speed_m_s:g}",
+        "height": f"{height_m:g}",
+        "safe_height": f"{max(height_m, _SAFE_HEIGHT_M):g}",
+        "photo_spacing": f"{round(plan.photo_spacing_m, 2):g}",
+    }
     made = io.BytesIO()
     with zipfile.ZipFile(made, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, document in (
-            ("template.kml", _template(plan, lonlat, DJI_DRONES[drone])),
-            ("waylines.wpml", _waylines(plan, lonlat, DJI_DRONES[drone])),
-        ):
+        for name in ("template.kml", "waylines.wpml"):
             info = zipfile.ZipInfo(f"wpmz/{name}", _ZIP_TIME)
             info.compress_type = zipfile.ZIP_DEFLATED
-            archive.writestr(info, tostring(document, encoding="utf-8", xml_declaration=True))
+            archive.writestr(info, xml_of(name, declaration=True, **values))
     return made.getvalue()
-
-
-def _template(plan: FlightPlan, lonlat: Sequence[Sequence[float]], drone: DjiDrone) -> Element:
-    """What DJI Pilot 2 shows and edits."""
-    kml, folder = _document(plan, drone, author="sorvolo")
-    _add(folder, {"templateType": "waypoint", "templateId": 0})
-    _add(
-        _sub(folder, "waylineCoordinateSysParam"),
-        {"coordinateMode": "WGS84", "heightMode": "relativeToStartPoint"},
-    )
-    _add(
-        folder,
-        {
-            "autoFlightSpeed": plan.speed_m_s,
-            "gimbalPitchMode": "usePointSetting",
-            "globalHeight": _height(plan),
-        },
-    )
-    _add(_sub(folder, "globalWaypointHeadingParam"), _HEADING)
-    _add(folder, {"globalWaypointTurnMode": _TURN_MODE})
-    _add(_sub(folder, "payloadParam"), {"payloadPositionIndex": 0, "imageFormat": drone.photo})
-    for index, place in enumerate(lonlat):
-        placemark = _placemark(folder, index, place)
-        _add(
-            placemark,
-            {
-                "ellipsoidHeight": _height(plan),
-                "height": _height(plan),
-                "useGlobalHeight": 1,
-                "useGlobalSpeed": 1,
-                "useGlobalHeadingParam": 1,
-                "useGlobalTurnParam": 1,
-                "gimbalPitchAngle": -90,
-            },
-        )
-        _add_actions(placemark, plan, index)
-    return kml
-
-
-def _waylines(plan: FlightPlan, lonlat: Sequence[Sequence[float]], drone: DjiDrone) -> Element:
-    """What the drone flies."""
-    kml, folder = _document(plan, drone, author="")
-    _add(
-        folder,
-        {
-            "templateId": 0,
-            "executeHeightMode": "relativeToStartPoint",
-            "waylineId": 0,
-            "autoFlightSpeed": plan.speed_m_s,
-        },
-    )
-    for index, place in enumerate(lonlat):
-        placemark = _placemark(folder, index, place)
-        _add(placemark, {"executeHeight": _height(plan), "waypointSpeed": plan.speed_m_s})
-        _add(_sub(placemark, "waypointHeadingParam"), _HEADING)
-        _add(
-            _sub(placemark, "waypointTurnParam"),
-            {"waypointTurnMode": _TURN_MODE, "waypointTurnDampingDist": 0},
-        )
-        _add(placemark, {"useStraightLine": 1})
-        _add_actions(placemark, plan, index)
-    return kml
-
-
-_HEADING: _Texts = {
-    "waypointHeadingMode": "followWayline",
-    "waypointHeadingPathMode": "followBadArc",
-}
-_TURN_MODE = (
-    "toPointAndStopWithDiscontinuityCurvature"  # straight to each end of a pass, and a stop there
-)
-
-
-def _document(plan: FlightPlan, drone: DjiDrone, *, author: str) -> tuple[Element, Element]:
-    """The root with its mission's settings, and the empty folder of waypoints."""
-    kml = Element(f"{{{_KML}}}kml")
-    document = SubElement(kml, f"{{{_KML}}}Document")
-    if author:
-        _add(document, {"author": author})
-    mission = _sub(document, "missionConfig")
-    _add(
-        mission,
-        {
-            "flyToWaylineMode": "safely",
-            "finishAction": "goHome",
-            "exitOnRCLost": "executeLostAction",
-            "executeRCLostAction": "goBack",
-            "takeOffSecurityHeight": max(_height(plan), _SAFE_HEIGHT_M),
-            "globalTransitionalSpeed": plan.speed_m_s,
-            "globalRTHHeight": max(_height(plan), _SAFE_HEIGHT_M),
-        },
-    )
-    _add(
-        _sub(mission, "droneInfo"),
-        {"droneEnumValue": drone.drone, "droneSubEnumValue": drone.sub_type},
-    )
-    if drone.payload is not None:
-        _add(
-            _sub(mission, "payloadInfo"),
-            {
-                "payloadEnumValue": drone.payload,
-                "payloadSubEnumValue": 0,
-                "payloadPositionIndex": 0,
-            },
-        )
-    return kml, SubElement(document, f"{{{_KML}}}Folder")
-
-
-def _placemark(folder: Element, index: int, place: Sequence[float]) -> Element:
-    placemark = SubElement(folder, f"{{{_KML}}}Placemark")
-    point = SubElement(placemark, f"{{{_KML}}}Point")
-    SubElement(point, f"{{{_KML}}}coordinates").text = f"{place[0]:.9f},{place[1]:.9f}"
-    _add(placemark, {"index": index})
-    return placemark
-
-
-def _add_actions(placemark: Element, plan: FlightPlan, index: int) -> None:
-    """The gimbal turned down at the first waypoint, photos from each pass's start to its end."""
-    if index == 0:
-        _add_group(
-            placemark,
-            0,
-            (0, 0),
-            {"actionTriggerType": "reachPoint"},
-            "gimbalRotate",
-            {
-                "gimbalHeadingYawBase": "north",
-                "gimbalRotateMode": "absoluteAngle",
-                "gimbalPitchRotateEnable": 1,
-                "gimbalPitchRotateAngle": -90,
-                "gimbalRollRotateEnable": 0,
-                "gimbalRollRotateAngle": 0,
-                "gimbalYawRotateEnable": 0,
-                "gimbalYawRotateAngle": 0,
-                "gimbalRotateTimeEnable": 0,
-                "gimbalRotateTime": 0,
-                "payloadPositionIndex": 0,
-            },
-        )
-    if index % 2 == 0:
-        _add_group(
-            placemark,
-            1 + index // 2,
-            (index, index + 1),
-            {
-                "actionTriggerType": "multipleDistance",
-                "actionTriggerParam": round(plan.photo_spacing_m, 2),
-            },
-            "takePhoto",
-            {"payloadPositionIndex": 0, "fileSuffix": "map", "useGlobalPayloadLensIndex": 1},
-        )
-
-
-def _add_group(
-    placemark: Element,
-    number: int,
-    waypoints: tuple[int, int],
-    trigger: _Texts,
-    action: str,
-    settings: _Texts,
-) -> None:
-    group = _sub(placemark, "actionGroup")
-    _add(
-        group,
-        {
-            "actionGroupId": number,
-            "actionGroupStartIndex": waypoints[0],
-            "actionGroupEndIndex": waypoints[1],
-            "actionGroupMode": "sequence",
-        },
-    )
-    _add(_sub(group, "actionTrigger"), trigger)
-    one = _sub(group, "action")
-    _add(one, {"actionId": 0, "actionActuatorFunc": action})
-    _add(_sub(one, "actionActuatorFuncParam"), settings)
-
-
-def _height(plan: FlightPlan) -> float:
-    return round(plan.height_m, 2)
-
-
-def _sub(parent: Element, name: str) -> Element:
-    return SubElement(parent, f"{{{_WPML}}}{name}")
-
-
-def _add(parent: Element, texts: _Texts) -> None:
-    for name, text in texts.items():
-        _sub(parent, name).text = f"{text:g}" if isinstance(text, float) else str(text)
 
 
 _TAKEOFF, _WAYPOINT, _RETURN, _CHANGE_SPEED, _MOUNT_CONTROL, _TRIGGER_DISTANCE = (

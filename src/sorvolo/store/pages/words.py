@@ -5,6 +5,7 @@ import math
 from collections.abc import Mapping
 from functools import cache
 from typing import Any
+from xml.etree.ElementTree import fromstring, tostring
 
 import cv2
 import numpy as np
@@ -115,6 +116,16 @@ _HOME = "sorvolo.store.pages"
 def render(template: str, *, package: str = _HOME, **values: Any) -> Markup:
     """The template `templates/<template>` of a package filled with these values, as text that needs no more escaping."""
     return Markup(_environment(package).get_template(template).render(**values))
+
+
+def xml_of(template: str, *, package: str, declaration: bool = False, **values: Any) -> bytes:
+    """The template `templates/<template>.xml` of a package filled with these values: XML in UTF-8, in one line."""
+    root = fromstring(render(f"{template}.xml", package=package, **values))
+    for element in root.iter():
+        element.tail = None
+        if not (element.text or "").strip():
+            element.text = None
+    return bytes(tostring(root, encoding="utf-8", xml_declaration=declaration))
 
 
 def cell(macro: str, *values: Any) -> Markup:
