@@ -2,7 +2,7 @@
 
 import json
 from contextlib import redirect_stdout
-from io import StringIO
+from io import BytesIO, StringIO
 from pathlib import Path
 from shutil import copytree
 
@@ -17,6 +17,7 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.missions.search.measure import MeasuredClass, MeasuredFlight, SearchedPlants
 from sorvolo.missions.search.through_trees import seen_floor
+from sorvolo.missions.worker import PERSON_FOUND, Journal, _add_people
 from sorvolo.search.cells import Cells
 from sorvolo.search.conditions import Conditions
 from sorvolo.search.outcomes import Outcomes
@@ -64,6 +65,14 @@ def test_the_people_are_named_with_the_chance_that_one_is_found(
     with rasterio.open(out / "under_trees.tif") as opened:
         assert opened.descriptions[:3] == ("mean", "anomaly, sigmas", "views")
         assert opened.read(3).max() > 24
+
+
+def test_a_station_is_told_of_each_person(searched: tuple[Path, int, str], site: Path) -> None:
+    lines = BytesIO()
+    _add_people(Journal(lines), site, ["flown"])
+    told = [json.loads(each) for each in lines.getvalue().splitlines()]
+    assert [each["type"] for each in told] == [PERSON_FOUND] * len(_PEOPLE_M)
+    assert {each["data"]["feature"]["properties"]["class"] for each in told} == {"person"}
 
 
 def test_the_finds_are_findings_of_the_site(searched: tuple[Path, int, str], site: Path) -> None:

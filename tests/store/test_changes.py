@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 
 from sealing import seal_again
 from sorvolo.errors import InputError, StoreError
+from sorvolo.findings.importance import between
 from sorvolo.geometry.polygons import signed_area
 from sorvolo.store.exports.change_files import changes_geojson, mask_name, write_view_masks
 from sorvolo.store.exports.places import Placemark, gpx_bytes, kml_bytes, longitude_latitude
@@ -248,6 +249,27 @@ def test_a_comparison_without_changes_reports_that_and_a_mapping_nothing(folder:
     assert "No change was found" in (folder / "flights/b/changes.html").read_text()
     assert not (folder / "flights/b/changes").exists()
     assert not (folder / "flights/a/changes.geojson").exists()
+
+
+def test_changes_enter_the_register_by_the_order_of_flights(folder: Path) -> None:
+    """However late one is compared again, and of a flight without times; what moves is of its own date alone."""
+    changes = [
+        fake_change(1, kind=ChangeKind.DISAPPEARED),
+        fake_change(2, kind=ChangeKind.MOVING, east_m=30.0, velocity_m_s=(1.0, 0.0)),
+    ]
+    with Archive.open(folder, write=True) as archive:
+        compare(archive, "b", changes)
+        with archive.begin_flight("c", "", {}) as writer:
+            made = [fake_change(1, "c", east_m=60.0)]
+            writer.commit([], {}, {"flight": "c"}, "<html></html>", changes=made)
+        compare(archive, "b", changes)
+        found = archive.register().findings
+        assert {(*each.dates, each.gone, each.newest.moving) for each in found} == {
+            ("a", "b", False),
+            ("b", "", True),
+            ("c", "", False),
+        }
+        assert between(archive.register(), "a", "b").endswith("1 thing left")
 
 
 @pytest.mark.usefixtures("kind")

@@ -199,7 +199,8 @@ def begun_and_ended(
     for found, is_known in zip(new, was_looked_for):
         # or its own comparison saw it come
         if (is_known and _can_be_missed(found.sightings)) or any(
-            each.origin is KnownBy.CHANGED and not each.gone for each in found.sightings
+            each.origin is KnownBy.CHANGED and not (each.gone or each.moving)
+            for each in found.sightings
         ):
             yield ChangeKind.APPEARED, found
     for found in register.findings:

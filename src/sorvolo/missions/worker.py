@@ -302,6 +302,8 @@ def run_search(order: Order, journal: Journal, until: threading.Event) -> Done:
     from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
     from sorvolo.missions.search.while_flying import SearchWhileFlying
 
+    if order.options.get("through_trees"):
+        return _look_through_trees(order, journal)
     settings, outputs = order.settings(SearchSettings), SearchOutputs(Path(order.folder))
     mapped = Done("")
     if order.source:  # a flight to map first
@@ -319,6 +321,30 @@ def run_search(order: Order, journal: Journal, until: threading.Event) -> Done:
             )
         headline = measuring.result()["headline"]
     return Done(headline["text"], mapped.flight, mapped.is_good and headline["complete"])
+
+
+def _look_through_trees(order: Order, journal: Journal) -> Done:
+    """Look for people below the crowns of the site's newest flight."""
+    from sorvolo.missions.search.through_trees import search_under_trees
+
+    report: dict[str, Any] = {}
+    for update in search_under_trees(
+        order.site, order.folder, plants=order.options.get("plants", 80)
+    ):
+        if isinstance(update, dict):
+            report = update
+        else:
+            journal.progress(
+                {
+                    "frames": update.number,
+                    "frames_expected": update.total,
+                    "flight": update.flight,
+                    "reason": update.stage,
+                }
+            )
+    flight, headline = report["flight"], report["headline"]
+    _add_people(journal, Path(order.site), [flight])
+    return Done(headline["text"], flight, headline["complete"])
 
 
 def run_inspect(order: Order, journal: Journal, _: threading.Event) -> Done:
@@ -369,6 +395,17 @@ def _live_settings(order: Order, *, keeps_all: bool = False) -> Any:
 
 def _mapped(journal: Journal, site: Path, outcomes: "Sequence[FlightOutcome]") -> Done:
     """How a flight's map, or its comparison, ended. Writes each person that the new versions show."""
+    _add_people(journal, site, [each.flight for each in outcomes if not each.done_utc])
+    texts = "; ".join(filter(None, (each.headline for each in outcomes)))
+    flight = outcomes[-1].flight if outcomes else ""
+    return Done(texts or "finished", flight, all(each.trusted for each in outcomes))
+
+
+# ---- what happens on the way ------------------------------------------------------------------------------------
+
+
+def _add_people(journal: Journal, site: Path, flights: Sequence[str]) -> None:
+    """Write each person that flights of the site found."""
     from sorvolo.store.exports.change_files import objects_geojson
     from sorvolo.store.site.archive import Archive
     from sorvolo.survey.objects import PERSON
@@ -376,20 +413,13 @@ def _mapped(journal: Journal, site: Path, outcomes: "Sequence[FlightOutcome]") -
     with Archive.open(site, write=False) as archive:
         people = [
             each
-            for outcome in outcomes
-            if not outcome.done_utc
-            for each in archive.objects(outcome.flight)
+            for flight in flights
+            for each in archive.objects(flight)
             if each.thing.label == PERSON
         ]
         place = archive.site()
     for feature in objects_geojson(people, place, crops_from_site=True)["features"]:
         journal.add(PERSON_FOUND, {"feature": feature, "is_local": place.is_local})
-    texts = "; ".join(filter(None, (each.headline for each in outcomes)))
-    flight = outcomes[-1].flight if outcomes else ""
-    return Done(texts or "finished", flight, all(each.trusted for each in outcomes))
-
-
-# ---- what happens on the way ------------------------------------------------------------------------------------
 
 
 def _add_frame(journal: Journal, view: "FrameView | None", name: str, status: str) -> None:

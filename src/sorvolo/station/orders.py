@@ -2,9 +2,10 @@
 
 import json
 import os
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -29,9 +30,11 @@ SOURCE_VARIABLE = "SORVOLO_RUN_SOURCE"
 Mission = Literal["map", "compare", "watch", "search"]
 
 
-def writes(mission: str, *, has_input: bool) -> bool:
-    """Whether a mission writes into its site, as one at a time may; a search does of a flight that it maps first."""
-    return mission in ("map", "compare") or (mission == "search" and has_input)
+def writes(mission: str, has_input: bool, options: Mapping[str, Any]) -> bool:
+    """Whether a mission writes into its site, as one at a time may; a search does that maps a flight first, or keeps
+    whom it finds below crowns."""
+    is_writing_search = has_input or bool(options.get("through_trees"))
+    return mission in ("map", "compare") or (mission == "search" and is_writing_search)
 
 
 _CAMERA = r"^(aov=[0-9.]{1,8}|focal_px=[0-9.]{1,10}|[A-Za-z0-9 .+-]+)$"  # a preset's name: no path
@@ -81,6 +84,7 @@ class MissionOptions(BaseModel):
     least_score: Annotated[float | None, Field(ge=0, le=1)] = None
     frames_per_second: Annotated[float | None, Field(ge=0.01, le=240)] = None
     plants: Annotated[int, Field(ge=10, le=5000)] = 80
+    through_trees: bool = False  # a search looks below the newest flight's crowns instead
     ground_elevation_m: Annotated[float | None, Field(ge=-1000, le=9000)] = None
 
 
@@ -99,6 +103,10 @@ class RunWish(BaseModel):
         if self.input is None and self.mission != "search":
             raise ValueError(
                 "map, compare and watch need an input; search without one measures the site's flights"
+            )
+        if self.options.through_trees and (self.input is not None or self.mission != "search"):
+            raise ValueError(
+                "through_trees is for a search of a mapped flight; leave it out, or the input"
             )
         return self
 

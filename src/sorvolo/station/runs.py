@@ -453,8 +453,10 @@ class Runs(ThreadOwner):
             raise Problem(
                 409, f"{len(running)} missions run already; wait until one ends, or stop one"
             )
-        for each in running if writes(wish.mission, has_input=wish.input is not None) else ():
-            if each.site == wish.site and writes(each.mission, has_input=each.input is not None):
+        is_writing = writes(wish.mission, wish.input is not None, wish.options.model_dump())
+        for each in running if is_writing else ():
+            own = each.mission, each.input is not None, each.options or {}
+            if each.site == wish.site and writes(*own):
                 raise _busy(409, each, f"writes into the site {wish.site!r}")
 
     def _demand_room(self) -> None:

@@ -32,7 +32,7 @@ from sorvolo.store.site.change_records import (
 from sorvolo.survey.findings import ChangeKind, Verdict
 from sorvolo.survey.map_objects import MapObject
 
-_CAME = (ChangeKind.APPEARED, ChangeKind.REPLACED, ChangeKind.AREA)
+_CAME = (ChangeKind.APPEARED, ChangeKind.REPLACED, ChangeKind.AREA, ChangeKind.MOVING)
 _LEFT = (ChangeKind.DISAPPEARED, ChangeKind.REPLACED)
 
 
@@ -146,20 +146,23 @@ def sighting_of(thing: MapObject, flight_id: str, rank: float) -> MissionSightin
 
 
 def _of_change(
-    change: StoredChange, before: str, dates: Mapping[str, tuple[float, list[int]]]
+    change: StoredChange, ranks: Mapping[str, float], spans: Mapping[str, list[int]]
 ) -> Iterator[MissionSighting]:
-    """What a change shows: what stands after it, and what left with it; its class where it has one."""
-    if change.flight_id not in dates:
-        return
+    """What a change shows: what stands after it, or moves, and what left with it; its class where it has one.
+
+    What left was there on the flight before, by rank, however late the change's own flight was compared.
+    """
+    rank = ranks[change.flight_id]
+    before = max((each for each in ranks if ranks[each] < rank), key=ranks.__getitem__, default="")
     came = change.flight_id, change.class_after, _CAME, ""
     left = before, change.class_before, _LEFT, change.flight_id
     for date, label, kinds, gone in (came, left):
-        if date in dates and change.kind in kinds:
-            seen_ns = (change.first_seen_ns, change.last_seen_ns)
-            first_ns, last_ns = dates[date][1] if gone else seen_ns
+        if date and change.kind in kinds:
+            seen_ns = [change.first_seen_ns, change.last_seen_ns]
+            first_ns, last_ns = spans.get(date, seen_ns) if gone else seen_ns
             yield MissionSighting(
                 date,
-                dates[change.flight_id][0],
+                rank,
                 f"{change.flight_id} changes",
                 change.id,
                 KnownBy.CHANGED,
@@ -170,6 +173,8 @@ def _of_change(
                 change.length_m,
                 first_ns,
                 last_ns,
+                change.kind is ChangeKind.MOVING,
+                (float(change.velocity_m_s[0]), float(change.velocity_m_s[1])),
                 gone=gone,
             )
 
@@ -183,19 +188,12 @@ def _seen(
         for each in load_objects(connection, _only(flights))
         if flights is None or each.flight_id in flights
     ]
-    versions, parents = schema.versions, schema.versions.alias()
-    query = (
-        select(versions.c.flight_id, parents.c.flight_id.label("before"))
-        .join(parents, parents.c.id == versions.c.parent_id)
-        .where(versions.c.complete)
-        .order_by(versions.c.id)
-    )
-    before = {row.flight_id: row.before for row in connection.execute(query)}
-    dates = {name: (float(rank), span) for name, rank, *span in flown_flights(connection)}
+    ranks = {row.id: float(row.rank) for row in connection.execute(select(schema.flights))}
+    spans = {name: span for name, _, *span in flown_flights(connection)}
     for change in load_changes(connection, _only(flights)):
         is_known = flights is None or change.flight_id in flights
         if is_known and change.verdict is not Verdict.REJECTED:
-            sightings += _of_change(change, before.get(change.flight_id, ""), dates)
+            sightings += _of_change(change, ranks, spans)
     looks = load_searches(connection, _only(flights))
     return sightings, [each for each in looks if flights is None or each.date in flights]
 
