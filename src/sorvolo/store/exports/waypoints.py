@@ -67,7 +67,7 @@ def wpml_kmz(plan: FlightPlan, lonlat: Sequence[Sequence[float]], drone: str) ->
     register_namespace("", "http://www.opengis.net/kml/2.2")
     register_namespace("wpml", "http://www.dji.com/wpmz/1.0.2")
     height_m = round(plan.height_m, 2)
-    values = {
+    values: dict[str, Any] = {
         "package": "sorvolo.store.exports",
         "drone": DJI_DRONES[drone],
         "lonlat": lonlat,

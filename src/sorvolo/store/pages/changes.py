@@ -399,7 +399,7 @@ def _how(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     residual_px = number_at(report, "comparison", "residual_px", "median")
     rows = [
         ("method", at(report, "comparison", "method")),
-        ("misalignment of views and map", with_unit("{:.2f} px median", residual_px)),
+        ("misalignment of views and map", with_unit(residual_px, "{:.2f} px median")),
         *(
             (str(name).replace("_", " "), _plain(value))
             for name, value in (at(report, "comparison", "chosen") or {}).items()

@@ -60,7 +60,7 @@ def search_page(report: Mapping[str, Any], pictures: Mapping[str, ImageRGBA]) ->
         ],
         calibration=_calibration(report),
         calibration_plot=_calibration_plot(report),
-        cell=with_unit("{:g} m", report["cell_m"]),
+        cell=with_unit(report["cell_m"], "{:g} m"),
         so_far=report["so_far"],
     )
     return str(page)
@@ -109,7 +109,7 @@ def _figures(row: Mapping[str, Any]) -> list[tuple[str, str, str]]:
         ("area", area_words(row["area_m2"]), f"of it seen: {area_words(row['seen_m2'])}"),
         (
             "effective sweep width",
-            with_unit("{:.1f} m", row["sweep_width_m"]) or "unknown",
+            with_unit(row["sweep_width_m"], "{:.1f} m") or "unknown",
             "ground times its probability, within the area or not, over the path of all flights",
         ),
         (

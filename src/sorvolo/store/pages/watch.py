@@ -217,7 +217,7 @@ def _rows(tracks: Sequence[_Track], *, is_local: bool) -> list[dict[str, Any]]:
                 "name": each["class"],
                 "score": f"{each['score']:.2f}",
                 "place": _place(each, is_local, has_cuts),
-                "accuracy": with_unit("{:.1f} " + unit, finite_or_none(each.get("sigma_m"))) or "",
+                "accuracy": with_unit(each.get("sigma_m"), "{:.1f} " + unit) or "",
                 "motion": f"{np.hypot(*speed):.1f} {unit}/s" if speed else "still",
                 "views": each["views"],
                 "passes": each["passes"],
@@ -286,7 +286,7 @@ def _course(report: Mapping[str, Any]) -> list[tuple[str, str]]:
             "time taken",
             join_words(
                 seconds_words(number_at(report, "seconds", "total")),
-                with_unit("({:.1f} frames per second)", number_at(report, "frames_per_second")),
+                with_unit(report.get("frames_per_second"), "({:.1f} frames per second)"),
             ),
         ),
         (

@@ -3,7 +3,8 @@
 import base64
 import math
 from collections.abc import Mapping
-from functools import cache
+from functools import cache, partial
+from types import MappingProxyType
 from typing import Any
 from xml.etree.ElementTree import fromstring, tostring
 
@@ -48,7 +49,7 @@ def plural(count: float, name: str) -> str:
     return f"{count:.0f} {wording.plural(name, round(count))}"
 
 
-def with_unit(pattern: str, value: Any) -> str | None:
+def with_unit(value: Any, pattern: str) -> str | None:
     """The number in a pattern of str.format; None when it is none."""
     number = finite_or_none(value)
     return None if number is None else pattern.format(number)
@@ -113,9 +114,19 @@ def jpeg_uri(jpeg: bytes) -> str:
 _HOME = "sorvolo.store.pages"
 
 
-def render(template: str, *, package: str = _HOME, **values: Any) -> Markup:
-    """The template `templates/<template>` of a package filled with these values, as text that needs no more escaping."""
-    return Markup(_environment(package).get_template(template).render(**values))
+def render(
+    template: str,
+    report: Mapping[str, Any] = MappingProxyType({}),
+    *,
+    package: str = _HOME,
+    **values: Any,
+) -> Markup:
+    """The template `templates/<template>` of a package filled with these values, as text that needs no more escaping.
+
+    Of `report` the template asks by path: `at("frames", "total")` and `number("area_m2")` as `at` and `number_at`.
+    """
+    looked_up = {"at": partial(at, report), "number": partial(number_at, report)}
+    return Markup(_environment(package).get_template(template).render(looked_up | values))
 
 
 def xml_of(template: str, *, package: str, declaration: bool = False, **values: Any) -> bytes:
@@ -142,8 +153,17 @@ def _environment(package: str) -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["px"] = _px
-    environment.filters["percent"] = _percent
+    environment.filters |= {
+        "px": _px,
+        "percent": _percent,
+        "known": known,
+        "unit": with_unit,
+        "metres": length_words,
+        "area": area_words,
+        "duration": seconds_words,
+        "sentence": lambda text: text[:1].upper() + text[1:],
+    }
+    environment.globals |= {"plural": plural, "join_words": join_words}
     return environment
 
 
