@@ -25,34 +25,18 @@ from sorvolo.store.pages.words import (
     length_words,
     number_at,
     picture_uri,
-    plural,
     render,
     with_unit,
 )
 from sorvolo.store.site.change_records import StoredChange, grouped_changes
 from sorvolo.survey.coverage import GAP_WORDS, Gap
-from sorvolo.survey.findings import ChangeKind, Verdict, ViewStatus
+from sorvolo.survey.findings import ChangeKind, Verdict
 from sorvolo.survey.flight import Site
 
 _MANY = 40  # changes on one map: their numbers become small
 _CROP_PX = 320  # longer side of a picture on a page
 _CROPS_BYTES = 6_000_000  # of all crops in the page together
 _RIM = 0.96  # of the map: where an outline reaches beyond, its number stands on the other side
-_UNKNOWN_SHARE = 0.1  # of the ground: more is announced first
-_KIND_WORDS = {
-    ChangeKind.APPEARED: "is there now and was not before",
-    ChangeKind.DISAPPEARED: "was there before and is gone",
-    ChangeKind.REPLACED: "something else stands in its place, or it looks different",
-    ChangeKind.AREA: "the ground itself is another one: paved, ploughed, heaped, flooded or built over",
-    ChangeKind.MOVING: "moved while it was seen: no change of the ground",
-}
-_VIEW_WORDS = {
-    ViewStatus.COMPARED: "aligned with the map and compared",
-    ViewStatus.NOT_ALIGNED: "could not be aligned with the map: no statement about its ground",
-    ViewStatus.OUTSIDE: "shows ground that the map does not have: nothing to compare it with",
-    ViewStatus.ALL_CHANGED: "nearly everything differs (snow, flood, another place): a list of changes would mislead",
-    ViewStatus.LOST: "could not be used: blurred, damaged or without a position",
-}
 
 _Crops = tuple[ImageRGBA | None, ImageRGBA | None]
 
@@ -95,30 +79,29 @@ def changes_page(
         for group in grouped_changes(changes)
     ]
     listed = [each for group in groups for each in group]
-    is_reviewed = any(each.verdict is not None for each in changes)
+    kinds, verdicts = (
+        Counter(each.kind for each in changes),
+        Counter(each.verdict for each in changes if each.verdict is not None),
+    )
     measured = [name for name, _ in listed[0].cells] if listed else []
     page = render(
         "changes.html",
+        report,
         title=f"{report.get('flight')} - changes",
-        flight=known(report.get("flight")),
-        site=known(report.get("site")),
-        against=at(report, "comparison", "against_version"),
-        headline=_headline(report, changes),
-        summary=" ".join(_summary(report, changes)),
-        warning_lines=_warnings(report),
+        kinds={kind.value: kinds[kind] for kind in ChangeKind if kinds[kind]},
+        verdicts={verdict.value: verdicts[verdict] for verdict in Verdict if verdicts[verdict]},
         is_many=len(changes) > _MANY,
-        legend=_legend(changes),
         before_words=before_words,
         after_words=after_words,
-        **_compared_ground(report, coverage, site, shown),
+        map=_map(*shown) if shown else None,
+        coverage=coverage_shapes(coverage, site, shown[1]) if shown and not site.is_local else (),
+        gap_rows=gap_rows(coverage),
+        size_rows=() if site.is_local else size_rows(coverage),
         changes=listed,
         groups=groups,
-        is_reviewed=is_reviewed,
         has_metres=not site.is_local,
         systems=() if site.is_local else tuple(SYSTEMS.items()),
-        columns=["", "kind", *(["verdict"] if is_reviewed else []), *measured, "place", "id"],
-        files=_files(site),
-        view_rows=_view_rows(report),
+        columns=["", "kind", *(["verdict"] if verdicts else []), *measured, "place", "id"],
         not_announced=[
             (known(count), words, str(reason))
             for name, words in (
@@ -133,25 +116,6 @@ def changes_page(
         how=_how(report),
     )
     return str(page)
-
-
-def _compared_ground(
-    report: Mapping[str, Any],
-    coverage: Sequence[Any],
-    site: Site,
-    shown: tuple[Picture, Picture] | None,
-) -> dict[str, Any]:
-    """The map on both dates with the ground that was not compared, for the template; sizes only of sites in metres."""
-    unknown = number_at(report, "comparison", "unknown_share")
-    return {
-        "map": _map(*shown) if shown else None,
-        "coverage": coverage_shapes(coverage, site, shown[1])
-        if shown and not site.is_local
-        else (),
-        "gap_rows": gap_rows(coverage),
-        "size_rows": () if site.is_local else size_rows(coverage),
-        "unknown_share": None if unknown is None else f"{unknown:.1%}",
-    }
 
 
 @dataclass(frozen=True)
@@ -212,103 +176,6 @@ def _listed(
     )
 
 
-def _headline(report: Mapping[str, Any], changes: Sequence[StoredChange]) -> str:
-    views = at(report, "comparison", "views")
-    if views and not views.get(ViewStatus.COMPARED.value):
-        return "No view could be compared with the map: this flight cannot show changes."
-    area_m2 = number_at(report, "comparison", "compared_area_m2")
-    ground = missing = ""
-    if area_m2 is not None and report.get("georeferenced", True):
-        covered = coverage_words(at(report, "comparison") or {})
-        ground, missing = covered or (f" on {area_words(area_m2)} of ground", "")
-    kinds: Counter[ChangeKind] = Counter(
-        each.kind for each in changes if each.kind is not ChangeKind.MOVING
-    )
-    moving = sum(each.kind is ChangeKind.MOVING for each in changes)
-    also = (f"; also {plural(moving, 'moving object')}" if moving else "") + missing
-    is_dark = at(report, "comparison", "most_missed") is True
-    found = _found_words(kinds, ground, also, is_dark=is_dark)
-    if at(report, "comparison", "headline", "quality") != "doubtful":
-        return found
-    doubt = str(at(report, "comparison", "headline", "text")).partition(":")[0]
-    return f"{doubt.capitalize()}: {found[:1].lower()}{found[1:]}"
-
-
-def _found_words(kinds: Mapping[ChangeKind, int], ground: str, also: str, *, is_dark: bool) -> str:
-    total = sum(kinds.values())
-    if not total:
-        none = f"no change was found{ground}{also}."
-        return f"Too dark: most changes would be missed, and {none}" if is_dark else f"N{none[1:]}"
-    named = ", ".join(f"{kinds[kind]} {kind.value}" for kind in ChangeKind if kinds.get(kind))
-    dark = "; it was too dark to find most others" if is_dark else ""
-    return f"{plural(total, 'change')}{ground}: {named}{also}{dark}."
-
-
-def _summary(report: Mapping[str, Any], changes: Sequence[StoredChange]) -> list[str]:
-    """What stands under the headline, sentence by sentence."""
-    views = at(report, "comparison", "views") or {}
-    votes, voters = at(report, "comparison", "votes"), at(report, "comparison", "voters")
-    unknown = number_at(report, "comparison", "unknown_share")
-    sentences = (
-        [f"{short[:1].upper()}{short[1:]}."]
-        if (short := at(report, "comparison", "in_short"))
-        else []
-    )
-    if views:
-        sentences.append(
-            f"{views.get(ViewStatus.COMPARED.value, 0)} of {sum(views.values())} views were compared."
-        )
-    if votes is not None and voters is not None:
-        sentences.append(f"A change counts when {votes} of {voters} views of its ground show it.")
-    if unknown is not None:
-        sentences.append(
-            f"{unknown:.1%} of the ground under these views was unknown on one of the dates."
-        )
-    grown_m2, extending = (
-        number_at(report, "comparison", "extension", key) for key in ("area_m2", "frames")
-    )
-    if grown_m2 and extending:
-        sentences.append(
-            f"The map grew by {area_words(grown_m2)}, shown by {plural(extending, 'frame')}."
-        )
-    # One sentence, or none where nothing was reviewed.
-    reviewed = Counter(each.verdict for each in changes if each.verdict is not None)
-    counts = " and ".join(
-        f"{reviewed[verdict]} {verdict.value}" for verdict in Verdict if reviewed[verdict]
-    )
-    return sentences + ([f"Reviewed by a person: {counts}."] if reviewed else [])
-
-
-def _warnings(report: Mapping[str, Any]) -> list[str]:
-    # Reasons for which more than a tenth of the views could not be compared.
-    views = at(report, "comparison", "views") or {}
-    total = sum(views.values())
-    counts = {
-        status: views.get(status.value, 0)
-        for status in (ViewStatus.NOT_ALIGNED, ViewStatus.ALL_CHANGED)
-    }
-    warnings = [str(each) for each in at(report, "warnings") or []] + (
-        [
-            f"{count} of {total} views: {status.value}; each {_VIEW_WORDS[status]}."
-            for status, count in counts.items()
-            if total and count > 0.1 * total
-        ]
-    )
-    unknown = number_at(report, "comparison", "unknown_share")
-    if unknown is not None and unknown > _UNKNOWN_SHARE:
-        warnings.append(
-            f"{unknown:.0%} of the ground under the views was unknown: its changes are not in the list."
-        )
-    suppressed = number_at(report, "comparison", "suppressed")
-    if suppressed:
-        warnings.append(
-            f"{plural(suppressed, 'change')} left out: a person rejected the same after an earlier flight."
-        )
-    if at(report, "comparison", "map_updated") is False:
-        warnings.append("The map was not updated: both halves of the picture show the map before.")
-    return warnings
-
-
 def _map(before: Picture, after: Picture) -> dict[str, Any]:
     height_px, width_px = after.rgba.shape[:2]
     return {
@@ -317,17 +184,6 @@ def _map(before: Picture, after: Picture) -> dict[str, Any]:
         "width": width_px,
         "height": height_px,
     }
-
-
-def _legend(changes: Sequence[StoredChange]) -> list[dict[str, Any]]:
-    kinds = Counter(each.kind for each in changes)
-    entries = [
-        {"name": kind.value, "meaning": _KIND_WORDS[kind], "count": kinds[kind]}
-        for kind in ChangeKind
-        if kinds[kind]
-    ]
-    rejected = sum(each.verdict is Verdict.REJECTED for each in changes)
-    return entries + ([{"name": "rejected", "meaning": "", "count": rejected}] if rejected else [])
 
 
 def _cells(change: StoredChange, site: Site) -> tuple[tuple[str, str], ...]:
@@ -386,15 +242,6 @@ def _crop(rgba: ImageRGBA | None, change: StoredChange, when: str, most_bytes: i
     return _Crop(when, picture_uri(small, most_bytes), width_px, height_px, _points(outline_px))
 
 
-def _view_rows(report: Mapping[str, Any]) -> list[tuple[str, int, str]]:
-    views = at(report, "comparison", "views") or {}
-    return [
-        (status.value, views[status.value], _VIEW_WORDS[status])
-        for status in ViewStatus
-        if views.get(status.value)
-    ]
-
-
 def _how(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     residual_px = number_at(report, "comparison", "residual_px", "median")
     rows = [
@@ -434,13 +281,6 @@ def _points(outline_px: PointsPx) -> str:
     """The outline as an SVG polygon's points."""
     simple = cv2.approxPolyDP(outline_px.astype(np.float32)[:, None], 0.3, True)[:, 0]
     return " ".join(f"{x:.1f},{y:.1f}" for x, y in (simple if len(simple) > 2 else outline_px))
-
-
-def _files(site: Site) -> str:
-    if site.is_local:
-        return "changes.json and the pictures in the folder changes"
-    others = "changes.geojson, changes.kml (Google Earth), changes.gpx (GPS receivers)"
-    return f"{others}, and the pictures in the folder changes"
 
 
 def _plain(value: Any) -> str:
@@ -552,16 +392,6 @@ def size_rows(coverage: Sequence[Any]) -> list[tuple[str, str, str]]:
 
 def _area_m2(feature: Any) -> float:
     return finite_or_none(at(feature, "properties", "area_m2")) or 0.0
-
-
-def coverage_words(comparison: Mapping[str, Any]) -> tuple[str, str] | None:
-    """The ground that was compared and the ground that was not: " in 2.1 ha", "; 0.4 ha could not be compared"; None
-    for reports that lack it."""
-    compared_m2 = finite_or_none(at(comparison, "coverage", "compared_m2"))
-    missing_m2 = finite_or_none(at(comparison, "coverage", "not_compared_m2"))
-    if compared_m2 is None or missing_m2 is None:
-        return None
-    return f" in {area_words(compared_m2)}", f"; {area_words(missing_m2)} could not be compared"
 
 
 def _size_words(size_m: float) -> str:
