@@ -3,6 +3,7 @@
 The page needs no other file, no network and no script.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,15 +17,9 @@ from sorvolo.store.exports.places import SYSTEMS, degrees_words
 from sorvolo.store.exports.plain import NO_PLACE_FILES
 from sorvolo.store.pages.plots import round_length
 from sorvolo.store.pages.words import (
-    at,
-    finite_or_none,
-    join_words,
     jpeg_uri,
     known,
-    number_at,
     render,
-    seconds_words,
-    with_unit,
 )
 
 _WIDE_PX, _HIGH_PX, _RIM_PX = 940.0, 560.0, 36.0
@@ -32,8 +27,6 @@ _LETTER_PX, _LINE_PX = 7.5, 12.0  # of the map's labels
 _ROWS = 3  # so many lines a label may lie from its dot
 _CROPS_BYTES = 8_000_000  # of all crops in the page together
 _COLOURS = 6  # that the styles of pages have, c0 to c5
-_FILES = "tracks.geojson, tracks.kml (Google Earth), tracks.gpx (GPS receivers)"
-_LOCAL_FILES = "tracks.json, coordinates in pixels of the first picture. " + NO_PLACE_FILES
 _FACTS = {
     "thresholds": "reported from a score of",
     "calibrated": "half are right at 0.5",
@@ -50,31 +43,22 @@ def watch_page(
     `crops` are JPEG files by track, and `drone_m` (N, 2) the camera's places in site metres, none for a flight that
     nothing places. All text is escaped.
     """
-    shown = _crops(tracks, crops)
     is_local = not report.get("georeferenced")
+    has_cuts = len({each.get("segment") for each in tracks}) > 1
     page = render(
         "watch.html",
+        report,
         title=f"{report.get('flight')} - watch",
-        flight=known(report.get("flight")),
-        first=_when(report.get("first_frame")),
-        last=_when(report.get("last_frame")),
-        headline=known(at(report, "headline", "text")),
-        looked_for=", ".join(map(str, report.get("looked_for") or ["objects"])),
-        warning_lines=report.get("warnings") or [],
-        maps=_maps(report, tracks, drone_m),
-        rows=_rows(tracks, is_local=is_local),
+        maps=_maps(tracks, drone_m, is_local=is_local),
+        rows=[
+            (each, _place(each, is_local, has_cuts), math.hypot(*each.get("velocity_m_s") or ()))
+            for each in tracks
+        ],
         systems=() if is_local else tuple(SYSTEMS.items()),
-        files=_LOCAL_FILES if is_local else _FILES,
-        crops=shown,
-        without_crop=len(tracks) - len(shown),
-        course=_course(report),
-        notices=[str(each["text"]) for each in report.get("notices") or []],
+        no_place_files=NO_PLACE_FILES,
+        crops=_crops(tracks, crops),
         model=_model_rows(report.get("model") or {}),
         others=[_model_rows(each) for each in report.get("other_models") or []],
-        versions=join_words(
-            f"Sorvolo {known(report.get('sorvolo'))},",
-            ", ".join(f"{name} {value}" for name, value in (report.get("versions") or {}).items()),
-        ),
     )
     return str(page)
 
@@ -99,24 +83,13 @@ class _Spot:
     label_y: float
 
 
-def _maps(
-    report: Mapping[str, Any], tracks: Sequence[_Track], drone_m: Floats
-) -> list[dict[str, Any]]:
+def _maps(tracks: Sequence[_Track], drone_m: Floats, *, is_local: bool) -> list[dict[str, Any]]:
     """One map, or one for each segment of a flight that was followed in the picture: their pixels are not the same."""
-    is_local = not report.get("georeferenced")
-    note = (
-        "Pixels of the first frame, or the first after a cut, with the camera's own motion removed: nothing places "
-        "this flight on the ground."
-        if is_local
-        else "North is up. The dashed line is the path of the camera. The pale discs show the position accuracy (1 sigma)."
-    )
-    maps = []
-    for title, of_one in _by_segment(tracks):
-        drawing = _drawing(of_one, drone_m, is_local=is_local)
-        if drawing:
-            keys = [(f"c{k % _COLOURS}", name) for k, name in enumerate(_classes(of_one))]
-            maps.append({"title": title, "legend": keys, "drawing": drawing, "note": note})
-    return maps
+    return [
+        {"title": title, "classes": _classes(of_one), "colours": _COLOURS, "drawing": drawing}
+        for title, of_one in _by_segment(tracks)
+        if (drawing := _drawing(of_one, drone_m, is_local=is_local))
+    ]
 
 
 def _by_segment(tracks: Sequence[_Track]) -> list[tuple[str, list[_Track]]]:
@@ -204,30 +177,6 @@ def _label_places(dots_px: Floats, names: Sequence[str]) -> list[tuple[float, fl
     return places
 
 
-def _rows(tracks: Sequence[_Track], *, is_local: bool) -> list[dict[str, Any]]:
-    has_cuts = len({each.get("segment") for each in tracks}) > 1
-    unit = "px" if is_local else "m"
-    rows = []
-    for each in tracks:
-        speed = each.get("velocity_m_s")
-        first, last = _when(each["first_seen"]), _when(each["last_seen"])
-        rows.append(
-            {
-                "id": each["id"],
-                "name": each["class"],
-                "score": f"{each['score']:.2f}",
-                "place": _place(each, is_local, has_cuts),
-                "accuracy": with_unit(each.get("sigma_m"), "{:.1f} " + unit) or "",
-                "motion": f"{np.hypot(*speed):.1f} {unit}/s" if speed else "still",
-                "views": each["views"],
-                "passes": each["passes"],
-                "first": first,
-                "last": last if first[:10] != last[:10] else last[-8:],
-            }
-        )
-    return rows
-
-
 def _place(track: _Track, is_local: bool, has_cuts: bool) -> list[tuple[str, str]]:
     if is_local:
         of_segment = f" in segment {track['segment']}" if has_cuts else ""
@@ -235,77 +184,15 @@ def _place(track: _Track, is_local: bool, has_cuts: bool) -> list[tuple[str, str
     return list(degrees_words(track["latitude"], track["longitude"]).items())
 
 
-def _when(utc: object) -> str:
-    """A time to read; what no clock dated counts from 1970 on, and is shown as the time since the start."""
-    day, _, clock = str(utc or "")[:19].partition("T")
-    return clock if day == "1970-01-01" else f"{day} {clock}".strip() or "unknown"
-
-
-def _crops(tracks: Sequence[_Track], crops: Mapping[int, bytes]) -> list[dict[str, str]]:
+def _crops(tracks: Sequence[_Track], crops: Mapping[int, bytes]) -> list[tuple[_Track, str]]:
+    """The tracks whose picture the page has room for, with its address."""
     left, shown = _CROPS_BYTES, []
     for each in tracks:
         data = crops.get(each["id"])
-        if data is None or len(data) > left:
-            continue
-        left -= len(data)
-        shown.append(
-            {
-                "address": jpeg_uri(data),
-                "name": f"{each['class']} {each['id']}",
-                "score": f"{each['score']:.2f}",
-                "frame": known(each["best_frame"]),
-            }
-        )
+        if data is not None and len(data) <= left:
+            left -= len(data)
+            shown.append((each, jpeg_uri(data)))
     return shown
-
-
-def _course(report: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """How the watch went: frames, detections, times, and what the places rest on."""
-    frames, latency = report.get("frames") or {}, report.get("latency_s") or {}
-    seconds = {
-        name: value for name, value in (report.get("seconds") or {}).items() if name != "total"
-    }
-    missing = (
-        f"{known(at(report, 'detections', 'not_placed'))} without"
-        if report.get("georeferenced")
-        else "none with"
-    )
-    short = at(report, "detections", "set_aside")
-    aside = f"; {short} dropped, of a size that their class cannot have" if short else ""
-    rows = [
-        (
-            "frames",
-            f"{known(frames.get('detected'))} searched of {known(frames.get('read'))} read, "
-            f"{known(frames.get('skipped'))} left, {known(frames.get('lost'))} unusable",
-        ),
-        (
-            "detections",
-            f"{known(at(report, 'detections', 'total'))}, of which {missing} a place on the ground{aside}",
-        ),
-        (
-            "time taken",
-            join_words(
-                seconds_words(number_at(report, "seconds", "total")),
-                with_unit(report.get("frames_per_second"), "({:.1f} frames per second)"),
-            ),
-        ),
-        (
-            "of that",
-            ", ".join(
-                f"{name} {seconds_words(finite_or_none(value))}" for name, value in seconds.items()
-            ),
-        ),
-        (
-            "delay from frame to result",
-            f"{seconds_words(finite_or_none(latency.get('median')))} (median), "
-            f"{seconds_words(finite_or_none(latency.get('max')))} at most",
-        ),
-        ("height", known(at(report, "telemetry", "height"))),
-        ("attitude", known(at(report, "telemetry", "attitude"))),
-        ("camera", known(at(report, "camera", "origin"))),
-        ("ended", known(report.get("ended"))),
-    ]
-    return [(name, words) for name, words in rows if words]
 
 
 def _plain(value: Any) -> Any:

@@ -91,6 +91,12 @@ def seconds_words(value: float | None) -> str:
     )
 
 
+def moment_words(utc: object) -> str:
+    """A time to read; what no clock dated counts from 1970 on, and is shown as the time since the start."""
+    day, _, clock = str(utc or "")[:19].partition("T")
+    return clock if day == "1970-01-01" else f"{day} {clock}".strip() or "unknown"
+
+
 def picture_uri(picture: ImageRGBA, most_bytes: int = _MOST_PICTURE_BYTES) -> str:
     """The picture as a JPEG on grey inside an address, below a size: that which a page can carry."""
     small = picture
@@ -161,6 +167,7 @@ def _environment(package: str) -> Environment:
         "metres": length_words,
         "area": area_words,
         "duration": seconds_words,
+        "moment": moment_words,
         "sentence": lambda text: text[:1].upper() + text[1:],
     }
     environment.globals |= {"plural": plural, "join_words": join_words}
