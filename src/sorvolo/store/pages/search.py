@@ -10,27 +10,20 @@ from sorvolo.store.pages.words import (
     at,
     jpeg_uri,
     known,
-    number_at,
     picture_uri,
     render,
     seconds_words,
-    with_unit,
 )
 
 
 def search_page(report: Mapping[str, Any], pictures: Mapping[str, ImageRGBA]) -> str:
     """search.html of search.json's content; `pictures` are the maps of the classes' probabilities. Text is escaped."""
-    first = next(iter(report["classes"]))
-    headline = known(at(report, "headline", "text"))
     page = render(
         "search.html",
+        report,
         title=f"{known(report['site'])} - what the search would have found",
-        site=known(report["site"]),
-        headline=headline[:1].upper() + headline[1:],
-        model=known(report["model"]),
         notices=[*report["warnings"], *(known(at(each, "text")) for each in report["notices"])],
         maps=[(label, picture_uri(picture)) for label, picture in pictures.items()],
-        figures=_figures(report["classes"][first]),
         holes=[
             [label, reason, area_words(area_m2), f"{area_m2 / row['area_m2']:.0%}"]
             for label, row in report["classes"].items()
@@ -44,7 +37,6 @@ def search_page(report: Mapping[str, Any], pictures: Mapping[str, ImageRGBA]) ->
             ]
             for each in report["segments"]
         ],
-        refly=_refly(report.get("refly")),
         plants=[
             [
                 known(flight["name"]),
@@ -60,8 +52,6 @@ def search_page(report: Mapping[str, Any], pictures: Mapping[str, ImageRGBA]) ->
         ],
         calibration=_calibration(report),
         calibration_plot=_calibration_plot(report),
-        cell=with_unit(report["cell_m"], "{:g} m"),
-        so_far=report["so_far"],
     )
     return str(page)
 
@@ -75,15 +65,11 @@ def waiting_page(*, is_over: bool) -> str:
 
 def under_trees_page(report: Mapping[str, Any], floor: ImageRGBA, crops: Sequence[bytes]) -> str:
     """under_trees.html of under_trees.json's content, the floor's picture and a JPEG of each find. Text is escaped."""
-    headline = report["headline"]["text"]
     page = render(
         "under_trees.html",
+        report,
         title=f"{report['flight']} - under the trees",
-        flight=report["flight"],
-        headline=headline[:1].upper() + headline[1:],
-        warning_lines=report["warnings"],
         floor=picture_uri(floor),
-        pictures=report["pictures"],
         rows=[
             [
                 str(number),
@@ -98,37 +84,6 @@ def under_trees_page(report: Mapping[str, Any], floor: ImageRGBA, crops: Sequenc
         crops=[jpeg_uri(each) for each in crops],
     )
     return str(page)
-
-
-def _figures(row: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    interval = (
-        f"90 % interval {row['pod_low']:.2f} to {row['pod_high']:.2f}; unseen ground counts as 0"
-    )
-    return [
-        ("probability of detection (POD)", f"{row['pod']:.2f}", interval),
-        ("area", area_words(row["area_m2"]), f"of it seen: {area_words(row['seen_m2'])}"),
-        (
-            "effective sweep width",
-            with_unit(row["sweep_width_m"], "{:.1f} m") or "unknown",
-            "ground times its probability, within the area or not, over the path of all flights",
-        ),
-        (
-            "coverage",
-            f"{row['coverage']:.2f}",
-            f"a random search of that effort has POD {row['random_pod']:.2f}",
-        ),
-    ]
-
-
-def _refly(refly: Mapping[str, Any] | None) -> str:
-    if refly is None:
-        return ""
-    written = ", ".join(refly["files"])
-    files = f" Files: {written}." if written else " --refly FILE.kml (or .plan, .kmz) writes it."
-    return (
-        f"Another flight over {refly['holes']} of the holes ({area_words(number_at(refly, 'area_m2'))}), "
-        f"{refly['height_m']:.0f} m high, takes {seconds_words(number_at(refly, 'duration_s'))}.{files}"
-    )
 
 
 def _calibration_plot(report: Mapping[str, Any]) -> dict[str, Any]:
