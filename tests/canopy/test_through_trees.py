@@ -70,6 +70,8 @@ def test_the_people_are_named_with_the_chance_that_one_is_found(
 def test_a_station_is_told_of_each_person(searched: tuple[Path, int, str], site: Path) -> None:
     lines = BytesIO()
     _add_people(Journal(lines), site, ["flown"])
+    assert not lines.getvalue()  # its map found none: whom it found was told then
+    _add_people(Journal(lines), site, ["flown"], below_crowns=True)
     told = [json.loads(each) for each in lines.getvalue().splitlines()]
     assert [each["type"] for each in told] == [PERSON_FOUND] * len(_PEOPLE_M)
     assert {each["data"]["feature"]["properties"]["class"] for each in told} == {"person"}

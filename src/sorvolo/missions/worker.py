@@ -343,7 +343,7 @@ def _look_through_trees(order: Order, journal: Journal) -> Done:
                 }
             )
     flight, headline = report["flight"], report["headline"]
-    _add_people(journal, Path(order.site), [flight])
+    _add_people(journal, Path(order.site), [flight], below_crowns=True)
     return Done(headline["text"], flight, headline["complete"])
 
 
@@ -404,10 +404,13 @@ def _mapped(journal: Journal, site: Path, outcomes: "Sequence[FlightOutcome]") -
 # ---- what happens on the way ------------------------------------------------------------------------------------
 
 
-def _add_people(journal: Journal, site: Path, flights: Sequence[str]) -> None:
-    """Write each person that flights of the site found."""
+def _add_people(
+    journal: Journal, site: Path, flights: Sequence[str], *, below_crowns: bool = False
+) -> None:
+    """Write each person that flights of the site found, in single pictures or by a look below crowns."""
     from sorvolo.store.exports.change_files import objects_geojson
     from sorvolo.store.site.archive import Archive
+    from sorvolo.store.site.change_records import is_under_trees
     from sorvolo.survey.objects import PERSON
 
     with Archive.open(site, write=False) as archive:
@@ -415,7 +418,7 @@ def _add_people(journal: Journal, site: Path, flights: Sequence[str]) -> None:
             each
             for flight in flights
             for each in archive.objects(flight)
-            if each.thing.label == PERSON
+            if each.thing.label == PERSON and is_under_trees(each.thing.id) == below_crowns
         ]
         place = archive.site()
     for feature in objects_geojson(people, place, crops_from_site=True)["features"]:
