@@ -139,6 +139,20 @@ def test_changes_that_nobody_named_are_things_too() -> None:
     assert not lasting.gone  # nobody looks for it
 
 
+def test_what_came_where_its_like_left_is_seen_once() -> None:
+    """A comparison saw one car leave and another come; the detector saw the second, nearer to the first's place."""
+    changed = sighting(1, "changes", 0.7, origin=KnownBy.CHANGED)
+    left = replace(changed, date="flight0", gone="flight1", position_m=np.array([0.1, 0.0]))
+    seen = [sighting(0, "map", 0.0), left, changed, sighting(1, "map", 0.1)]
+    register = associate(seen, [look(0), look(1)])
+    assert [(each.dates, each.gone) for each in register.findings] == [
+        (("flight0",), "flight1"),
+        (("flight1",), ""),
+    ]
+    (stands,) = associate([*seen[:2], seen[3]], [look(0), look(1)]).findings
+    assert not stands.gone  # no other came: the comparison erred
+
+
 def test_what_comes_after_it_was_gone_is_another() -> None:
     """A second car in the place of the first has an interval of its own."""
     seen = [sighting(0, "map", 0.0), sighting(2, "map", 0.2)]

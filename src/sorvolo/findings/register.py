@@ -28,6 +28,7 @@ _AGREE_M = 1.0  # so far apart at most, they show the same
 _SIGMA_OF_MEDIAN = 0.85  # per axis, by the median distance of a normal scatter in the plane
 _LIKE_SIZE = 2.5  # lengths further apart than this ratio are two things, where their classes differ
 _LIKE_CLASS = 0.1  # classes' shares that agree less are two classes
+_LEFT = 4.0  # as unlike is what the date's comparison saw leave: what came in its place is nearer
 _FAR = 1e3  # the cost of a pair that cannot be one thing: more than all that can
 
 UNNAMED = "thing"
@@ -394,7 +395,7 @@ def _known(value: float, otherwise: float = 0.0) -> float:
 @dataclass(frozen=True, eq=False)
 class _Pair:
     """A sighting and a thing that it may be: how far it is off, (2,), how far it may be beside its error, and how
-    unlike its class is, 0 to 1."""
+    unlike it is, its class 0 to 1."""
 
     row: int
     number: int
@@ -431,7 +432,7 @@ def _pair(row: int, sighting: MissionSighting, number: int, thing: _Thing) -> _P
         sighting.position_m - thing.known_m - np.multiply(last.velocity_m_s, between_s),
         _REACH_OF_LENGTH * length_m + _REACH_M + _WALKS_M_S * abs(between_s),
         math.hypot(_known(sighting.sigma_m), _known(thing.sigma_m)),
-        1 - shared,
+        1 - shared + _LEFT * (thing.left is not None),
         not moves,
     )
 

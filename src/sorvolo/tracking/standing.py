@@ -120,7 +120,8 @@ def fuse(
         views = len(_frames_of([k for k in group if not (is_reported and laid[k].is_cut)], laid))
         if is_reported:
             standing.append(_standing(group, laid, possible, score))
-        is_seldom = views < max(2.0, _STANDING_SHARE * possible)
+        unseen = possible - len(_frames_of(group, laid))
+        is_seldom = views < max(2.0, _STANDING_SHARE * (views + unseen))
         if is_seldom and (not is_reported or 2 * views <= possible):
             left += (own := [k for k in group if strong[k]])
             doubted |= set(own) if is_reported else set()
