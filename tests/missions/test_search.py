@@ -66,7 +66,10 @@ def test_a_detector_that_sees_all_gives_high_chances_and_the_files_agree(
     )
     assert area_m2 == pytest.approx(row["seen_m2"], rel=0.02)
     assert "probability of detection" in (out / "search.html").read_text()
-    assert report["headline"]["text"].startswith("probability of detection of a car")
+    headline = report["headline"]
+    assert headline["text"].startswith("probability of detection of a car")
+    assert not headline["complete"]  # its map was made without a model
+    assert "; nobody has looked for a car in photos: " in headline["text"]
 
 
 def test_a_blind_detector_finds_nothing_and_the_headline_reports_it(

@@ -61,12 +61,15 @@ def search_site(
         outlines_m = [each.placed.outline_m for own in frames.values() for each in own]
         cells = cells_of(outlines_m, site, None if area is None else area.polygons_m(site.frame))
         measured = yield from _measured(frames, cells, archive, prepared, settings, outputs.folder)
+        first, looks = measured[0].classes[0].label, archive.searches()
+        looked = {each.date for each in looks if len(each.frames.for_class(first))}
         searched = Searched(
             site,
             cells,
             tuple(measured),
             {name: tuple(own) for name, own in frames.items()},
             prepared.segments,
+            [name for name in frames if name not in looked],
         )
         return write_search(
             searched, archive.tiles(), archive.site_grid(), settings, outputs, prepared.detector

@@ -85,13 +85,15 @@ class SoFar:
 
 @dataclass(frozen=True, eq=False)
 class Searched:
-    """All that was measured of a site; `segments` are names, areas and the probability that the missing is in each."""
+    """All that was measured of a site; `segments` are names, areas and the probability that the missing is in each.
+    `unlooked` are flights in whose own pictures nobody looked for the first class: only their plants were."""
 
     site: Site
     cells: Cells
     flights: tuple[MeasuredFlight, ...]
     frames: Mapping[str, tuple[SearchFrame, ...]]
     segments: Sequence[tuple[str, Area, float]]
+    unlooked: Sequence[str] = ()
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -195,12 +197,19 @@ def build_search_report(
         label: _class_row(searched, label, settings, detector.info) for label in searched.labels
     }
     first = searched.labels[0]
+    headline = _headline(first, rows[first], settings, so_far)
+    if searched.unlooked:
+        names = ", ".join(searched.unlooked)
+        headline["text"] += (
+            f"; nobody has looked for a {first} in {names}: map it again with a model"
+        )
+        headline["complete"] = False
     report = {
         "site": searched.site.name,
         "model": detector.info.name,
         "settings": asdict(settings),
         "cell_m": searched.cells.cell_m,
-        "headline": _headline(first, rows[first], settings, so_far),
+        "headline": headline,
         "so_far": None if so_far is None else asdict(so_far),
         "classes": rows,
         "flights": [_flight_row(each) for each in searched.flights],
