@@ -341,6 +341,42 @@ def test_a_walker_is_one_and_moves() -> None:
     assert np.hypot(*(walker.position_m - [8.0 + 1.3 * last_s, 2.0 - 0.3 * last_s])) < 0.5
 
 
+def test_two_boxes_of_one_walker_are_one_step() -> None:
+    """A tall box around the usual one, in each frame, ends no walk and makes no second walker."""
+    frames = survey()[:10]
+    once = sightings(frames, [("person", 8.0, 2.0, 0.0, (1.3, -0.3))], misses=0.0)
+    tall = [
+        replace(
+            each,
+            sighting=replace(each.sighting, box_px=each.sighting.box_px - [0, 20, 0, 0], score=0.9),
+        )
+        for each in once
+    ]
+    (walker,) = fuse([*once, *tall], frames).objects
+    assert walker.moves and walker.possible_views == len(once)
+
+
+def test_cars_that_cross_after_a_gap_keep_to_their_ways() -> None:
+    """One leaves the picture as another is seen far from where the first would be."""
+    frames = [placed(k, 16.0, 0.0) for k in range(12)]
+    laid = list[LaidSighting]()
+    for number, frame in enumerate(frames):
+        cars = [(10.5 + 2.0 * number, 6.0)] if number < 6 else []
+        cars += [(20.0, 36.0 - 3.0 * number)] if number in (8, 10, 11) else []
+        boxes = [box_of(frame, "car", east_m, north_m, 90.0) for east_m, north_m in cars]
+        shown = [each for each in boxes if each is not None]
+        seen = Detections(
+            np.array(shown).reshape(-1, 4),
+            np.full(len(shown), 0.95),
+            np.full(len(shown), CLASSES.index("car")),
+            CLASSES,
+        )
+        laid += [each for each in lay_on_ground(seen, frame) if each is not None]
+    ways = fuse(laid, frames).objects
+    assert all(each.moves for each in ways) and len(ways) == 2
+    assert sorted(round(float(np.hypot(*each.velocity_m_s)), 1) for each in ways) == [2.0, 3.0]
+
+
 def test_its_own_sigma_is_honest() -> None:
     """Errors against the truth lie within twice the stated sigma about as often as they should."""
     frames = survey()

@@ -123,7 +123,10 @@ def fuse(
         unseen = possible - len(_frames_of(group, laid))
         is_seldom = views < max(2.0, _STANDING_SHARE * (views + unseen))
         if is_seldom and (not is_reported or 2 * views <= possible):
-            left += (own := [k for k in group if strong[k]])
+            # a frame's twins are one step of a way
+            surest_last = sorted(group, key=lambda k: laid[k].sighting.score)
+            own = {laid[k].sighting.frame_index: k for k in surest_last if strong[k]}.values()
+            left += own
             doubted |= set(own) if is_reported else set()
     walks = [[left[k] for k in walk] for walk in _walks([laid[k] for k in left])]
     # two places alone may be those of two things that stand
@@ -134,7 +137,9 @@ def fuse(
     objects = [
         each
         for each in standing
-        if walked.isdisjoint(each.members) or whole.intersection(each.members) - walked
+        if walked.isdisjoint(each.members)
+        or _frames_of([*whole.intersection(each.members)], laid)
+        - _frames_of([*walked.intersection(each.members)], laid)
     ]
     objects += [_moving(each, laid) for each in walks]
     used = set[int]().union(*(each.members for each in objects))
@@ -541,8 +546,11 @@ def _prolonged(
             break
         if after_s <= 0 or laid[k].sighting.label != label:
             continue
-        expected_m, _, spread = _line(members, laid, times_s, float(times_s[k]))
-        sigma_m = np.hypot(np.hypot(spread, _sigma_m(laid[k])), 0.5 * _WOBBLE_M_S2 * after_s**2)
+        expected_m, velocity_m_s, spread = _line(members, laid, times_s, float(times_s[k]))
+        # whoever turns is no farther off than one who is known again by `_joined`
+        farthest_m = 1.0 + _SWERVE * float(np.hypot(*velocity_m_s)) * after_s
+        turned_m = min(0.5 * _WOBBLE_M_S2 * after_s**2, farthest_m / _MOST_OFF)
+        sigma_m = np.hypot(np.hypot(spread, _sigma_m(laid[k])), turned_m)
         if np.hypot(*(laid[k].sighting.position_m - expected_m)) < _MOST_OFF * sigma_m:
             members.append(int(k))
     return members
