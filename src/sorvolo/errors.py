@@ -9,7 +9,7 @@ _ARGUMENT_OF = {  # options whose argument in Python is not called the same
     "height": "height_m", "interval": "interval_m", "masks": "writes_masks", "max-height": "max_height_m", "out": "folder",
     "offset": "offset_s", "trust-map": "trusts_map", "no-update": "updates_map=False",
 }  # fmt: skip
-_OPTION = re.compile(r"(?:sorvolo [a-z]|ray start|pip install)[^,;`]*|--([a-z][a-z-]*)")
+_OPTION = re.compile(r"(?:sorvolo [a-z]|ray start|pip install)[^,;`]*|(?<![\w-])--([a-z][a-z-]*)")
 
 
 class SorvoloError(Exception):

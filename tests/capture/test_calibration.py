@@ -406,6 +406,8 @@ def test_the_camera_option(tmp_path):
         ("aov=wide", "not a number"),
         ("focal_px=-3", "no lens"),
         ("focal_px=nan", "no lens"),
+        ("focal_35mm=0", "no lens"),
+        ("focal_35mm=inf", "no lens"),
         ("f=3", "key must be"),
         ("Concorde", "Mavic 2 Pro"),
         ("", "neither"),

@@ -1,5 +1,6 @@
 """Inputs as flights: what becomes a flight, under which name, with which camera and telemetry."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -170,6 +171,10 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
         InputError, match=r"no such file or folder: .*nowhere; a video, a folder of photos.*rtsp://"
     ):
         open_sources([tmp_path / "nowhere"])
+    os.mkfifo(tmp_path / "waits.mp4")
+    for path in ("", tmp_path / "waits.mp4"):  # of a shell's variable that is not set, of a pipe
+        with pytest.raises(InputError, match="no such file or folder"):
+            open_sources([path])
     with pytest.raises(
         InputError, match=r"^foo://x: no such file, and no address that is known; give rtsp://"
     ):

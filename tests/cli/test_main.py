@@ -180,12 +180,29 @@ def test_nothing_is_left_of_a_map_that_could_not_begin(
     [
         ("--gsd", "-1", "(--gsd) must lie in 1e-4 to 100 m, got -1.0"),
         ("--offset", "1e9", "(--offset) must be 20 years of seconds at most, got 1000000000.0"),
+        ("--ground-elevation", "nan", "--ground-elevation must lie in -1000 to 9000 m, got nan"),
     ],
 )
 def test_settings_out_of_range_are_errors(
     option: str, value: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(["map", str(tmp_path), "--site", str(tmp_path / "site"), option, value]) == 1
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "words"),
+    [
+        ("--height", "nan", "the flight height must be positive, got nan m"),
+        ("--critical-m", "nan", "the critical dimension must be positive, got nan m"),
+        ("--bearing", "nan", "--bearing nan: give degrees from north"),
+        ("--size", "9" * 400 + "x9", "give width x height in pixels"),
+    ],
+)
+def test_a_plan_takes_no_number_that_is_none_as_not_given(
+    option: str, value: str, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["plan", "--camera", "aov=70", option, value]) == 1
     assert words in capsys.readouterr().err
 
 

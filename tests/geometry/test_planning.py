@@ -170,7 +170,7 @@ def rotated(ring, angle_deg):
     st.integers(0, 10**6),
     st.floats(10, 80),
     st.sampled_from([0.0, 0.3, 0.65, 0.9]),
-    st.sampled_from([math.nan, 0.0, 37.0, 90.0, 200.0]),
+    st.sampled_from([None, 0.0, 37.0, 90.0, 200.0]),
 )
 def test_every_point_of_a_star_shaped_area_is_seen(corners, seed, height_m, overlap, bearing_deg):
     rng = np.random.default_rng(seed)

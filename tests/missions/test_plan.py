@@ -92,7 +92,7 @@ def test_the_packaged_detector_bounds_the_height_by_its_own_word():
 
 
 def test_another_object_is_not_bounded_by_how_people_are_found():
-    answers = answer_questions(THESIS_LENS, PlanSettings(critical_m=4.0, person_m=math.nan))
+    answers = answer_questions(THESIS_LENS, PlanSettings(critical_m=4.0, person_m=None))
     assert set(answers.height_bounds_m) == {"task", "ceiling"}
 
 

@@ -84,6 +84,7 @@ def _annotations(function: Callable[..., Any]) -> list[Any]:
     [
         ("give --offset 2, or --telemetry FILE", "give offset_s 2, or telemetry FILE"),
         ("use --height-model (--gsd)", "use height_model (m_per_px)"),
+        ("a--b.mp4: give --camera", "a--b.mp4: give camera"),
         (
             "first run sorvolo map --site s, then --gcp",
             "first run sorvolo map --site s, then control",

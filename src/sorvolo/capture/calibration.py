@@ -81,9 +81,7 @@ def guess_camera(
     if _is_lens(focal_px, width_px):  # not where one is unknown: NaN or 0
         words = f"EXIF of the {label}: {focal_length_mm:g} mm at {focal_plane_px_per_mm:.1f} px/mm"
         return _plain_camera(width_px, height_px, focal_px, words, 0.05)
-    # The equivalent compares diagonals of whole photos. A 16:9 picture is nearly always cut from a 4:3 sensor.
-    diagonal_px = width_px * 1.25 if width_px / height_px > 1.6 else math.hypot(width_px, height_px)
-    focal_px = focal_length_35mm / _FULL_FRAME_DIAGONAL_MM * diagonal_px
+    focal_px = _focal_px(focal_length_35mm, width_px, height_px)
     if _is_lens(focal_px, width_px):
         words = f"EXIF of the {label}: equivalent to {focal_length_35mm:g} mm on 35 mm film"
         return _plain_camera(width_px, height_px, focal_px, words, 0.05)
@@ -175,6 +173,7 @@ def _camera_of_number(key: str, text: str, width_px: int, height_px: int) -> Cam
         number = float(text)
     except ValueError as error:
         raise InputError(f"--camera {key}={text}: {text!r} is not a number") from error
+    sigma = 0.03
     if key == "aov":
         focal_px = (
             0.5 * width_px / math.tan(math.radians(number) / 2) if 0 < number < 180 else math.nan
@@ -182,12 +181,18 @@ def _camera_of_number(key: str, text: str, width_px: int, height_px: int) -> Cam
     elif key == "focal_px":
         focal_px = number
     elif key == "focal_35mm":
-        return guess_camera(width_px, height_px, make="--camera", focal_length_35mm=number)
+        focal_px, sigma = _focal_px(number, width_px, height_px), 0.05
     else:
         raise InputError(f"--camera {key}={text}: the key must be aov, focal_px or focal_35mm")
     if not _is_lens(focal_px, width_px):
         raise InputError(f"--camera {key}={text}: no lens for pictures {width_px} px wide")
-    return _plain_camera(width_px, height_px, focal_px, f"given as {key}={number:g}", 0.03)
+    return _plain_camera(width_px, height_px, focal_px, f"given as {key}={number:g}", sigma)
+
+
+def _focal_px(focal_35mm: float, width_px: int, height_px: int) -> float:
+    # The equivalent compares diagonals of whole photos. A 16:9 picture is nearly always cut from a 4:3 sensor.
+    diagonal_px = width_px * 1.25 if width_px / height_px > 1.6 else math.hypot(width_px, height_px)
+    return focal_35mm / _FULL_FRAME_DIAGONAL_MM * diagonal_px
 
 
 def _plain_camera(

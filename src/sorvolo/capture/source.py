@@ -268,8 +268,9 @@ def frames(
 def _recorded(inputs: Sequence[Path | str]) -> list[Path]:
     """The inputs that are files or folders; raises InputError for one that is not there."""
     recorded = [str(each) for each in inputs if not is_live_address(str(each))]
-    if missing := next((text for text in recorded if not Path(text).exists()), ""):
-        raise InputError(_nothing_at(missing))
+    for text in recorded:
+        if not (text and (Path(text).is_file() or Path(text).is_dir())):
+            raise InputError(_nothing_at(text))
     return [Path(text) for text in recorded]
 
 
@@ -357,7 +358,7 @@ def _nothing_at(text: str) -> str:
     if re.match("[a-z][a-z0-9+.-]+:", text, re.IGNORECASE):
         return f"{shown_address(text)}: no such file, and no address that is known; give {ADDRESS_FORMS}"
     return (
-        f"no such file or folder: {text}; a video, a folder of photos, photos, or a live source was needed "
+        f"no such file or folder: {text or '(nothing)'}; a video, a folder of photos, photos, or a live source was needed "
         f"({ADDRESS_FORMS})"
     )
 

@@ -346,10 +346,8 @@ class _Sizes:
 
 
 def _check_file(path: Path) -> None:
-    if not path.exists():
-        raise InputError(f"no such file: {path}")
     if not path.is_file():
-        raise InputError(f"{path} is not a file; give a video file or a folder of photos")
+        raise InputError(f"no such file: {path}; give a video, or a folder of photos")
     if path.stat().st_size == 0:
         raise InputError(f"{path.name} is empty (0 bytes); copy it again from the drone")
     with path.open("rb") as file:

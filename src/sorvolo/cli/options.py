@@ -1,5 +1,6 @@
 """Options that several commands share, each worded once, and what their texts mean."""
 
+import re
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -163,10 +164,9 @@ def size_px(text: str) -> tuple[int, int] | None:
     """Width and height of "1920x1080"; None for no text. Raises SettingsError for anything else."""
     if not text:
         return None
-    width, _, height = text.lower().partition("x")
-    if not (width.isdecimal() and height.isdecimal() and int(width) > 0 and int(height) > 0):
+    if not (size := re.fullmatch(r"([1-9]\d{1,4})x([1-9]\d{1,4})", text, re.ASCII | re.IGNORECASE)):
         raise SettingsError(f"--size {text!r}: give width x height in pixels, such as 1920x1080")
-    return int(width), int(height)
+    return int(size[1]), int(size[2])
 
 
 def names(text: str) -> tuple[str, ...]:

@@ -25,7 +25,7 @@ TaskOption = Annotated[
     ),
 ]
 CriticalDimension = Annotated[
-    float,
+    float | None,
     typer.Option(
         help="Smallest side of another object to be made out, m.", show_default="a person's"
     ),
@@ -37,7 +37,7 @@ GroundSpeed = Annotated[float, typer.Option(help="Ground speed, m/s.")]
 ForwardOverlap = Annotated[float, typer.Option(help="Overlap of consecutive pictures, 0 to 0.95.")]
 SideOverlap = Annotated[float, typer.Option(help="Overlap of neighbouring strips, 0 to 0.95.")]
 StripBearing = Annotated[
-    float,
+    float | None,
     typer.Option(help="Direction of the strips, deg from north.", show_default="along the area"),
 ]
 ThroughTrees = Annotated[
@@ -59,14 +59,14 @@ def plan(
     camera: Camera,
     size: PictureSize = "",
     task: TaskOption = "recognition",
-    critical_m: CriticalDimension = math.nan,
+    critical_m: CriticalDimension = None,
     height: FlightHeight = None,
     max_height: HighestFlight = 120.0,
     model: Model = "default",
     speed: GroundSpeed = 5.0,
     overlap: ForwardOverlap = 0.75,
     side_overlap: SideOverlap = 0.65,
-    bearing: StripBearing = math.nan,
+    bearing: StripBearing = None,
     through_trees: ThroughTrees = None,
     area: Area = None,
     out: WaypointFiles = None,
@@ -87,7 +87,7 @@ def plan(
 
     settings = planning.PlanSettings(
         task=Task(task),
-        height_m=math.nan if height is None else height,
+        height_m=height,
         max_height_m=max_height,
         model=model,
         speed_m_s=speed,
@@ -95,8 +95,8 @@ def plan(
         side_overlap=side_overlap,
         strip_bearing_deg=bearing,
     )
-    if not math.isnan(critical_m):  # another object than a person
-        settings = replace(settings, critical_m=critical_m, person_m=math.nan)
+    if critical_m is not None:  # another object than a person
+        settings = replace(settings, critical_m=critical_m, person_m=None)
     if through_trees is not None:
         settings = planning.through_trees(settings, through_trees)
     if out and area is None:

@@ -102,14 +102,14 @@ def minimum_frame_rate(speed_m_s: float, scene_m: float, overlap: float) -> floa
 class StripSettings:
     """How an area is flown; the camera looks straight down with the image's top towards the flight direction.
 
-    `strip_bearing_deg` is clockwise from north; NaN means along the area's longest extent.
+    `strip_bearing_deg` is clockwise from north; None: along the area's longest extent.
     """
 
     height_m: float
     speed_m_s: float = 5.0
     forward_overlap: float = 0.75
     side_overlap: float = 0.65
-    strip_bearing_deg: float = float("nan")
+    strip_bearing_deg: float | None = None
 
     def __post_init__(self) -> None:
         for name, overlap in (("forward", self.forward_overlap), ("side", self.side_overlap)):
@@ -119,6 +119,8 @@ class StripSettings:
             raise SettingsError(f"the flight height must be positive, got {self.height_m} m")
         if not (np.isfinite(self.speed_m_s) and self.speed_m_s > 0):
             raise SettingsError(f"the speed must be positive, got {self.speed_m_s} m/s")
+        if not np.isfinite(self.strip_bearing_deg or 0):
+            raise SettingsError(f"--bearing {self.strip_bearing_deg}: give degrees from north")
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,8 +188,9 @@ def plan_strips(
         length_m * (1 - settings.forward_overlap),
     )
     outlines_m = np.concatenate([rings[0] for rings in polygons_m])
-    wished_deg = settings.strip_bearing_deg
-    bearing_deg = wished_deg if np.isfinite(wished_deg) else longest_bearing_deg(outlines_m)
+    bearing_deg = settings.strip_bearing_deg
+    if bearing_deg is None:
+        bearing_deg = longest_bearing_deg(outlines_m)
     turn = np.radians(90 - bearing_deg)
     # strip axes: x along the strips, y across
     strip_from_site = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
@@ -208,7 +211,7 @@ def plan_strips(
         settings.speed_m_s,
         photo_m,
         spacing_m,
-        float(bearing_deg % 360),
+        bearing_deg % 360,
     )
 
 

@@ -1,6 +1,5 @@
 """Planning a flight: from a camera and a task to height, overlap and rate, and over an area to waypoints."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -53,28 +52,28 @@ REFLY_LOWEST_M = 10.0  # above ground, where a search's pictures were too coarse
 
 @dataclass(frozen=True)
 class PlanSettings:
-    """What the flight is for. A NaN `height_m` means: as high as task, detector and `max_height_m` allow.
+    """What the flight is for. No `height_m` means: as high as task, detector and `max_height_m` allow.
 
     `critical_m` is the object's smallest decisive dimension as the camera sees it: a person's from above by default.
-    `person_m` is the longest side of a person that the camera sees, which the detector `model` must make out; NaN, or
+    `person_m` is the longest side of a person that the camera sees, which the detector `model` must make out; None, or
     the model "none", where no detector has to. Raises SettingsError for a height above `max_height_m`.
     """
 
     task: Task = Task.RECOGNITION
     critical_m: float = BOTTOM_CRITICAL_M
-    height_m: float = math.nan
+    height_m: float | None = None
     max_height_m: float = LEGAL_CEILING_M
     model: str = "default"
-    person_m: float = TYPICAL_SIZE_M["person"][0]
+    person_m: float | None = TYPICAL_SIZE_M["person"][0]
     speed_m_s: float = 5.0
     forward_overlap: float = 0.75
     side_overlap: float = 0.65
-    strip_bearing_deg: float = math.nan
+    strip_bearing_deg: float | None = None  # clockwise from north; None: along the area
 
     def __post_init__(self) -> None:
         if not self.max_height_m > 0:
             raise SettingsError(f"--max-height must be positive, got {self.max_height_m} m")
-        if self.height_m > self.max_height_m:
+        if self.height_m is not None and self.height_m > self.max_height_m:
             raise SettingsError(
                 f"--height {self.height_m:g} is above {self.max_height_m:g} m, the law's limit for small drones in "
                 "most countries; with a permit, give --max-height as well"
@@ -139,10 +138,10 @@ def answer_questions(model: CameraModel, settings: PlanSettings) -> FlightAnswer
     bounds_m[Bound.CEILING] = settings.max_height_m
     bound = (
         Bound(min(bounds_m, key=lambda each: bounds_m[each]))
-        if math.isnan(settings.height_m)
+        if settings.height_m is None
         else Bound.ASKED
     )
-    height_m = settings.height_m if bound is Bound.ASKED else bounds_m[bound]
+    height_m = bounds_m[bound] if settings.height_m is None else settings.height_m
     strips = _strips(settings, height_m)
     width_m, _ = footprint_size_m(camera, height_m)
     length_m = scene_length_m(height_m, camera.angle_of_view_deg[1])
@@ -226,7 +225,7 @@ def fly_again(
 
 def _detector_bound(focal_px: float, settings: PlanSettings) -> dict[str, float]:
     """The height up to which the detector finds people well; nothing where no detector has to."""
-    if settings.model == "none" or math.isnan(settings.person_m):
+    if settings.model == "none" or settings.person_m is None:
         return {}
     info = read_info(find_model(settings.model))
     demand_searching(info)

@@ -54,11 +54,15 @@ def available_bytes() -> int:
 _MOST_OFFSET_S = 86_400 * 365 * 20  # a clock that was never set begins with its maker's year
 
 
-def check_offset(offset_s: float | None) -> None:
-    """Raise SettingsError for a clock offset, s, that no clock has; None leaves it to the clocks."""
+def check_telemetry(offset_s: float | None, ground_elevation_m: float | None) -> None:
+    """Raise SettingsError for a clock offset, s, that no clock has, or for ground that is not on Earth."""
     if offset_s is not None and not abs(offset_s) <= _MOST_OFFSET_S:
         raise SettingsError(
             f"the clock offset (--offset) must be 20 years of seconds at most, got {offset_s}"
+        )
+    if not -1000 <= (ground_elevation_m or 0) <= 9000:
+        raise SettingsError(
+            f"--ground-elevation must lie in -1000 to 9000 m, got {ground_elevation_m}"
         )
 
 
@@ -127,7 +131,7 @@ class MapSettings:
             raise SettingsError(f"overlap must lie between 0 and 1, got {self.overlap}")
         if self.crs is not None:
             check_map_crs(self.crs)
-        check_offset(self.offset_s)
+        check_telemetry(self.offset_s, self.ground_elevation_m)
 
     @property
     def method_name(self) -> str:
@@ -170,7 +174,7 @@ class CompareSettings:
             )
         if self.side_px is not None and not 256 <= self.side_px <= 8192:
             raise SettingsError(f"frames are compared at 256 to 8192 px, got {self.side_px}")
-        check_offset(self.offset_s)
+        check_telemetry(self.offset_s, self.ground_elevation_m)
 
     @property
     def method_name(self) -> str:

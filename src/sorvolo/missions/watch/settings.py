@@ -6,7 +6,7 @@ from typing import Literal
 
 from sorvolo.errors import SettingsError
 from sorvolo.missions.flight.looked_at import ENOUGH_LOOKED_AT, check_enough
-from sorvolo.missions.flight.settings import check_offset
+from sorvolo.missions.flight.settings import check_telemetry
 from sorvolo.missions.watch import alerts
 from sorvolo.missions.watch.cot_sender import CotTls, cot_place
 from sorvolo.paths import as_path
@@ -49,7 +49,7 @@ class WatchSettings:
         check_enough(self.enough_looked_at)
         if self.height_model and self.ground_elevation_m is not None:
             raise SettingsError("give a height model or the ground's elevation, not both")
-        check_offset(self.offset_s)
+        check_telemetry(self.offset_s, self.ground_elevation_m)
 
     def _check_frames(self) -> None:
         if self.every is not None and self.frames_per_second is not None:
