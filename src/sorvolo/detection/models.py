@@ -99,7 +99,7 @@ def installed_model(name: str) -> InstalledModel:
             return each
     raise InputError(
         f"there is no model {name!r}; installed are: {_searching()} (own ones lie in {models_folder()}); give one of "
-        "them or a .onnx file"
+        "them or a .onnx file; `pip install sorvolo-models` brings the packaged ones"
     )
 
 

@@ -66,7 +66,8 @@ class Telemetry:
     def __post_init__(self) -> None:
         time_ns = frozen(self.time_ns, np.int64)
         if unknown := set(self.columns) - set(TELEMETRY_COLUMNS):
-            raise GeometryError(f"unknown telemetry columns: {sorted(unknown)}")
+            known = ", ".join(TELEMETRY_COLUMNS)
+            raise GeometryError(f"unknown telemetry columns: {sorted(unknown)}; there are {known}")
         if len(time_ns) > 1 and not (np.diff(time_ns) > 0).all():
             raise GeometryError("telemetry times must increase strictly")
         columns = {

@@ -296,7 +296,7 @@ def why_not_searched(model: str) -> str:
     """Why nothing was searched for objects, in words."""
     if model == NO_MODEL:
         return "no model was wanted"
-    return "no default model is installed; `sorvolo models` shows how to get one"
+    return "no default model is installed: pip install sorvolo-models"
 
 
 def crops_of(search: ObjectSearch | None) -> dict[str, bytes]:

@@ -124,7 +124,7 @@ def gpx_bytes(title: str, placemarks: Sequence[Placemark]) -> bytes:
         document.waypoints.append(
             gpxpy.gpx.GPXWaypoint(
                 latitude=round(each.latitude_deg, 8),
-                longitude=round((each.longitude_deg + 180) % 360 - 180, 8),
+                longitude=round(wrapped_deg(each.longitude_deg), 8),
                 name=printable(each.name),
                 description=printable(each.description),
                 time=_moment(each.seen_ns) if each.seen_ns >= DAY_NS else None,
