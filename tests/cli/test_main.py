@@ -260,7 +260,6 @@ class TestFailures:
 
     @pytest.fixture(autouse=True)
     def _command(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.delenv("SORVOLO_DEBUG", raising=False)
         failing = cli.typer.Typer(pretty_exceptions_enable=False)
         failing.callback()(cli.options)
         failing.command("fail")(self._fail)
@@ -314,12 +313,6 @@ class TestFailures:
     def test_debug_shows_where(self, capsys: pytest.CaptureFixture[str]) -> None:
         code, printed = self._printed(KeyError("oops"), capsys, "--debug")
         assert code == 1 and "Traceback" in printed and "_fail" in printed
-
-    def test_debug_by_environment(
-        self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        monkeypatch.setenv("SORVOLO_DEBUG", "1")
-        assert "Traceback" in self._printed(InputError("x"), capsys)[1]
 
     def test_stopped(self, capsys: pytest.CaptureFixture[str]) -> None:
         code, printed = self._printed(KeyboardInterrupt(), capsys)

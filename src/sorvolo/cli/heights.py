@@ -13,7 +13,13 @@ from rich.markup import escape
 from rich.table import Table
 
 from sorvolo.cli.options import Area, AsJson, Flight, OutFile, SiteArgument
-from sorvolo.cli.printing import TO_CHECK, print_json, read_json, show_path
+from sorvolo.cli.printing import (
+    TO_CHECK,
+    print_json,
+    read_json,
+    show_notices_and_warnings,
+    show_path,
+)
 from sorvolo.cli.progress import ProgressReport
 from sorvolo.cli.sites import opened_site
 from sorvolo.survey.wording import counted
@@ -191,8 +197,7 @@ def show_heights(site: Path, report: Mapping[str, Any], console: Console) -> Non
         if text:
             table.add_row(name, text)
     console.print(table)
-    for warning in report["warnings"]:
-        console.print(f"[yellow]warning[/yellow] {escape(warning)}", highlight=False)
+    show_notices_and_warnings(report, console)
     folder = site / "flights" / report["flight"]
     for name, file in (
         ("heights", HeightFile.SURFACE),

@@ -90,7 +90,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # before NumPy is loaded: BLAS's threads only wait for each other over our small matrices
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     share_arenas()
-    global_options = GlobalOptions(debug=os.environ.get("SORVOLO_DEBUG", "") not in ("", "0"))
+    global_options = GlobalOptions()
     try:
         with _interrupts_repeated(), _warnings_in_one_line():
             app(
@@ -190,7 +190,7 @@ def options(
 
     New here? Run `sorvolo demo`. With a flight of your own: `sorvolo inspect`, then `map`, `compare` or `watch`.
     """
-    context.ensure_object(GlobalOptions).debug |= debug
+    context.ensure_object(GlobalOptions).debug = debug
     context.call_on_close(partial(IS_QUIET.reset, IS_QUIET.set(quiet)))
     if config is not None:
         try:

@@ -57,7 +57,7 @@ def show_path(name: str, path: Path, console: Console) -> None:
 
 def show_notices_and_warnings(report: Mapping[str, Any], console: Console) -> None:
     """Print a report's notices, then its warnings."""
-    for notice in report["notices"]:
+    for notice in report.get("notices", ()):
         console.print(f"[blue]note[/blue]     {escape(notice['text'])}", highlight=False)
     for warning in report["warnings"]:
         console.print(f"[yellow]warning[/yellow]  {escape(warning)}", highlight=False)
