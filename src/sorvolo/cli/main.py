@@ -99,7 +99,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 obj=global_options,
             )
     except SystemExit as stop:
-        code = stop.code if isinstance(stop.code, int) else 0 if stop.code is None else FAILED
+        code = stop.code if isinstance(stop.code, int) else FAILED
         if code == STOPPED:
             _print_line(global_options.stop_words)
         return code
@@ -117,10 +117,8 @@ def _interrupts_repeated() -> Iterator[None]:
     before = sys.unraisablehook
 
     def strike_again() -> None:
-        if hasattr(signal, "pthread_kill"):  # wakes a main thread that waits, too
-            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
-        else:
-            signal.raise_signal(signal.SIGINT)
+        # wakes a main thread that waits, too
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
 
     def look(lost: "UnraisableHookArgs") -> None:
         if not issubclass(lost.exc_type, KeyboardInterrupt):
