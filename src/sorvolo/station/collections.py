@@ -108,11 +108,15 @@ class Findings:
 
     def of_site(self, site_id: str) -> list[Track]:
         """What the watches of a site found that has a place on Earth, those of the newest watch first."""
+        return [each for run in self.watches(site_id) for each in self._of_run(run)]
+
+    def watches(self, site_id: str) -> list[str]:
+        """The newest watches of a site, also of one that has no map yet."""
         rows = self._state.rows(
             "SELECT id FROM runs WHERE site = ? AND mission = 'watch' ORDER BY made_at DESC LIMIT ?",
             (site_id, _MOST_RUNS),
         )
-        return [each for row in rows for each in self._of_run(row["id"])]
+        return [row["id"] for row in rows]
 
     def crop(self, site_id: str, finding_id: str) -> bytes:
         """The picture of a finding, JPEG. Raises Problem (404)."""
@@ -246,7 +250,7 @@ class SiteCollections:
         try:
             archive: Archive | None = self._shelf.open(site_id)
         except Problem:
-            if not tracks:
+            if not self._findings.watches(site_id):
                 raise
             archive = None
         marks = self._marks(site_id) if archive else []

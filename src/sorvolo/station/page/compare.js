@@ -37,7 +37,7 @@ export class Compare {
   build() {
     const pairs = this.versions.map((each) => [each.n, `${each.n}: ${dayOf(each)} (${each.flight})`]);
     const pick = (name) => choice(pairs, this[name], (n) => { this[name] = Number(n); this.apply(); }, { data: { which: name } });
-    const modes = [["swipe", "Swipe"], ["blink", "Blink"], ["difference", "Difference"], ["before", "Before"], ["after", "After"]];
+    const modes = [["swipe", "Swipe"], ["side", "Side by side"], ["blink", "Blink"], ["difference", "Difference"], ["before", "Before"], ["after", "After"]];
     fill(this.body,
       field("Before", this.pickBefore = pick("before")), field("After", this.pickAfter = pick("after")),
       el("div.segments", { role: "group", "aria-label": "How to compare" }, this.buttons = modes.map(([mode, words]) =>
@@ -109,11 +109,12 @@ export class Compare {
     press(this.buttons, (each) => each.dataset.mode === mode);
     if (!this.cover) return;
     this.cover.classList.toggle("difference", mode === "difference");
+    this.screen.stage.classList.toggle("side", mode === "side");
     this.put();
     const swiping = mode === "swipe";
     for (const each of [this.handle, this.edge]) each.hidden = !swiping;
     if (swiping) this.cut(this.split);
-    else this.showWhole(mode === "before" || mode === "difference");
+    else this.showWhole(["before", "difference", "side"].includes(mode));
     if (mode === "blink") {
       let on = false;
       this.blinking = setInterval(() => { on = !on; this.showWhole(on); }, BLINK_MS);
@@ -128,7 +129,7 @@ export class Compare {
 
   named(before = this.mode === "before") {
     const one = (words, n) => el("span", `${words}: ${dayOf(this.versions.find((each) => each.n === n))}`, el("small", ` (v${n})`));
-    fill(this.names, ["swipe", "difference"].includes(this.mode) ? [one("Before", this.before), one("After", this.after)] : before ? one("Before", this.before) : one("After", this.after));
+    fill(this.names, ["swipe", "side", "difference"].includes(this.mode) ? [one("Before", this.before), one("After", this.after)] : before ? one("Before", this.before) : one("After", this.after));
   }
 
   apply() {
@@ -196,6 +197,7 @@ export class Compare {
     clearInterval(this.blinking);
     this.untie?.();
     this.other?.close();
+    this.screen.stage.classList.remove("side");
     for (const each of [this.cover, this.handle, this.edge, this.names]) each?.remove();
     const { data, view } = this.screen;
     const newest = this.versions?.at(-1).n;

@@ -4,7 +4,7 @@ import { choices } from "./choices.js";
 import { choice, el, field, fill, quiet, tick } from "./dom.js";
 import { ALL, sortOf } from "./filters.js";
 import { badge } from "./feature_card.js";
-import { GROUPS, KINDS, CLASSES, PLACED, POD_RAMP } from "./map_style.js";
+import { FADED, GROUPS, KINDS, CLASSES, PLACED, POD_RAMP } from "./map_style.js";
 import { lookedAt } from "./sentence.js";
 import { chooseBaseMap } from "./base_map.js";
 import { grouped } from "./site_data.js";
@@ -15,8 +15,9 @@ export function layersPanel(screen, body) {
   const { data, view } = screen;
   const legend = el("div");
   const layers = el("fieldset.ticks", el("legend", "Layers"),
-    Object.entries(GROUPS).map(([group, [words]]) => tick(words, choices.get("layers")[group] ?? GROUPS[group][1],
-      (shown) => { view?.show(group, shown); refresh(); })));
+    Object.entries(GROUPS).map(([group, [words]]) => [tick(words, choices.get("layers")[group] ?? GROUPS[group][1],
+      (shown) => { view?.show(group, shown); refresh(); }),
+    FADED[group] && el("input", { type: "range", min: 0.1, max: 1, step: 0.05, "aria-label": `Opacity: ${words}`, ".value": String(view?.opacity(group) ?? 1), on: { input: (event) => view?.fade(group, Number(event.target.value)) } })]));
   const found = el("div");
   const coverage = el("div");
   fill(body, legend, found, coverage, layers, filterForm(data), base(screen));

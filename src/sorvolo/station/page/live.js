@@ -9,6 +9,7 @@ import * as words from "./words.js";
 
 const PLACED_FOR_MS = 3000; // a frame's place counts for so long before telemetry alone is shown
 const CLOCKS_AGREE_S = 0.5;
+const WORLD_ZOOM = 6; // a map of no ground yet
 const LONGEST_DELAY_S = 600; // more is a recording, or a clock that is wrong
 
 /** Follows the site's live events while its screen is shown; `figures(run)` are a mission's own. */
@@ -76,8 +77,6 @@ export class Live {
     // a recorded flight has none, and a drone whose clock is ahead of the station's has none that is known
     run.delay_s = delay_s > -CLOCKS_AGREE_S && delay_s < LONGEST_DELAY_S ? Math.max(0, delay_s) : undefined;
     if (position) run.trail.push(position.slice(0, 2));
-    const { view, data: site } = this.screen;
-    if (position && view && !site.detail.bounds_wgs84 && run.trail.length === 1) view.go(position.slice(0, 2), 18);
     this.drones.set(this.droneOf(event.run), { ...data, placed_at: Date.now() });
     this.drawSoon();
   }
@@ -110,7 +109,8 @@ export class Live {
     const trails = [...this.flown.values()].filter(({ trail }) => trail.length > 1);
     view.put("track", [...data.all.track, ...trails.map(({ trail }) => featureOf("LineString", trail))]);
     const { position } = this.drones.values().next().value ?? {};
-    if (this.follows && position && !view.isCentral(position.slice(0, 2))) view.go(position.slice(0, 2), view.map.getZoom());
+    const zoom = view.map.getZoom();
+    if (this.follows && position && (zoom < WORLD_ZOOM || !view.isCentral(position.slice(0, 2)))) view.go(position.slice(0, 2), zoom < WORLD_ZOOM ? 18 : zoom);
   }
 
   found(name, feature) {
@@ -138,14 +138,14 @@ export class Live {
     this.screen.goTo(feature);
   }
 
-  /** A person was found, by whatever mission: one banner a mission, which stays until it is closed. */
+  /** A person was found, by whatever mission: one banner, which stays until it is closed. */
   person(feature, local, run) {
     const mission = this.of(run);
     mission.people = (mission.people ?? 0) + 1;
-    mission.banner?.remove();
+    this.banner?.remove();
     const many = mission.people > 1 ? `${mission.people} people found, the last: ` : "Person found: ";
     const place = local || !feature.geometry ? "without a place on Earth" : words.place(middleOf(feature.geometry));
-    mission.banner = message(many + titleOf(feature), { kind: "alert person", todo: place,
+    this.banner = message(many + titleOf(feature), { kind: "alert person", todo: place,
       act: local || !feature.geometry ? null : button("Show", () => this.showFound(watched(feature, run))) });
     if (choices.get("sound")) beep();
   }

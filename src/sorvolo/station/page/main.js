@@ -173,7 +173,7 @@ function showSettings() {
       tick("Sound when something appears in an alert zone", choices.get("sound"), set("sound")),
       el("h3", "Keys"),
       el("dl.keys", [
-        ["1 2 3", "Live, Findings, Compare"], ["J / K", "next and previous finding"], ["C or Y / R / ? / U", "confirm, reject, not sure, withdraw"],
+        ["1 2 3", "Live, Findings, Compare"], ["4 5 6", "layers, measure, memory of a place"], ["F", "follow the drone"], ["J / K", "next and previous finding"], ["C or Y / R / ? / U", "confirm, reject, not sure, withdraw"],
         ["N", "note"], ["M", "show on the map"], ["B", "blink before and after"], ["O", "hide what was found, in Compare"], ["← →", "from change to change, in Compare"], ["Esc", "end drawing, close"],
       ].map(([key, words]) => [el("dt", key), el("dd", words)])),
       who ? el("details", el("summary", "Diagnostics"), el("p.note.diagnostics", `memory ${bytes((who.memory_mb ?? NaN) * 1e6)}, disk left ${bytes(who.disk_free_gb * 1e9)}, connection ${station.events?.state}`)) : null,

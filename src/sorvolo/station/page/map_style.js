@@ -26,6 +26,9 @@ export const GROUPS = {
   pod: ["Chance to have seen a person", false], drone: ["Drone and field of view", true], drawings: ["Drawings and zones", true],
 };
 
+/** What is laid over ground and can be made fainter: its property of opacity, and that at first. */
+export const FADED = { mosaic: ["raster-opacity", 1], coverage: ["fill-opacity", 0.75], pod: ["fill-opacity", 0.6] };
+
 /** The style with empty data; `dark` chooses the ground's colour. */
 export function mapStyle(dark) {
   const sources = Object.fromEntries(DATA.map((name) => [name, { type: "geojson", data: EMPTY }]));

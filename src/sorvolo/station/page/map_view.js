@@ -3,7 +3,7 @@
 import * as maplibre from "./vendor/maplibre-gl.mjs";
 import { siteUrl } from "./api.js";
 import { choices, isDark } from "./choices.js";
-import { GROUPS, groundColour, mapStyle, pictures } from "./map_style.js";
+import { FADED, GROUPS, groundColour, mapStyle, pictures } from "./map_style.js";
 import { distance_m, tileColumn, tileRow } from "./places.js";
 
 const EARTH_M_PER_PX = 156543.034; // of a tile of 256 px at zoom 0, on the equator
@@ -47,6 +47,7 @@ export class MapView {
     this.map.on("dragstart", onDrag);
     this.map.on("mousemove", (event) => onMove([event.lngLat.lng, event.lngLat.lat], this.hits(event.point)));
     this.ready = new Promise((done) => this.map.once("style.load", () => {
+      for (const name of ["coverage", "pod"]) this.map.setPaintProperty(name, FADED[name][0], this.opacity(name));
       for (const [name, picture] of Object.entries(pictures())) this.map.addImage(name, picture);
       for (const [name, features] of Object.entries(this.data)) this.put(name, features); // put before the style was there
       done();
@@ -61,6 +62,16 @@ export class MapView {
   show(group, visible, isKept = true) {
     if (isKept) choices.set("layers", { ...choices.get("layers"), [group]: visible });
     for (const id of this.groups[group] ?? []) if (this.map.getLayer(id)) this.map.setLayoutProperty(id, "visibility", visible ? "visible" : "none");
+  }
+
+  opacity(group) {
+    return choices.get("layers")[`${group}-opacity`] ?? FADED[group][1];
+  }
+
+  /** Make a layer over the ground fainter, for the next time, too. */
+  fade(group, opacity) {
+    choices.set("layers", { ...choices.get("layers"), [`${group}-opacity`]: opacity });
+    if (this.map.getLayer(group)) this.map.setPaintProperty(group, FADED[group][0], opacity);
   }
 
   /** Follow the page's colours and units. */
@@ -91,7 +102,7 @@ export class MapView {
       tiles: [location.origin + siteUrl(this.site.id, "tiles", version, "{z}/{x}/{y}.webp")], // URL() would escape the braces
       ...(bounds && !String(version).startsWith("live") ? { bounds } : {}),
     });
-    this.map.addLayer({ id: "mosaic", type: "raster", source: "mosaic", paint: { "raster-fade-duration": 0, "raster-resampling": "linear" },
+    this.map.addLayer({ id: "mosaic", type: "raster", source: "mosaic", paint: { "raster-fade-duration": 0, "raster-resampling": "linear", "raster-opacity": this.opacity("mosaic") },
       layout: { visibility: this.isShown("mosaic") ? "visible" : "none" } }, "coverage");
   }
 

@@ -46,9 +46,13 @@ export function sentence({ link, loaded, runs, objects, changes, pod, versions, 
     return parts;
   }
   const running = runs.filter(({ state }) => state === "running");
-  for (const run of running) {
-    const isFlying = Boolean(run.input?.stream || run.input?.stream_url) && !run.progress?.landed;
-    say(run.progress?.landed ? "Landed, searching the rest" : `${isFlying ? "Flying" : ACTS[run.mission]} ${duration((now - new Date(run.started_at)) / 1000)}`, "live");
+  const told = new Set(); // two missions on one flight are one flight
+  for (const run of running.toReversed()) {
+    const { input, mission, started_at: began } = run;
+    const hasLanded = runs.some((each) => each.progress?.landed && each.input?.stream === input?.stream && each.started_at >= began);
+    const name = hasLanded ? (mission === "watch" ? "Landed, searching the rest" : "Landed, finishing the map") : input?.stream || input?.stream_url ? "Flying" : ACTS[mission];
+    if (!told.has(name)) say(hasLanded ? name : `${name} ${duration((now - new Date(began)) / 1000)}`, "live");
+    told.add(name);
   }
   if (!running.length) {
     const newest = versions.at(-1);
@@ -58,12 +62,15 @@ export function sentence({ link, loaded, runs, objects, changes, pod, versions, 
   }
   say(...found(objects, pod, running, runs));
   const looked = lookedAt(pod);
-  say(looked ? `${percent(looked.share)} of the ground looked at (a person on it: ${Math.round(looked.from * 100)}–${percent(looked.to)})` : "how much was looked at is not measured", "coverage");
+  say(looked ? `${percent(looked.share)} of the ground looked at (a person on it: ${Math.round(looked.from * 100)}–${percent(looked.to)})` : "the chance to have seen a person is not measured", "coverage");
   const open = openOf(objects, changes).length;
   if (changes.length) say(counted(changes.length, "change"), "compare");
   if (open) say(`${open} to review`, "review");
   return parts;
 }
+
+/** Whether a mission's detector surely knows people: a model of one's own may not. */
+const looksForPeople = ({ options }) => /^(default|thermal)/.test(options?.model ?? "default");
 
 /** People first, then all else; where there is no person, why that says little. */
 function found(objects, pod, running, runs) {
@@ -75,9 +82,9 @@ function found(objects, pod, running, runs) {
   if (people) return [[counted(people, "person", "people"), ...more].join(", "), "review", "found"];
   const seen = (property) => objects.filter(({ properties }) => properties.class === "person" && property(properties)).length;
   const [rejected, gone] = [seen(({ review }) => review === "rejected"), seen(({ gone: isGone, review }) => isGone && review !== "rejected")];
-  const wasLooked = lookedAt(pod) || runs.some(({ mission, state }) => ["watch", "search"].includes(mission) && state === "finished");
+  const wasLooked = lookedAt(pod) || runs.some((run) => ["watch", "search"].includes(run.mission) && run.state === "finished" && looksForPeople(run));
   const why = rejected || gone
     ? [gone ? `${counted(gone, "person", "people")} on an earlier date only` : null, rejected ? `${counted(rejected, "person", "people")} found and rejected in review` : null].filter(Boolean).join(", ")
-    : running.length ? "no person found so far" : wasLooked ? "no person found in what was looked at" : "no search for people is on record";
+    : running.some(looksForPeople) ? "no person found so far" : wasLooked ? "no person found in what was looked at" : "no search for people is on record";
   return [[...more, why].join(", "), "review"];
 }

@@ -329,8 +329,9 @@ class SiteScreen {
   key(event) {
     if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest?.("input:not([type=range], [type=checkbox]), select, textarea, dialog")) return;
     if (this.opened?.key?.(event)) return event.preventDefault();
-    const name = Object.keys(ROOMS)[Number(event.key) - 1];
+    const name = Object.keys(ALL_PANELS)[Number(event.key) - 1];
     if (name) this.open(name, true);
+    else if (event.key.toLowerCase() === "f") this.follow(!this.live.follows);
     else if (event.key === "Escape") {
       if (this.data.chosen) this.data.choose(null);
       else if (this.shown in TOOLS) this.open(this.room);

@@ -123,8 +123,8 @@ export class DroneVideo {
 
   /** No pictures come, and why. */
   off(why) {
-    this.isOff = true;
     fill(this.delay, why);
+    this.pane.dataset.off = why;
   }
 
   connect() {
@@ -149,7 +149,7 @@ export class DroneVideo {
   /** Where the drone is, by its own telemetry; whether its flight is over, or the connection to it dead. */
   async ask() {
     const quiet_s = (performance.now() - this.heard_at) / 1000;
-    if (quiet_s > QUIET_S && !this.isOff) fill(this.delay, `no picture for ${number(quiet_s, 0)} s`);
+    if (quiet_s > QUIET_S && !this.pane.dataset.off) fill(this.delay, `no picture for ${number(quiet_s, 0)} s`);
     try {
       const asked_us = Date.now() * 1000;
       const state = await get(this.url);
@@ -175,7 +175,7 @@ export class DroneVideo {
   packet(data) {
     const pts_us = this.fmp4 ? null : Number(new DataView(data).getBigInt64(0));
     if (pts_us !== null) this.newest = { pts_us, at: performance.now() };
-    this.isOff = false;
+    delete this.pane.dataset.off;
     this.cameAlive = true;
     this.heard_at = performance.now();
     this.show.take(this.fmp4 ? new Uint8Array(data) : new Uint8Array(data, STAMP_BYTES), pts_us);
