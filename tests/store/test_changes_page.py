@@ -280,7 +280,9 @@ def test_a_phone_and_paper_show_many_changes_in_little_room() -> None:
         assert page.evaluate("document.documentElement.scrollWidth") <= 390
         assert page.evaluate("document.documentElement.scrollHeight") < 6_500
         page.emulate_media(media="print")
-        styles = "each => [getComputedStyle(each).overflow, getComputedStyle(each).printColorAdjust]"
+        styles = (
+            "each => [getComputedStyle(each).overflow, getComputedStyle(each).printColorAdjust]"
+        )
         assert page.locator(".overview").locator("..").evaluate(styles) == ["visible", "exact"]
         last = page.locator("article").last.bounding_box()  # in a group that is folded on a screen
         assert last is not None and last["height"] > 0
