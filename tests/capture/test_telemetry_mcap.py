@@ -1,8 +1,10 @@
 """MCAP recordings, written by mcap's own writers: ROS 2, protobuf and JSON fixes; cut, empty, of several topics."""
 
+import importlib
 import io
 import json
 import sys
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -165,3 +167,20 @@ def test_without_the_extra_the_line_to_install_is_named(
     monkeypatch.setitem(sys.modules, "mcap.reader", None)
     with pytest.raises(InputError, match=r"MCAP recording.*pip install 'sorvolo\[logs\]'"):
         read_telemetry(tmp_path / "a.mcap")
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_a_small_chunk_of_many_bytes_is_not_unpacked(tmp_path: Path, compression: str) -> None:
+    """Nor is its stated size believed."""
+    records = pytest.importorskip("mcap.records")
+    packed = importlib.import_module({"zstd": "zstandard", "lz4": "lz4.frame"}[compression])
+    data = packed.compress(bytes(200_000_000))
+    builder = importlib.import_module("mcap.data_stream").RecordBuilder()
+    records.Chunk(compression, data, 0, 0, 0, 10).write(builder)
+    path = tmp_path / "bomb.mcap"
+    path.write_bytes(b"\x89MCAP0\r\n" + builder.end())
+    tracemalloc.start()
+    with pytest.raises(InputError, match="cut or damaged"):
+        read_telemetry(path)
+    assert tracemalloc.get_traced_memory()[1] < 150e6
+    tracemalloc.stop()

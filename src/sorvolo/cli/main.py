@@ -193,7 +193,7 @@ def options(
     if config is not None:
         try:
             tables = tomllib.loads(config.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise InputError(f"{config}: no TOML file that can be read ({error})") from error
         context.default_map = _defaults(context.command, tables, f"{config}: ")
 

@@ -3,6 +3,7 @@
 import io
 import json
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -25,6 +26,8 @@ _FIXES = frozenset(
 _DATED_NS = (
     946_684_800 * 10**9
 )  # the year 2000: an earlier stamp counts from when a robot was switched on
+
+_LARGEST_CHUNK_BYTES = 50_000_000  # recorders write chunks of about 4 MB
 
 _Row = tuple[int, dict[str, float]]
 
@@ -80,12 +83,8 @@ class McapReader:
 
 def _fixes(data: bytes) -> Iterator[tuple[str, _Row | None]]:
     """Each fix with its topic, in the file's order; None for a message that cannot be decoded."""
-    from mcap.reader import NonSeekingReader
-
     decoders: dict[int, Callable[[bytes], Any] | None] = {}
-    # without the index at the end, which a cut file lacks
-    reader = NonSeekingReader(io.BytesIO(data))
-    for schema, channel, message in reader.iter_messages(log_time_order=False):
+    for schema, channel, message in _messages(data):
         if schema is None or schema.name not in _FIXES:
             continue
         if channel.id not in decoders:
@@ -95,6 +94,33 @@ def _fixes(data: bytes) -> Iterator[tuple[str, _Row | None]]:
             yield channel.topic, decode and _row(decode(message.data), message.log_time)
         except Exception:  # whatever damaged bytes lead the decoders to
             yield channel.topic, None
+
+
+def _messages(data: bytes) -> Iterator[tuple[Any, Any, Any]]:
+    """Each message with its schema and channel, in the file's order; EOFError for a chunk that no recorder writes."""
+    import lz4.frame
+    import zstandard
+    from mcap.records import Channel, Chunk, Message, Schema
+    from mcap.stream_reader import StreamReader, breakup_chunk
+
+    known: dict[Any, Any] = {}
+    # without the index at the end, which a cut file lacks
+    for record in StreamReader(io.BytesIO(data), emit_chunks=True).records:
+        inside = [record]
+        if isinstance(record, Chunk):
+            if opened := {"zstd": zstandard.open, "lz4": lz4.frame.open}.get(record.compression):
+                # some kilobytes may hold gigabytes, whatever size the chunk states
+                unpacked = opened(io.BytesIO(record.data)).read(_LARGEST_CHUNK_BYTES)
+                if len(unpacked) == _LARGEST_CHUNK_BYTES:
+                    raise EOFError
+                record = replace(record, compression="", data=unpacked)
+            inside = breakup_chunk(record)
+        for part in inside:
+            if isinstance(part, Schema | Channel):
+                known[type(part), part.id] = part
+            elif isinstance(part, Message):
+                channel = known[Channel, part.channel_id]
+                yield known.get((Schema, channel.schema_id)), channel, part
 
 
 def _decoder(encoding: str, schema: Any) -> Callable[[bytes], Any] | None:
