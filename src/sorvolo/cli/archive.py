@@ -6,12 +6,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from sorvolo.cli.options import AsJson, CatalogueAddress, OutFile, wanted_classes
-from sorvolo.cli.printing import FAILED, print_json
+from sorvolo.cli.printing import FAILED, Console, print_json
 from sorvolo.cli.progress import shown_work
 from sorvolo.cli.sites import show_copy
 from sorvolo.survey.wording import counted, counted_list

@@ -6,12 +6,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from sorvolo.cli.options import AsJson, Camera, Model, Resolution
-from sorvolo.cli.printing import FAILED, TO_CHECK, print_json, show_path
+from sorvolo.cli.printing import FAILED, TO_CHECK, Console, print_json, show_path
 from sorvolo.cli.progress import ProgressReport, shown_work
 from sorvolo.errors import SettingsError
 from sorvolo.survey.wording import counted
@@ -128,7 +127,6 @@ def _show_update(progress: ProgressReport, update: "BatchUpdate") -> None:
         words = f"try {row.tries} failed: {row.words}" if row.state == "waiting" else row.words
         progress.console.print(
             f"[{_COLOURS.get(state, 'red')}]{state:>9}[/]  {escape(row.source)}: {escape(words)}",
-            highlight=False,
             soft_wrap=True,
         )
     words = f"at {', '.join(update.running[:4])}" if update.running else ""
@@ -158,7 +156,7 @@ def _show(report: "BatchReport", places: list[Path], root: Path, console: Consol
     from sorvolo.cluster.batch import TABLE
 
     ended = ", ".join(f"{count:,} {name}" for name, count in report.counts().items())
-    console.print(f"{counted(len(report.rows), 'flight')}: {ended}", style="bold", highlight=False)
+    console.print(f"{counted(len(report.rows), 'flight')}: {ended}", style="bold")
     rows = report.rows
     if len(rows) > _MOST_ROWS:
         rows = tuple(row for row in rows if row.state != "done")
@@ -187,9 +185,8 @@ def _show(report: "BatchReport", places: list[Path], root: Path, console: Consol
     if rows:
         console.print(table)
     if len(rows) > _MOST_ROWS:
-        console.print(f"and {len(rows) - _MOST_ROWS:,} more", highlight=False)
+        console.print(f"and {len(rows) - _MOST_ROWS:,} more")
     console.print(
         f"tries: {report.tries}, of which {report.crashes} crashed; {report.seconds:.1f} s",
-        highlight=False,
     )
     show_path("table", root / TABLE, console)

@@ -4,11 +4,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 from rich.table import Table
 
 from sorvolo.cli.options import AsJson, OutFile
-from sorvolo.cli.printing import print_json
+from sorvolo.cli.printing import Console, print_json
 from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:

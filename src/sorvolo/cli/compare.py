@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -31,6 +30,7 @@ from sorvolo.cli.options import (
 )
 from sorvolo.cli.printing import (
     TO_CHECK,
+    Console,
     announce_people,
     place_heading,
     place_words,
@@ -266,7 +266,6 @@ def _show_progress(
                     f"[{colour}]{change.kind.value:>11}[/{colour}]  {escape(change.id)}: "
                     f"{what + ', ' if what else ''}{change.length_m:.1f} {unit} long, "
                     f"at {place_words(site, form)(middle_m)} (accuracy {change.sigma_m:.2f} {unit})",
-                    highlight=False,
                     soft_wrap=True,
                 )
             compared = f"{update.compared:,} of {counted(update.views, 'view')} compared"
@@ -294,17 +293,15 @@ def _show_result(
     console.print(
         f"Flight {escape(result['flight'])}: {comparison['headline']['text']}{dark}",
         style="bold",
-        highlight=False,
     )
     is_local = result["changes"].get("crs", "WGS84") is None  # no place on Earth, no metres
     if features:
-        console.print(escape(comparison["in_short"]), highlight=False, soft_wrap=True)
+        console.print(escape(comparison["in_short"]), soft_wrap=True)
         _show_changes(_in_rows(features, sort, least_m), console, form, is_local=is_local)
     views = comparison["views"]
     console.print(
         f"{views['compared']:,} of {counted(sum(views.values()), 'view')} compared in {result['seconds']:.1f} s; "
         f"memory at most {result['peak_memory_mb']:,.0f} MB",
-        highlight=False,
     )
     _show_coverage(comparison["coverage"], console, is_local=is_local)
     extension = comparison.get("extension") or {}
@@ -314,16 +311,14 @@ def _show_result(
         console.print(
             f"the map grew by {extension['area_m2']:,.0f} m2 from {counted(extension['frames'], 'frame')}"
             f"{same if more else ''}",
-            highlight=False,
         )
     if result["withdrawn"]:
         console.print(
             f"withdrawn (not confirmed by the whole flight): {', '.join(result['withdrawn'])}",
-            highlight=False,
             markup=False,
         )
     for reason, count in list(comparison["reasons"].items())[:_MAX_REASONS]:
-        console.print(f"  {counted(count, 'view')}: {escape(reason)}", highlight=False)
+        console.print(f"  {counted(count, 'view')}: {escape(reason)}")
     show_notices_and_warnings(result, console)
 
 
@@ -335,7 +330,6 @@ def _show_coverage(coverage: Mapping[str, Any], console: Console, *, is_local: b
         if area >= _MIN_GAP * coverage["compared_m2"]:
             console.print(
                 f"  not compared: {area_text(area, is_local=is_local)}, {GAP_WORDS[Gap(name)]}",
-                highlight=False,
             )
     if is_local:
         return
@@ -349,7 +343,7 @@ def _show_coverage(coverage: Mapping[str, Any], console: Console, *, is_local: b
         if not coverage["faint_known"]:
             faint = "too few faint ones were drawn to know"
         words = f"on half of the ground, plain ones are found from {plain_m:g} m; {faint}"
-    console.print(f"test objects drawn into these views: {words}", highlight=False)
+    console.print(f"test objects drawn into these views: {words}")
 
 
 def _in_rows(features: Sequence[Any], sort: str, least_m: float) -> list[list[Any]]:
@@ -411,5 +405,4 @@ def _show_changes(
     console.print(
         f"accuracy: 1 sigma; views: how many show it{alone if single else ''}; score: 0 to 1, how sure",
         style="dim",
-        highlight=False,
     )

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.table import Table
 
 from sorvolo import __version__
@@ -23,7 +22,7 @@ from sorvolo.cli.options import (
     class_names,
     names,
 )
-from sorvolo.cli.printing import print_json
+from sorvolo.cli.printing import Console, print_json
 from sorvolo.cli.progress import ProgressReport
 from sorvolo.cli.sites import opened_site
 from sorvolo.survey.wording import counted
@@ -213,7 +212,6 @@ def show_changes(console: Console, measured: "MeasuredChanges") -> None:
         console.print(
             f"{measured.flight}: class before and after, of the events of the right kind: {classes.right} right, "
             f"{classes.wrong} wrong, {classes.unnamed} without a class",
-            highlight=False,
         )
     for remark in measured.remarks:
         console.print(f"{measured.flight}: {remark}")
@@ -235,7 +233,6 @@ def _show_masks(console: Console, flight: str, masks: "MaskScores") -> None:
         f"{flight}: {counted(masks.compared, 'mask')} compared; without truth: {masks.only_found}; true "
         f"masks without a found one: {masks.only_true}; a frame is positive from "
         f"{counted(masks.least_px, 'changed pixel')} on",
-        highlight=False,
     )
 
 
@@ -265,7 +262,6 @@ def _show_events(console: Console, flight: str, scores: "EventScores", map_shift
         f"{flight}: found {_share(scores.found_share)}; {scores.false_per_hectare:.2f} false per hectare "
         f"({scores.compared_m2:,.0f} m2 compared); {scores.twice} reported twice; {scores.late} of "
         f"{scores.judged_late} late",
-        highlight=False,
     )
     if math.isfinite(scores.error_median_m):
         shift = (
@@ -278,7 +274,6 @@ def _show_events(console: Console, flight: str, scores: "EventScores", map_shift
             f"95 %{shift}; {_share(scores.within_two_sigma)} within twice the reported accuracy on the map (1 sigma, "
             f"median {scores.sigma_median_m:.2f} m), {_share(scores.world_within_two_sigma)} in the world (median "
             f"{scores.world_sigma_median_m:.2f} m)",
-            highlight=False,
         )
 
 
@@ -369,7 +364,6 @@ def _show_scores(console: Console, scores: "SetScores") -> None:
     if scores.groups > 1:
         console.print(
             f"{scores.pictures:,} pictures of {scores.groups} videos or flights; 95 % intervals over these",
-            highlight=False,
         )
     for remark in scores.remarks:
         console.print(f"{scores.name}: {remark}")

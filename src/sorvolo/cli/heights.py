@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from sorvolo.cli.options import Area, AsJson, Flight, OutFile, SiteArgument
 from sorvolo.cli.printing import (
     TO_CHECK,
+    Console,
     print_json,
     read_json,
     show_notices_and_warnings,

@@ -6,12 +6,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from sorvolo.cli.options import AsJson, OnlyFlight, PlaceFormat, PlaceFormatOption, SiteArgument
-from sorvolo.cli.printing import place_heading, place_words, print_json, site_of
+from sorvolo.cli.printing import Console, place_heading, place_words, print_json, site_of
 from sorvolo.cli.sites import opened_site
 from sorvolo.errors import SettingsError
 from sorvolo.survey.wording import counted
@@ -68,13 +67,13 @@ def history(
         console = Console()
         _show_versions(entries, console)
         if words := came_and_left(place.folder):
-            console.print(words, highlight=False, soft_wrap=True)
+            console.print(words, soft_wrap=True)
         if entries and not (of_map := site_of(place.folder)).is_local:
             origin = of_map.origin
             written = place_text(
                 origin.latitude_deg, origin.longitude_deg, Coordinates(coordinates)
             )
-            console.print(f"the map's origin lies at {written}", highlight=False)
+            console.print(f"the map's origin lies at {written}")
 
 
 def _show_versions(entries: Sequence["HistoryEntry"], console: Console) -> None:
@@ -103,9 +102,7 @@ def _show_versions(entries: Sequence["HistoryEntry"], console: Console) -> None:
     for entry in entries:
         table.add_row(*_cells(entry))
     console.print(table)
-    console.print(
-        "tiles: new or changed, of all; MB: written for this version", style="dim", highlight=False
-    )
+    console.print("tiles: new or changed, of all; MB: written for this version", style="dim")
 
 
 def _cells(entry: "HistoryEntry") -> tuple[str, ...]:

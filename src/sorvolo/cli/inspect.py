@@ -4,12 +4,11 @@ import math
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from sorvolo.cli.options import AsJson, Camera, Inputs, Telemetry
-from sorvolo.cli.printing import print_json
+from sorvolo.cli.printing import Console, print_json
 from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
@@ -51,7 +50,6 @@ def inspect(
             advice = f" [dim]-> {escape(finding.advice)}[/dim]" if finding.advice else ""
             console.print(
                 f"[{colour}]{finding.level:>8}[/{colour}]  {escape(finding.text)}{advice}",
-                highlight=False,
             )
         if not inspection.findings:
             console.print("[green]nothing is missing or suspicious: ready to map[/green]")

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -32,6 +31,7 @@ from sorvolo.cli.options import (
 )
 from sorvolo.cli.printing import (
     TO_CHECK,
+    Console,
     announce_people,
     print_json,
     read_json,
@@ -241,7 +241,7 @@ def show_reports(reports: Sequence[Mapping[str, Any]], site: Path, console: Cons
         for name, text in (*frame_rows, *_quality_rows(report)):
             if text:
                 table.add_row(name, text)
-        console.print(escape(report["headline"]["text"]), style="bold", highlight=False)
+        console.print(escape(report["headline"]["text"]), style="bold")
         announce_people(report["objects"], site, console)
         console.print(table)
         show_notices_and_warnings(report, console)

@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from sorvolo.cli.options import AsJson
-from sorvolo.cli.printing import FAILED, print_json
+from sorvolo.cli.printing import FAILED, Console, print_json
 from sorvolo.errors import InputError, SettingsError
 
 if TYPE_CHECKING:

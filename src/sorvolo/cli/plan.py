@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
-from rich.console import Console
 from rich.table import Table
 
 from sorvolo.cli.options import Area, AsJson, Camera, DjiDrone, FlightHeight, Model, size_px
-from sorvolo.cli.printing import print_json
+from sorvolo.cli.printing import Console, print_json
 from sorvolo.errors import SettingsError
 
 if TYPE_CHECKING:
@@ -187,7 +186,7 @@ def _show(
         table.add_row("written", str(path))
     console.print(table)
     for warning in _warnings(answers, settings):
-        console.print(f"[yellow]warning[/yellow]  {warning}", highlight=False)
+        console.print(f"[yellow]warning[/yellow]  {warning}")
 
 
 def _warnings(answers: "FlightAnswers", settings: "PlanSettings") -> list[str]:

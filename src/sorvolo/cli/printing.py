@@ -5,8 +5,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import rich.console
 import typer
-from rich.console import Console
 from rich.markup import escape
 
 from sorvolo.cli.options import PlaceFormat
@@ -26,12 +26,17 @@ STOPPED = 130
 """Exit code: stopped by Ctrl-C, as shells count it."""
 
 
+class Console(rich.console.Console):
+    """A terminal that colours no numbers and paths by itself."""
+
+    def __init__(self, *, stderr: bool = False) -> None:
+        super().__init__(stderr=stderr, highlight=False)
+
+
 def announce_person(words: str, console: Console) -> None:
     """Print that a person was found, with the terminal's bell."""
     console.bell()
-    console.print(
-        f"[bold red]PERSON FOUND[/bold red]  {escape(words)}", highlight=False, soft_wrap=True
-    )
+    console.print(f"[bold red]PERSON FOUND[/bold red]  {escape(words)}", soft_wrap=True)
 
 
 def announce_people(objects: Mapping[str, Any], folder: Path, console: Console) -> None:
@@ -52,15 +57,15 @@ def announce_people(objects: Mapping[str, Any], folder: Path, console: Console) 
 def show_path(name: str, path: Path, console: Console) -> None:
     """Print where a file is."""
     # in one piece, however long: people copy it
-    console.print(f"{name:>8}  {escape(str(path))}", soft_wrap=True, highlight=False)
+    console.print(f"{name:>8}  {escape(str(path))}", soft_wrap=True)
 
 
 def show_notices_and_warnings(report: Mapping[str, Any], console: Console) -> None:
     """Print a report's notices, then its warnings."""
     for notice in report.get("notices", ()):
-        console.print(f"[blue]note[/blue]     {escape(notice['text'])}", highlight=False)
+        console.print(f"[blue]note[/blue]     {escape(notice['text'])}")
     for warning in report["warnings"]:
-        console.print(f"[yellow]warning[/yellow]  {escape(warning)}", highlight=False)
+        console.print(f"[yellow]warning[/yellow]  {escape(warning)}")
 
 
 def print_json(value: Any) -> None:

@@ -5,9 +5,9 @@ from collections.abc import Callable, Generator, Iterable
 from contextvars import ContextVar
 from typing import TYPE_CHECKING, Self, TypeVar
 
-from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
+from sorvolo.cli.printing import Console
 from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ class ProgressReport:
             self._last_s = self._clock()
             so_far = f" {done:,} of {total:,}" if total else f" {done:,}" if done else ""
             line = f"{task}{so_far}{', ' + words if words else ''}"
-            self.console.print(line, highlight=False, markup=False, soft_wrap=True)
+            self.console.print(line, markup=False, soft_wrap=True)
         self._task = task
 
 
@@ -106,9 +106,7 @@ class Resumed:
 
     def _announce(self, words: str) -> None:
         if self._count:
-            self._console.print(
-                f"{words} {counted(self._count, 'frame')} of a stopped run", highlight=False
-            )
+            self._console.print(f"{words} {counted(self._count, 'frame')} of a stopped run")
             self._count = 0
 
 

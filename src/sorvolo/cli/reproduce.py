@@ -5,12 +5,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from sorvolo.cli.options import AsJson, OutFolder
-from sorvolo.cli.printing import TO_CHECK, print_json
+from sorvolo.cli.printing import TO_CHECK, Console, print_json
 from sorvolo.cli.progress import ProgressReport
 from sorvolo.cli.train import PresetOption
 from sorvolo.errors import SettingsError
@@ -124,7 +123,7 @@ def _rows(
             progress.show("reproducing, row", update.done, update.total, update.row.id)
             if update.row.missing:
                 words = f"missing  {update.row.id}: {update.row.missing}"
-                console.print(words, style="yellow", highlight=False, markup=False, soft_wrap=True)
+                console.print(words, style="yellow", markup=False, soft_wrap=True)
     return rows
 
 
@@ -147,14 +146,12 @@ def _show(document: dict[str, Any], page: Path) -> None:
     console = Console()
     if missing := document["missing"]:
         words = f"{len(missing)} of {counted(len(missing) + len(document['rows']), 'row')} could not be made"
-        console.print(
-            f"{words}; {page} has the reasons", style="yellow", highlight=False, soft_wrap=True
-        )
+        console.print(f"{words}; {page} has the reasons", style="yellow", soft_wrap=True)
     for sheet in reproduction_sheets(document["tables"]):
         if sheet.rows:
             table = Table(*map(escape, sheet.columns), title=escape(sheet.title), box=SIMPLE_HEAD)
             for row in sheet.rows:
                 table.add_row(*map(escape, row))
             console.print(table)
-    console.print(document["size"], highlight=False)
-    console.print(f"tables and figures: {page}", highlight=False, soft_wrap=True)
+    console.print(document["size"])
+    console.print(f"tables and figures: {page}", soft_wrap=True)

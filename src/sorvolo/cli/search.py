@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -25,6 +24,7 @@ from sorvolo.cli.options import (
 )
 from sorvolo.cli.printing import (
     TO_CHECK,
+    Console,
     announce_people,
     announce_person,
     print_json,
@@ -178,7 +178,7 @@ def _look_through_trees(
 
 
 def _show_under_trees(report: Mapping[str, Any], folder: Path, console: Console) -> None:
-    console.print(escape(report["headline"]["text"]), style="bold", highlight=False, soft_wrap=True)
+    console.print(escape(report["headline"]["text"]), style="bold", soft_wrap=True)
     for row in report["people"]:
         where = f"{row['latitude_deg']:.6f}, {row['longitude_deg']:.6f}"
         pictures = ", ".join(row["pictures"])
@@ -255,9 +255,7 @@ def _show(
     report: Mapping[str, Any], folder: Path, refly: tuple[Path, ...], console: Console
 ) -> None:
     text = report["headline"]["text"]
-    console.print(
-        escape(text[:1].upper() + text[1:]), style="bold", highlight=False, soft_wrap=True
-    )
+    console.print(escape(text[:1].upper() + text[1:]), style="bold", soft_wrap=True)
     table = Table("class", "POD", "90 % interval", "area", "seen", "sweep width", "coverage")
     for label, row in report["classes"].items():
         width = "" if row["sweep_width_m"] is None else f"{row['sweep_width_m']:.1f} m"

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.table import Table
 
 from sorvolo.cli.options import AsJson, Authority, Cot, CotCertificate
+from sorvolo.cli.printing import Console
 from sorvolo.cli.sites import show_copy
 from sorvolo.errors import InputError, SettingsError
 
@@ -241,7 +241,7 @@ def _announce(settings: "StationSettings", *, opens: bool) -> None:
         if not settings.public_url
         else f"{settings.public_url} (proxy to {settings.address})"
     )
-    console.print(f"station at {where}", soft_wrap=True, highlight=False, markup=False)
+    console.print(f"station at {where}", soft_wrap=True, markup=False)
     if not settings.is_loopback and settings.tls_cert is None:
         console.print(
             "[yellow]warning[/yellow]  without TLS: who listens in this network can read tokens and maps"

@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 
 from sorvolo import __version__
 from sorvolo.cli.compare import read_results, show_results
 from sorvolo.cli.map import show_reports
 from sorvolo.cli.options import AsJson, FlightHeight, Seed
-from sorvolo.cli.printing import read_json
+from sorvolo.cli.printing import Console, read_json
 from sorvolo.cli.progress import ProgressReport, show_progress
 from sorvolo.cli.sites import opened_site, run_on_site
 from sorvolo.errors import SettingsError
@@ -144,9 +143,7 @@ def simulate(
         typer.echo(json.dumps(asdict(last)))
     elif last is not None:
         words = f"{counted(last.pictures_done, 'picture')} with {counted(last.boxes, 'box')}"
-        Console().print(
-            f"{words} in {last.seconds:.0f} s: {folder}", highlight=False, soft_wrap=True
-        )
+        Console().print(f"{words} in {last.seconds:.0f} s: {folder}", soft_wrap=True)
 
 
 def _changed(
@@ -181,7 +178,6 @@ def _simulate_flights(
         console.print(
             f"{counted(last.frames_done, 'frame')} in {last.seconds:.0f} s: {folder}\n"
             f"the truth is in {folder / 'truth'}; the camera is in {folder / 'camera.xml'}",
-            highlight=False,
             soft_wrap=True,
         )
 
@@ -221,11 +217,9 @@ def demo(
     console, errors = Console(), Console(stderr=True)
     settings = preset("demo")
     if _is_simulated(simulation, settings):
-        console.print(
-            f"using the flights of an earlier demo: {simulation}", soft_wrap=True, highlight=False
-        )
+        console.print(f"using the flights of an earlier demo: {simulation}", soft_wrap=True)
     else:
-        console.print(f"simulating two flights: {simulation}", soft_wrap=True, highlight=False)
+        console.print(f"simulating two flights: {simulation}", soft_wrap=True)
         _show_progress(simulate_site(simulation, settings))
     console.print("mapping the first flight")
     with opened_site(str(site), writes=True) as place:
@@ -253,7 +247,7 @@ def demo(
                 f"{counted(events.false, 'false change')} reported."
             )
     for line in _next_steps(folder, site):
-        console.print(line, soft_wrap=True, highlight=False, markup=False)
+        console.print(line, soft_wrap=True, markup=False)
 
 
 def _next_steps(folder: Path, site: Path) -> list[str]:

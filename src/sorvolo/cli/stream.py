@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 
 from sorvolo.cli.options import AsJson, Authority, Camera, Telemetry
-from sorvolo.cli.printing import print_json
+from sorvolo.cli.printing import Console, print_json
 from sorvolo.cli.progress import ProgressReport
 from sorvolo.cli.serve import demand_extra
 from sorvolo.errors import SettingsError
@@ -201,11 +200,10 @@ def _show_end(
         words_of_end = "; ".join(words)
         console.print(
             f"Sent as {escape(report.stream)}: {words_of_end}",
-            highlight=False,
             soft_wrap=True,
         )
     for text in footage.notices():
-        console.print(f"  {escape(text)}", highlight=False, soft_wrap=True)
+        console.print(f"  {escape(text)}", soft_wrap=True)
 
 
 def _result(report: "StreamReport") -> dict[str, Any]:

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 
 from sorvolo.cli.options import (
@@ -19,7 +18,7 @@ from sorvolo.cli.options import (
     SiteOption,
     Telemetry,
 )
-from sorvolo.cli.printing import print_json, show_path
+from sorvolo.cli.printing import Console, print_json, show_path
 from sorvolo.cli.progress import show_progress
 from sorvolo.cli.sites import OpenedSite, opened_site, run_on_site
 from sorvolo.errors import InputError, SettingsError
@@ -124,15 +123,14 @@ def _check_source(source: str, site: str, *, has_own_options: bool) -> None:
 
 def _show(report: Mapping[str, Any], target: Path, console: Console) -> None:
     words = f"Telemetry of {escape(report['flight'])}, {counted(report['frames'], 'frame')}"
-    console.print(words, style="bold", highlight=False)
+    console.print(words, style="bold")
     for sentence in report["sentences"]:
-        console.print(f"  {sentence}", highlight=False, soft_wrap=True)
+        console.print(f"  {sentence}", soft_wrap=True)
     for warning in report["warnings"]:
-        console.print(f"[yellow]warning[/yellow]  {escape(warning)}", highlight=False)
+        console.print(f"[yellow]warning[/yellow]  {escape(warning)}")
     if report["cot_sent"] is not None:
         console.print(
             f"  {report['cot_sent']} of {report['frames']} Cursor on Target events sent",
-            highlight=False,
         )
     for name in report["files"]:
         show_path("kept" if report["diagnosed_before"] else "written", target / name, console)

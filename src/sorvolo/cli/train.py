@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 
 from sorvolo.cli.options import (
@@ -22,6 +21,7 @@ from sorvolo.cli.options import (
     class_names,
     names,
 )
+from sorvolo.cli.printing import Console
 from sorvolo.cli.progress import ProgressReport
 from sorvolo.cli.sites import SignalStop
 from sorvolo.errors import SettingsError
@@ -133,7 +133,7 @@ def _show(updates: "Iterator[TrainingUpdate]", stop: SignalStop) -> None:
     with ProgressReport(console, stays=True) as progress:
         for update in updates:
             for notice in update.notices:
-                console.print(f"[blue]note[/blue]     {escape(notice)}", highlight=False)
+                console.print(f"[blue]note[/blue]     {escape(notice)}")
             progress.show(
                 f"{update.words}, step" if update.step else update.words,
                 update.step,
@@ -148,7 +148,6 @@ def _show(updates: "Iterator[TrainingUpdate]", stop: SignalStop) -> None:
                 console.print(
                     f"{at} {update.check.step}: AP50 {_number(update.check.ap50)} ({by_class}), "
                     f"AP {_number(update.check.ap)}",
-                    highlight=False,
                 )
             if stop.until.is_set():
                 return

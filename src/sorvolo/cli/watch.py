@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -37,6 +36,7 @@ from sorvolo.cli.options import (
 )
 from sorvolo.cli.printing import (
     TO_CHECK,
+    Console,
     announce_person,
     place_heading,
     print_json,
@@ -186,9 +186,7 @@ def _show_progress(
                 if track.label == PERSON:
                     announce_person(f"{name}  {rest}", console)
                 else:
-                    console.print(
-                        f"[bold]{escape(name)}[/bold]  {rest}", highlight=False, soft_wrap=True
-                    )
+                    console.print(f"[bold]{escape(name)}[/bold]  {rest}", soft_wrap=True)
             delay = f"{1000 * update.latency_s:.0f} ms delay"
             progress.show(
                 "landed, searching the rest, frame" if update.has_landed else "watching, frame",
@@ -212,7 +210,6 @@ def _show_result(result: Mapping[str, Any], console: Console, form: PlaceFormat)
     console.print(
         f"Watch of {escape(result['flight'])}: {escape(result['headline']['text'])}",
         style="bold",
-        highlight=False,
     )
     if tracks:
         _show_tracks(tracks, console, form, on_ground=result["georeferenced"])
@@ -222,7 +219,6 @@ def _show_result(result: Mapping[str, Any], console: Console, form: PlaceFormat)
         f"{frames['detected']:,} of {counted(frames['read'], 'frame')} searched at "
         f"{result['frames_per_second'] or 0.0:.1f} frames/s{skipped}; delay {1000 * (latency['median'] or 0):.0f} ms "
         f"(median), {1000 * (latency['max'] or 0):.0f} ms at most",
-        highlight=False,
     )
     show_notices_and_warnings(result, console)
     folder = Path(result["folder"])
@@ -232,7 +228,7 @@ def _show_result(result: Mapping[str, Any], console: Console, form: PlaceFormat)
         show_path("searched", folder / "searched.geojson", console)
     else:
         show_path("list", folder / "tracks.json", console)
-        console.print(f"  {result['tracks']['note']}", style="dim", highlight=False)
+        console.print(f"  {result['tracks']['note']}", style="dim")
 
 
 def _show_tracks(
@@ -276,5 +272,4 @@ def _show_tracks(
     console.print(
         "score: 0 to 1, about the share that is right; accuracy: 1 sigma; views: frames that show it",
         style="dim",
-        highlight=False,
     )
