@@ -1,7 +1,7 @@
 """Hooks of MkDocs: the README becomes the front page, and links to files of the repository are checked.
 
-README, ARCHITECTURE, CONTRIBUTING and CHANGELOG become pages of the site. Any other link out of docs/ must name a file of
-the repository, else it is broken; on the site its text stays.
+README, ARCHITECTURE, CONTRIBUTING and CHANGELOG become pages of the site, and so do the public names of the package. Any
+other link out of docs/ must name a file of the repository, else it is broken; on the site its text stays.
 """
 
 import logging
@@ -39,6 +39,11 @@ def on_files(files: Files, config: Any) -> Files:
     for name, page in PAGES.items():
         text = _relinked((ROOT / name).read_text(encoding="utf-8"), "", page)
         files.append(File.generated(config, page, content=text))
+    names = (ROOT / "src" / "sorvolo" / "__init__.pyi").read_text(encoding="utf-8")
+    homes = re.findall(r"^from (\S+) import (\w+) as", names, re.M)
+    entries = [f"::: {home}.{name}" for home, name in sorted(homes, key=lambda each: each[1])]
+    text = "\n\n".join(["# All public names", *entries])
+    files.append(File.generated(config, "reference.md", content=text))
     return files
 
 

@@ -180,7 +180,7 @@ def evaluate_mosaic(
     """Measure the map in a site folder; the deviation from its own frames always, the rest where given.
 
     `truth` is a simulation's folder or the truth folder in it, `reference` a GeoTIFF of the same ground,
-    `positions` a CSV of camera places: frame,longitude_deg,latitude_deg[,height_m][,flight]. Raises
+    `positions` a CSV of camera places: frame, longitude_deg, latitude_deg, and maybe height_m and flight. Raises
     InputError for files that cannot be read or belong to another place, StoreError for a folder that is no
     site.
     """
