@@ -1,6 +1,8 @@
 """Models of unknown origin: run beside this process, and stopped where they ask for too much."""
 
+import io
 import os
+import struct
 import sys
 from pathlib import Path
 
@@ -9,7 +11,7 @@ import onnx
 import pytest
 from toy_models import draw, rectangle_model
 
-from sorvolo.detection.confined import confined_engine, described_confined
+from sorvolo.detection.confined import confined_engine, described_confined, read_message
 from sorvolo.detection.engine import describe, open_engine
 from sorvolo.detection.models import find_model
 from sorvolo.detection.session import Session, read_info
@@ -95,3 +97,14 @@ def test_the_process_ends_with_its_session(tmp_path: Path) -> None:
 def test_packaged_models_run_here() -> None:
     session = Session(find_model("default"), "cpu", 1)
     assert not hasattr(session._run, "__self__")
+
+
+@pytest.mark.parametrize("lengths", [(2**31, 0), (0, 2**32 - 1)])
+def test_a_message_that_announces_too_much_is_not_read(lengths: tuple[int, int]) -> None:
+    class Pipe(io.BytesIO):
+        def read(self, size: int | None = -1) -> bytes:
+            assert size == 8
+            return super().read(size)
+
+    with pytest.raises(EOFError):
+        read_message(Pipe(struct.pack("<II", *lengths)))

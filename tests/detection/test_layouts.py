@@ -9,7 +9,7 @@ from toy_models import onnx, rectangle_model, write_model
 
 from sorvolo.cli.main import main
 from sorvolo.detection.detector import Detector
-from sorvolo.detection.layouts import COCO
+from sorvolo.detection.layouts import COCO, _columns
 from sorvolo.detection.models import FOLDER_VARIABLE, find_model, installed_model, integrity
 from sorvolo.detection.session import Session, adopted, read_info
 from sorvolo.errors import InputError
@@ -206,3 +206,14 @@ def test_our_own_model_is_not_imported_again(tmp_path: Path) -> None:
     path = rectangle_model(tmp_path / "own.onnx")
     with pytest.raises(InputError, match="is a model of Sorvolo already"):
         adopted(path)
+
+
+def test_networks_of_91_classes_have_cocos_ids() -> None:
+    names = _columns((), 91, "net.onnx")
+    assert [names.index(each) for each in ("person", "bottle", "wine glass", "toothbrush")] == [
+        1,
+        44,
+        46,
+        90,
+    ]
+    assert len([each for each in names if each]) == len(COCO)

@@ -12,6 +12,7 @@ from sorvolo.heights.adjustment import (
     AdjustmentSettings,
     Priors,
     Scene,
+    _add_priors,
     adjust,
     height_deviations,
     matched_deviations,
@@ -254,3 +255,18 @@ def test_pictures_without_common_points_are_refused() -> None:
     noise = [rng.integers(0, 255, (240, 320), dtype=np.uint8) for _ in views]
     with pytest.raises(InputError, match="overlap"):
         solve_cameras(views, lambda number: noise[number])
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_an_attitude_of_the_map_pulls_a_camera_back_about_each_axis(axis: int) -> None:
+    upright = scene().rotations[:1]
+    turn = 0.01 * np.eye(3)[axis]
+    priors = Priors(np.zeros((1, 3)), np.full((1, 3), np.inf), upright)
+    turned = replace(
+        scene(), rotations=rotation_from_vector(turn[None]) @ upright, centres_m=np.zeros((1, 3))
+    )
+    system, gradient = np.zeros((6, 6)), np.zeros(6)
+    _add_priors(
+        turned, priors, AdjustmentSettings(attitude_sigma_deg=np.degrees(1.0)), system, gradient
+    )
+    np.testing.assert_allclose(gradient, [*-turn, 0, 0, 0], atol=1e-6)

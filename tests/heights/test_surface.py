@@ -470,3 +470,17 @@ def test_what_one_cell_knows_reaches_its_neighbours_in_all_eight_directions(step
     row, column = 4 + 3 * step[0], 4 + 3 * step[1]
     assert best[row, :, column].argmin() == 2
     assert np.ptp(best[row, :, column]) > 0.2
+
+
+def test_the_picture_of_heights_has_a_colour_for_each_height() -> None:
+    lattice = Lattice.over(np.array([[0.0, 0], [10, 10]]), SiteGrid.at(ORIGIN, 0.1, CRS))
+    rows, columns = lattice.points_m().shape[:2]
+    up_m = np.tile(np.linspace(0, 5, rows, dtype=np.float32)[:, None], columns)
+    slope = Surface(lattice, up_m, np.ones_like(up_m), np.ones(up_m.shape, bool))
+    colours = relief_picture(slope)[:, 0, :3].astype(int)[:: rows // 8]
+    assert np.abs(np.diff(colours, axis=0)).sum(axis=1).min() > 10
+
+
+def test_what_heights_a_tile_has_is_looked_for_in_coarser_pictures() -> None:
+    coarse_m, fine_m = SurfaceSettings().sizes_m(0.1)
+    assert coarse_m > fine_m == 0.1

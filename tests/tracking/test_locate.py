@@ -17,10 +17,11 @@ from sorvolo.lab.simulation.settings import (
     SimulationSettings,
 )
 from sorvolo.lab.simulation.truth import coco_boxes
-from sorvolo.survey.flight import CameraPrior
+from sorvolo.survey.flight import CameraModel, CameraPrior
 from sorvolo.survey.objects import CLASSES, TYPICAL_SIZE_M, Detections, no_detections
+from sorvolo.tracking.following import GroundFollower
 from sorvolo.tracking.laying import IMPOSSIBLE_SIZE, LocateSettings, locate
-from sorvolo.tracking.tracker import Tracker
+from sorvolo.tracking.tracker import Tracker, TrackerSettings
 
 CAMERA = Camera.from_angle_of_view(960, 540, 62.0)
 NADIR = site_from_gimbal_rotation(0.0, -90.0, 0.0)
@@ -276,3 +277,11 @@ def test_places_from_sixty_metres_are_as_good_as_they_state():
     print(f"rms {rms_m:.2f} m per axis, {100 * inside:.1f} % inside, {len(errors_m)} places")
     assert rms_m < 2.0
     assert 0.90 <= inside <= 0.99
+
+
+def test_a_pixel_covers_more_ground_the_farther_the_camera_looks():
+    model = CameraModel(CAMERA, "given", 0.01)
+    follower = GroundFollower(model, TrackerSettings(), None, knows_heading=True, is_video=True)
+    tilted = replace(PRIOR, rotation=site_from_gimbal_rotation(0.0, -30.0, 0.0))
+    assert follower.m_per_px(PRIOR) == pytest.approx(60 / CAMERA.fx_px)
+    assert follower.m_per_px(tilted) == pytest.approx(120 / CAMERA.fx_px)

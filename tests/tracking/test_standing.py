@@ -12,7 +12,7 @@ from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
 from sorvolo.survey.mosaic import PlacedFrame, Status
 from sorvolo.survey.objects import CLASSES, TYPICAL_SIZE_M, Detections
 from sorvolo.tracking.laying import LaidSighting, lay_on_ground, shows
-from sorvolo.tracking.standing import Fused, fitted_size_m, fuse
+from sorvolo.tracking.standing import Fused, _line, fitted_size_m, fuse
 
 CAMERA = Camera(960, 540, 800.0, 800.0, 479.5, 269.5, np.array([-0.1, 0.02, 0.0, 0.0, 0.0]))
 SECOND_NS = 10**9
@@ -453,3 +453,24 @@ def test_shows_only_what_is_whole_in_the_picture() -> None:
         False,
         False,
     ]
+
+
+@pytest.mark.parametrize(("pitch_deg", "is_laid"), [(-11.0, True), (-8.0, False)])
+def test_what_lies_farther_than_six_heights_is_not_laid(pitch_deg: float, is_laid: bool) -> None:
+    middle_px = np.array([CAMERA.width_px, CAMERA.height_px]) / 2
+    box = np.concatenate([middle_px - 3, middle_px + 3])[None]
+    seen = Detections(box, np.array([0.9]), np.array([0]), ("sheep",))
+    (laid,) = lay_on_ground(seen, placed(0, 0.0, 0.0, pitch_deg=pitch_deg))
+    assert (laid is not None) == is_laid
+
+
+def test_a_walker_goes_on_as_the_last_sightings_show() -> None:
+    places = [(1.0 * k, 0.0) for k in range(5)] + [(4.0, 1.0 * k) for k in range(1, 5)]
+    frames = [placed(k, east_m, north_m) for k, (east_m, north_m) in enumerate(places)]
+    middle_px = np.array([CAMERA.width_px, CAMERA.height_px]) / 2
+    box = np.concatenate([middle_px - 6, middle_px + 6])[None]
+    seen = Detections(box, np.array([0.9]), np.array([0]), ("person",))
+    laid = [lay_on_ground(seen, frame)[0] for frame in frames]
+    times_s = np.arange(len(places), dtype=float)
+    _, velocity_m_s, _ = _line(range(len(places)), laid, times_s, times_s[-1])  # type: ignore[arg-type]
+    np.testing.assert_allclose(velocity_m_s, [0, 1], atol=1e-6)

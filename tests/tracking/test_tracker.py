@@ -338,3 +338,13 @@ def test_settings_and_columns_that_do_not_fit_are_refused():
         TrackerSettings(least_views=0)
     with pytest.raises(GeometryError, match="appearance"):
         Tracker().update([sighting(0, [0, 0])], time_ns=0, appearance=np.zeros((2, 3)))
+
+
+def test_a_car_that_drove_out_of_the_picture_is_looked_for_where_it_went():
+    """By clocks that count from 1970, as telemetry's do."""
+    tracker = Tracker()
+    for frame in (*range(12), 25):
+        place_m = np.array([2.4 * frame, 0.0])
+        seen = replace(car(frame, place_m), time_ns=17 * 10**17 + int(frame * 2e8))
+        tracker.update([seen], time_ns=seen.time_ns, footprint_m=place_m + AROUND_M / 10)
+    assert len(tracker.finish()) == 1
