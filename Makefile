@@ -86,6 +86,6 @@ $(VENV)/.built: pyproject.toml setup.py $(wildcard src/sorvolo/kernels/*.?pp) | 
 	touch $@
 
 $(VENV)/.training: requirements-test.lock requirements-training.lock requirements-notebooks.lock | $(VENV)/.locked
-	$(BIN)/python -m $(PIP) -r requirements-test.lock
-	$(BIN)/python -m $(PIP) -r requirements-training.lock -r requirements-notebooks.lock
+	$(BIN)/python -m $(PIP) -r requirements-test.lock -r requirements-notebooks.lock
+	$(BIN)/python -m $(PIP) -r requirements-training.lock
 	touch $@

@@ -201,7 +201,10 @@ def test_locks_that_are_installed_together_agree() -> None:
 
 
 @pytest.mark.parametrize(
-    "lock", [*TOGETHER[:2], "requirements-build.lock", "requirements-docs.lock"]
+    "lock",
+    sorted(
+        path.name for path in ROOT.glob("requirements*.lock") if "training" not in path.name
+    ),  # torch's index differs by machine
 )
 def test_every_package_of_a_lock_has_hashes_and_no_address(lock: str) -> None:
     text = (ROOT / lock).read_text(encoding="utf-8")
