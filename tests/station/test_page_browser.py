@@ -26,11 +26,13 @@ pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 import av
 import numpy as np
 from browsers import WAIT_MS, Served, Watched, chromium, context_of
+from fake_changes import fake_change
 from live_sender import free_port, sending, udp_url
 from PIL import Image
 from playwright.sync_api import expect
 from pyproj import Geod
 from stream_flights import write_track, write_video
+from test_changes_page import page_of
 from test_stream_messages import units
 from watch_runs import watch_run
 from websockets.sync.client import ClientConnection, connect
@@ -48,7 +50,7 @@ from sorvolo.store.exports.change_files import crop_names
 from sorvolo.store.images import jpeg_from_image, png_from_rgba
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.files import HeightFile
-from sorvolo.survey.findings import Verdict
+from sorvolo.survey.findings import ChangeKind, Verdict
 from waiting import wait_for
 
 expect.set_options(timeout=WAIT_MS)
@@ -2109,3 +2111,25 @@ def serious(page: Any, within: str = "document", rules: list[str] | None = None)
         for each in result["violations"]
         if each["impact"] in ("serious", "critical")
     ]
+
+
+def test_a_phone_and_paper_show_many_changes_in_little_room(browser: Any) -> None:
+    """A change was a page of paper and a screen of its own; colours and the whole list are printed."""
+    changes = [
+        fake_change(
+            k + 1, kind=list(ChangeKind)[k % 5], east_m=k % 13 - 6, north_m=k % 9 - 4, size_m=0.5
+        )
+        for k in range(12)
+    ]
+    page = context_of(browser, viewport={"width": 390, "height": 844}).new_page()
+    page.set_content(page_of(changes))
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    assert page.evaluate("document.documentElement.scrollHeight") < 4_400
+    page.emulate_media(media="print")
+    styles = "each => [getComputedStyle(each).overflow, getComputedStyle(each).printColorAdjust]"
+    assert page.locator(".overview").locator("..").evaluate(styles) == ["visible", "exact"]
+    last = page.locator("article").last.bounding_box()  # in a group that is folded on a screen
+    assert last is not None and last["height"] > 0
+    printed = page.pdf(format="A4", prefer_css_page_size=True)
+    assert len(re.findall(rb"/Type\s*/Page\b", printed)) <= 5
+    page.context.close()

@@ -265,26 +265,3 @@ def test_crops_stay_small_when_there_are_many() -> None:
     changes = [fake_change(k + 1) for k in range(100)]
     crops = {each.id: (large, large) for each in changes}
     assert len(changes_page({}, stored_changes("b", changes), None, None, SITE, crops)) < 9_000_000
-
-
-def test_a_phone_and_paper_show_many_changes_in_little_room() -> None:
-    """A change was a page of paper and a screen of its own; colours and the whole list are printed."""
-    browsers = pytest.importorskip("browsers")
-    changes = [
-        fake_change(k + 1, kind=KINDS[k % 5], east_m=k % 13 - 6, north_m=k % 9 - 4, size_m=0.5)
-        for k in range(12)
-    ]
-    with browsers.chromium() as browser:
-        page = browser.new_context(viewport={"width": 390, "height": 844}).new_page()
-        page.set_content(page_of(changes))
-        assert page.evaluate("document.documentElement.scrollWidth") <= 390
-        assert page.evaluate("document.documentElement.scrollHeight") < 6_500
-        page.emulate_media(media="print")
-        styles = (
-            "each => [getComputedStyle(each).overflow, getComputedStyle(each).printColorAdjust]"
-        )
-        assert page.locator(".overview").locator("..").evaluate(styles) == ["visible", "exact"]
-        last = page.locator("article").last.bounding_box()  # in a group that is folded on a screen
-        assert last is not None and last["height"] > 0
-        printed = page.pdf(format="A4", prefer_css_page_size=True)
-    assert len(re.findall(rb"/Type\s*/Page\b", printed)) <= 5
