@@ -28,23 +28,36 @@ from sorvolo.station.tokens import Holder, Role
 # upper limits of the counted times, about threefold each, around the targets of tiles and pages
 _SECONDS = (0.005, 0.01, 0.03, 0.06, 0.1, 0.3, 1.0, 3.0, 10.0)
 
-RunCounts = Callable[[], Mapping[str, int]]
-"""How many missions there are in each state."""
+_OF_STREAM = (
+    (GaugeMetricFamily, "stream_connected", "Whether the drone sends"),
+    (CounterMetricFamily, "stream_frames", "Pictures taken from a drone"),
+    (GaugeMetricFamily, "stream_frames_per_second", "Pictures a second"),
+    (GaugeMetricFamily, "stream_kept_bytes", "What is kept of a stream"),
+    (GaugeMetricFamily, "stream_viewers", "Browsers that watch"),
+)
+_OF_RECEIVER = (
+    (CounterMetricFamily, "relay_delivered", "Events a receiver took"),
+    (CounterMetricFamily, "relay_lost", "Events a receiver refused, or too old"),
+    (GaugeMetricFamily, "relay_waiting", "Events not looked at yet"),
+)
 
-Relays = Callable[[], Sequence[RelayFigures]]
 
+class StationMetrics(Collector):
+    """The figures of one station, in a registry of its own. `count` adds a request; others are read when asked for.
 
-class StationMetrics:
-    """The figures of one station, in a registry of its own. `count` adds a request."""
+    `runs`: how many missions there are in each state.
+    """
 
     def __init__(
         self,
         settings: StationSettings,
         ingest: Ingest,
         events: EventLog,
-        runs: RunCounts,
-        relays: Relays = lambda: (),
+        runs: Callable[[], Mapping[str, int]],
+        relays: Callable[[], Sequence[RelayFigures]],
     ) -> None:
+        self._settings, self._ingest, self._events = settings, ingest, events
+        self._runs, self._relays = runs, relays
         self.registry = CollectorRegistry()
         self._requests = Counter(
             "sorvolo_http_requests",
@@ -59,44 +72,12 @@ class StationMetrics:
             registry=self.registry,
             buckets=_SECONDS,
         )
-        self.registry.register(_StationCollector(settings, ingest, events, runs, relays))
+        self.registry.register(self)
 
     def count(self, route: str, method: str, status: int, seconds: float) -> None:
         """A request was answered; `route` is the route's pattern, so that ids make no new series."""
         self._requests.labels(route, method, str(status)).inc()
         self._seconds.labels(route).observe(seconds)
-
-
-def metrics_routes(metrics: StationMetrics) -> APIRouter:
-    """`/metrics`, for whoever may view the station."""
-    router = APIRouter(tags=["station"])
-
-    @router.get("/metrics", dependencies=[needs(Role.VIEW)], response_class=Response)
-    def show_metrics() -> Response:
-        """All figures in Prometheus' text format."""
-        return Response(generate_latest(metrics.registry), media_type=CONTENT_TYPE_LATEST)
-
-    return router
-
-
-class _StationCollector(Collector):
-    """Reads the figures when they are asked for."""
-
-    def __init__(
-        self,
-        settings: StationSettings,
-        ingest: Ingest,
-        events: EventLog,
-        runs: RunCounts,
-        relays: Relays,
-    ) -> None:
-        self._settings, self._ingest, self._events, self._runs, self._relays = (
-            settings,
-            ingest,
-            events,
-            runs,
-            relays,
-        )
 
     def collect(self) -> Iterator[Metric]:
         """See `prometheus_client.registry.Collector`."""
@@ -118,51 +99,46 @@ class _StationCollector(Collector):
                 "sorvolo_memory_bytes", "Resident memory of the station's process", memory
             )
         yield CounterMetricFamily("sorvolo_events", "Events so far", self._events.last)
-        yield from self._of_streams()
-        yield from self._of_relays()
+        ingest = self._ingest
+        yield from _families(
+            "stream",
+            _OF_STREAM,
+            {
+                state["stream"]: (
+                    state["is_connected"],
+                    state.get("frames", 0),
+                    (state["is_connected"] and state.get("frames_per_s")) or 0.0,
+                    ingest.kept_bytes(state["stream"]),
+                    ingest.viewers(state["stream"]),
+                )
+                for state in ingest.streams()
+            },
+        )
+        relays = {each.name: (each.delivered, each.lost, each.waiting) for each in self._relays()}
+        yield from _families("receiver", _OF_RECEIVER, relays)
 
-    def _of_streams(self) -> Iterator[Metric]:
-        connected = GaugeMetricFamily(
-            "sorvolo_stream_connected", "Whether the drone sends", labels=["stream"]
-        )
-        frames = CounterMetricFamily(
-            "sorvolo_stream_frames", "Pictures taken from a drone", labels=["stream"]
-        )
-        rate = GaugeMetricFamily(
-            "sorvolo_stream_frames_per_second", "Pictures a second", labels=["stream"]
-        )
-        size = GaugeMetricFamily(
-            "sorvolo_stream_kept_bytes", "What is kept of a stream", labels=["stream"]
-        )
-        viewers = GaugeMetricFamily(
-            "sorvolo_stream_viewers", "Browsers that watch", labels=["stream"]
-        )
-        for state in self._ingest.streams():
-            label = [state["stream"]]
-            connected.add_metric(label, float(state["is_connected"]))
-            frames.add_metric(label, state.get("frames", 0))
-            rate.add_metric(
-                label, (state.get("frames_per_s") or 0.0) if state["is_connected"] else 0.0
-            )
-            size.add_metric(label, self._ingest.kept_bytes(state["stream"]))
-            viewers.add_metric(label, self._ingest.viewers(state["stream"]))
-        yield from (connected, frames, rate, size, viewers)
 
-    def _of_relays(self) -> Iterator[Metric]:
-        delivered = CounterMetricFamily(
-            "sorvolo_relay_delivered", "Events a receiver took", labels=["receiver"]
-        )
-        lost = CounterMetricFamily(
-            "sorvolo_relay_lost", "Events a receiver refused, or too old", labels=["receiver"]
-        )
-        waiting = GaugeMetricFamily(
-            "sorvolo_relay_waiting", "Events not looked at yet", labels=["receiver"]
-        )
-        for each in self._relays():
-            delivered.add_metric([each.name], each.delivered)
-            lost.add_metric([each.name], each.lost)
-            waiting.add_metric([each.name], each.waiting)
-        yield from (delivered, lost, waiting)
+def _families(
+    label: str, kinds: Sequence[tuple[Any, str, str]], items: Mapping[str, Sequence[float]]
+) -> Iterator[Metric]:
+    """A family of each kind, with the values of all items."""
+    for column, (kind, name, words) in enumerate(kinds):
+        family = kind(f"sorvolo_{name}", words, labels=[label])
+        for item, values in items.items():
+            family.add_metric([item], float(values[column]))
+        yield family
+
+
+def metrics_routes(metrics: StationMetrics) -> APIRouter:
+    """`/metrics`, for whoever may view the station."""
+    router = APIRouter(tags=["station"])
+
+    @router.get("/metrics", dependencies=[needs(Role.VIEW)], response_class=Response)
+    def show_metrics() -> Response:
+        """All figures in Prometheus' text format."""
+        return Response(generate_latest(metrics.registry), media_type=CONTENT_TYPE_LATEST)
+
+    return router
 
 
 def memory_bytes() -> int | None:
