@@ -698,9 +698,11 @@ def test_a_change_and_an_object_are_tapped_on_the_map(browser: Any, served: Serv
     show(watched, served, "findings")
     change = changes(served)[2]
     page.locator(f".strip button[data-id='{change['id']}']").click()
-    page.keyboard.press("m")  # to its place, in the middle of the map, beside the card
+    page.keyboard.press("m")  # to its place, in the middle of what the card leaves of the map
+    over, ground = card.bounding_box(), page.locator(".map-canvas").bounding_box()
+    at = (over["x"] + over["width"] + ground["x"] + ground["width"]) / 2
     card.get_by_role("button", name="Close").click()
-    tap_middle_until(page, card)
+    tap_until(page, card, at)
     tapped = card.locator("dt", has_text=re.compile("^Id$")).locator("+ dd").inner_text()
     card.get_by_role("button", name="Confirm").click()
     card.locator(".verdict.confirmed").wait_for()
@@ -725,16 +727,16 @@ def test_a_change_and_an_object_are_tapped_on_the_map(browser: Any, served: Serv
             }
         },
     )
-    tap_middle_until(page, card.locator("h3", has_text=re.compile("boat", re.IGNORECASE)))
+    tap_until(page, card.locator("h3", has_text=re.compile("boat", re.IGNORECASE)), at)
     assert watched.faults == []
     context.close()
 
 
-def tap_middle_until(page: Any, shown: Any) -> None:
-    """Tap the middle of the map again and again, until what lies there is shown: the map has drawn it by then."""
+def tap_until(page: Any, shown: Any, x: float) -> None:
+    """Tap half-way up the map again and again, until what lies there is shown: the map has drawn it by then."""
     box = page.locator(".map-canvas").bounding_box()
     for _ in range(200):
-        page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+        page.mouse.click(x, box["y"] + box["height"] / 2)
         page.wait_for_timeout(100)
         if shown.count():
             return
@@ -925,7 +927,7 @@ def test_of_two_missions_at_once_the_map_s_figures_are_shown(
         }
         happens("run-watch", "person.found", {"feature": person, "is_local": False})
     expect(page.locator(".message.person")).to_have_count(1)
-    expect(page.locator(".message.person")).to_contain_text("2 people found, the last: person")
+    expect(page.locator(".message.person")).to_contain_text("2 people found, the last:")
     happens("run-watch", "run.finished", {"headline": "two cars found"})
     page.locator(".message", has_text="two cars found").wait_for()
     expect(mapping).to_have_text("3 of 5 frames matched, 2 rejected")

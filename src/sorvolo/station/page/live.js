@@ -143,9 +143,8 @@ export class Live {
     const mission = this.of(run);
     mission.people = (mission.people ?? 0) + 1;
     this.banner?.remove();
-    const many = mission.people > 1 ? `${mission.people} people found, the last: ` : "Person found: ";
     const place = local || !feature.geometry ? "without a place on Earth" : words.place(middleOf(feature.geometry));
-    this.banner = message(many + titleOf(feature), { kind: "alert person", todo: place,
+    this.banner = message(mission.people > 1 ? `${mission.people} people found, the last:` : "Person found", { kind: "alert person", todo: place,
       act: local || !feature.geometry ? null : button("Show", () => this.showFound(watched(feature, run))) });
     if (choices.get("sound")) beep();
   }

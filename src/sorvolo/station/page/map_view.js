@@ -163,27 +163,30 @@ export class MapView {
     return { middle: [lng, lat], width_m: distance_m(west, east), bearing_deg: this.map.getBearing() };
   }
 
-  /** How much of the map's lower part a sheet or a card of a phone lies over, px. */
+  /** How much of the map's lower part a sheet or a card of a phone lies over, and of its left part a card beside it, px. */
   covered() {
     const whole = this.map.getContainer().getBoundingClientRect();
-    const over = [...document.querySelectorAll(".card-over, .panel, #messages")].map((each) => each.getBoundingClientRect()).filter((box) => box.height && box.width > whole.width * 0.8 && box.bottom > whole.bottom - whole.height / 3);
-    return Math.max(0, ...over.map((box) => whole.bottom - box.top));
+    const boxes = [...document.querySelectorAll(".card-over, .panel, #messages")].map((each) => each.getBoundingClientRect()).filter((box) => box.height);
+    const [wide, narrow] = [true, false].map((is) => boxes.filter((box) => box.width > whole.width * 0.8 === is));
+    const low = wide.filter((box) => box.bottom > whole.bottom - whole.height / 3).map((box) => whole.bottom - box.top);
+    const left = narrow.filter((box) => box.left > whole.left).map((box) => box.right - whole.left);
+    return { low: Math.min(Math.max(0, ...low), whole.height * 0.7), left: Math.min(Math.max(0, ...left), whole.width * 0.7) };
   }
 
   /** Move to a [lon, lat] or to bounds, where nothing lies over the map. */
   go(place, zoom = 20.5, atOnce = false) {
     const still = atOnce || matchMedia("(prefers-reduced-motion: reduce)").matches;
-    const covered = Math.min(this.covered(), this.map.getContainer().clientHeight * 0.7);
-    if (place.length === 4) this.map.fitBounds(place, { padding: { top: 40, left: 40, right: 40, bottom: 40 + covered }, maxZoom: 21.5, animate: !still });
-    else this.map.easeTo({ center: place, zoom: Math.max(this.map.getZoom(), zoom), offset: [0, -covered / 2], animate: !still, duration: 500 });
+    const { low, left } = this.covered();
+    if (place.length === 4) this.map.fitBounds(place, { padding: { top: 40, left: 40 + left, right: 40, bottom: 40 + low }, maxZoom: 21.5, animate: !still });
+    else this.map.easeTo({ center: place, zoom: Math.max(this.map.getZoom(), zoom), offset: [left / 2, -low / 2], animate: !still, duration: 500 });
   }
 
   /** Whether a place lies in the middle half of what is seen of the map. */
   isCentral(place) {
     const { x, y } = this.map.project(place);
     const { clientWidth: width, clientHeight: height } = this.map.getContainer();
-    const seen = height - Math.min(this.covered(), height * 0.7);
-    return Math.abs(x - width / 2) < width / 4 && Math.abs(y - seen / 2) < seen / 4;
+    const { low, left } = this.covered();
+    return Math.abs(x - (width + left) / 2) < (width - left) / 4 && Math.abs(y - (height - low) / 2) < (height - low) / 4;
   }
 
   shows([west, south, east, north]) {
@@ -196,7 +199,8 @@ export class MapView {
     this.map.resize();
     const { x, y } = this.map.project(place);
     const { clientWidth: width, clientHeight: height } = this.map.getContainer();
-    if (x < 20 || y < 20 || x > width - 20 || y > height - this.covered() - 20) this.go(place, 0, true);
+    const { low, left } = this.covered();
+    if (x < left + 20 || y < 20 || x > width - 20 || y > height - low - 20) this.go(place, 0, true);
   }
 
   close() {

@@ -50,7 +50,7 @@ export function sentence({ link, loaded, runs, objects, changes, pod, versions, 
   for (const run of running.toReversed()) {
     const { input, mission, started_at: began } = run;
     const hasLanded = runs.some((each) => each.progress?.landed && each.input?.stream === input?.stream && each.started_at >= began);
-    const name = hasLanded ? (mission === "watch" ? "Landed, searching the rest" : "Landed, finishing the map") : input?.stream || input?.stream_url ? "Flying" : ACTS[mission];
+    const name = hasLanded ? (running.some((each) => each.mission === "watch") ? "Landed, searching the rest" : "Landed, finishing the map") : input?.stream || input?.stream_url ? "Flying" : ACTS[mission];
     if (!told.has(name)) say(hasLanded ? name : `${name} ${duration((now - new Date(began)) / 1000)}`, "live");
     told.add(name);
   }
