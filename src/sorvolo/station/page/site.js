@@ -144,7 +144,10 @@ class SiteScreen {
       if (this.closed) return;
       this.view.showVersion(live ? `live-${live}` : versions.at(-1)?.n);
       showStationMap(this);
-      if (!this.lastPlace) return;
+      if (!this.lastPlace) {
+        if (this.data.detail.bounds_wgs84 && this.view.covered().low) this.view.go(this.data.detail.bounds_wgs84, 0, true); // what a sheet lies over
+        return;
+      }
       this.follow(false);
       this.view.go(this.lastPlace, 20.5, true);
     });
