@@ -10,7 +10,7 @@ import numpy as np
 
 from sorvolo.change.local_fit import LocalFit, fit_locally
 from sorvolo.change.map_search import MapSearch
-from sorvolo.change.reference import HeldWindow, ReferenceMap, normalised
+from sorvolo.change.reference import ReferenceMap, normalised
 from sorvolo.errors import GeometryError
 from sorvolo.geometry.arrays import (
     Floats,
@@ -148,12 +148,10 @@ class FlightPlace:
 
 @dataclass(frozen=True, eq=False)
 class AlignStep:
-    """What a frame left in an `Aligner`: its place (None: it has none), the frames without one up to it, and the parts
-    of the map that were held in the end."""
+    """What a frame left in an `Aligner`: its place (None: it has none), and the frames without one up to it."""
 
     place: MapPlace | None
     misses: int
-    windows: tuple[HeldWindow, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +183,7 @@ class Aligner:
         self._count = 0
         self._misses = 0  # frames since the last fit
         self._is_found = False  # whether a frame was found beyond doubt
-        self.step = AlignStep(None, 0, ())
+        self.step = AlignStep(None, 0)
         """What the last frame left."""
 
     def align(
@@ -239,13 +237,13 @@ class Aligner:
         if isinstance(placed, NotAligned):
             is_outside = share_known() < _LEAST_KNOWN
             reason = _BESIDE if is_outside else placed.reason
-            self.step = AlignStep(None, self._misses, self._reference.windows)
+            self.step = AlignStep(None, self._misses)
             return NotAligned(
                 reason, placed.residual_px / scale, is_outside, is_cautious and not is_outside
             )
         moved, left, size_m = self._settled(frame, placed)
         self._remember(time_ns, moved, prior, new)
-        self.step = AlignStep(moved, self._misses, self._reference.windows)
+        self.step = AlignStep(moved, self._misses)
         small_from_full = resized(size[0] / image.shape[1], size[1] / image.shape[0])
         return Aligned(
             moved.site_from_image @ small_from_full,
@@ -266,7 +264,6 @@ class Aligner:
         if step.place is not None:
             self._remember(time_ns, step.place, prior, new)
         self._misses = step.misses
-        self._reference.hold(step.windows)
         self.step = step
 
     # ---- inside -----------------------------------------------------------------------------------------------
@@ -572,7 +569,7 @@ class Aligner:
         if residual_px > (_DOUBTFUL_PX if followed else _MOST_RESIDUAL_PX):
             return NotAligned("its points fit the map badly", residual_px)
         is_held = residual_px <= _DOUBTFUL_PX and (
-            _spread_of(found.new_px, seen[1], _CELLS) >= _LEAST_SPREAD
+            _spread_of(found.new_px, seen[1]) >= _LEAST_SPREAD
         )
         fit = _stiffened(guess @ np.linalg.inv(found.new_from_old), found, guess, new.camera)
         pose = pose_from_homography(fit, new.camera)
@@ -606,11 +603,11 @@ def _nearer(first: NotAligned, second: NotAligned) -> NotAligned:
     return second if second.residual_px < first.residual_px else first
 
 
-def _spread_of(points_px: PointsPx, known: Mask, across_down: tuple[int, int]) -> float:
+def _spread_of(points_px: PointsPx, known: Mask) -> float:
     """The share of the frame's cells on known ground, this many across and down, that hold points."""
     height, width = known.shape
-    cells = np.array(across_down)
-    on_map = cv2.resize(known.astype(np.float32), across_down, interpolation=cv2.INTER_AREA) > 0.5
+    cells = np.array(_CELLS)
+    on_map = cv2.resize(known.astype(np.float32), _CELLS, interpolation=cv2.INTER_AREA) > 0.5
     held = np.zeros_like(on_map)
     x, y = (points_px * cells / [width, height]).astype(int).clip(0, cells - 1).T
     held[y, x] = True

@@ -1,14 +1,12 @@
 """The known map as a later flight reads it: any view of it, and its features, made once."""
 
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from functools import cached_property
 
 import cv2
 import numpy as np
 
-from sorvolo.errors import GeometryError
 from sorvolo.geometry.arrays import ImageGray, ImageRGB, ImageRGBA, Mask, Matrix3, PointsPx
 from sorvolo.geometry.grid import Grid, TileIndex
 from sorvolo.geometry.homography import apply_homography, resized
@@ -24,29 +22,16 @@ _BLOCK_PX = 512  # features are found in blocks of this side
 _APRON_PX = 40  # what contrast and descriptors look at beyond a block
 _LEVEL_TILES, _LEVEL_STEP_PX = 20, 16  # by which the map's middle grey is known
 _CACHE_BYTES = 192 * 2**20  # of tiles at hand
+_STEP_PX = (
+    32  # of the map: pictures are made of whole squares of this side, a multiple of any `shrink`
+)
 _MOST_PX = 48_000_000  # of the map in one view: more is a view towards the horizon
 _FEATURES = FeatureSettings(detection_side_px=_BLOCK_PX + 2 * _APRON_PX, orb_count=1100)
 _NOTHING = Features("orb", np.zeros((0, 2)), np.zeros((0, 32), np.uint8))
 
 
-@dataclass(frozen=True)
-class HeldWindow:
-    """A part of the map that is held in one piece, in pixels of its level; pictures are resampled from it, and where
-    it begins decides their last bit."""
-
-    level: int
-    x: int
-    y: int
-    width_px: int
-    height_px: int
-
-    def __post_init__(self) -> None:
-        if not 0 < self.width_px * self.height_px <= 4 * _MOST_PX:
-            raise GeometryError(f"no part of a map is {self.width_px} x {self.height_px} px")
-
-
 class ReferenceMap:
-    """A version of the map, read a tile at a time; remembers the last tiles, each level's last window and all features.
+    """A version of the map, read a tile at a time; remembers the last tiles and all features.
 
     `tiles` is any mapping from tile to RGBA; level n of the map has pixels of 2^n grid pixels.
     """
@@ -55,45 +40,15 @@ class ReferenceMap:
         self._tiles, self._grid = tiles, grid
         self._cache: OrderedDict[tuple[int, TileIndex], ImageRGBA | None] = OrderedDict()
         self._cache_tiles = max(8, _CACHE_BYTES // (4 * grid.tile_px**2))
-        self._windows: dict[int, tuple[int, int, ImageRGBA]] = {}  # of each level the last
-        self._shrunk: dict[int, tuple[int, ImageRGBA]] = {}  # the same by how much smaller
         self._features: dict[tuple[int, TileIndex], Features] = {}
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether the map shows nothing at all."""
-        return len(self._tiles) == 0
-
-    @property
-    def windows(self) -> tuple[HeldWindow, ...]:
-        """Those held now, in the order in which they came."""
-        return tuple(
-            HeldWindow(level, x, y, window.shape[1], window.shape[0])
-            for level, (x, y, window) in self._windows.items()
-        )
-
-    def hold(self, windows: Sequence[HeldWindow]) -> None:
-        """Hold these windows and no others."""
-        before = {each.level: each for each in self.windows}
-        held, self._windows = self._windows, {}
-        for each in windows:
-            if before.get(each.level) == each:
-                self._windows[each.level] = held[each.level]
-                continue
-            self._shrunk.pop(each.level, None)
-            self._windows[each.level] = (
-                each.x,
-                each.y,
-                self._assembled(each.level, each.x, each.y, each.width_px, each.height_px),
-            )
 
     def seen_from(
         self, grid_from_image: Matrix3, width_px: int, height_px: int, shrink: int = 1
     ) -> tuple[ImageRGB, Mask]:
         """The map resampled to an image's pixels, and where it is known; nothing is known of views to the horizon.
 
-        With `shrink` n the result is an n-th as wide and high, made of the window that the whole image needs: whoever
-        asks for both pays for no coarse tiles.
+        With `shrink` n the result is an n-th as wide and high, made of the tiles that the whole image needs: whoever
+        asks for both pays for no coarse ones.
         """
         size = max(1, width_px // shrink), max(1, height_px // shrink)
         nothing = np.zeros((size[1], size[0], 3), np.uint8), np.zeros((size[1], size[0]), bool)
@@ -103,20 +58,18 @@ class ReferenceMap:
         level = level_for(grid_from_image, width_px, height_px)
         level_from_image = _level_from_grid(level) @ grid_from_image
         outline = apply_homography(_level_from_grid(level), outline)
-        low, high = (
-            np.floor(outline.min(axis=0)).astype(int) - 2,
-            np.ceil(outline.max(axis=0)).astype(int) + 3,
-        )
+        low = (np.floor(outline.min(axis=0)).astype(int) - 2) // _STEP_PX * _STEP_PX
+        high = -(-(np.ceil(outline.max(axis=0)).astype(int) + 3) // _STEP_PX) * _STEP_PX
         if np.prod((high - low).astype(float)) > _MOST_PX:
             return nothing
-        x, y, window = self._window_around(
-            level, (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
-        )
+        x, y = (int(each) for each in low)
+        window = self._assembled(level, x, y, *(int(each) for each in high - low))
         window_from_image = (
             np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [0.0, 0.0, 1.0]]) @ level_from_image
         )
         if shrink > 1:
-            window = self._shrunk_window(level, shrink)
+            small = window.shape[1] // shrink, window.shape[0] // shrink
+            window = np.asarray(cv2.resize(window, small, interpolation=cv2.INTER_AREA), np.uint8)
             image_from_small = resized(width_px / size[0], height_px / size[1])
             window_from_image = (
                 resized(1 / shrink, 1 / shrink) @ window_from_image @ image_from_small
@@ -171,47 +124,13 @@ class ReferenceMap:
     @cached_property
     def _middle_grey(self) -> float:
         """By a few of the map's tiles."""
-        step = _LEVEL_STEP_PX
         every = -(-len(self._tiles) // _LEVEL_TILES)
-        some = [self._tiles[index][::step, ::step] for index in sorted(self._tiles)[::every]]
+        some = [
+            self._tiles[index][::_LEVEL_STEP_PX, ::_LEVEL_STEP_PX]
+            for index in sorted(self._tiles)[::every]
+        ]
         levels = np.concatenate([tile[tile[..., 3] > 0][:, :3].ravel() for tile in some])
         return float(np.median(levels)) if len(levels) else 0.0
-
-    def _window_around(
-        self, level: int, box: tuple[int, int, int, int]
-    ) -> tuple[int, int, ImageRGBA]:
-        if level in self._windows:
-            x, y, window = self._windows[level]
-            height, width = window.shape[:2]
-            if x <= box[0] and y <= box[1] and box[2] <= x + width and box[3] <= y + height:
-                return x, y, window
-        spare = max(box[2] - box[0], box[3] - box[1]) // 4  # the next views lie beside this one
-        x, y = box[0] - spare, box[1] - spare
-        window = self._assembled(level, x, y, box[2] + spare - x, box[3] + spare - y)
-        self._windows[level] = x, y, window
-        self._shrunk.pop(level, None)
-        while (
-            sum(each[2].nbytes for each in self._windows.values()) > 4 * _MOST_PX
-            and len(self._windows) > 1
-        ):
-            other = next(each for each in self._windows if each != level)
-            self._windows.pop(other)
-            self._shrunk.pop(other, None)
-        return x, y, window
-
-    def _shrunk_window(self, level: int, shrink: int) -> ImageRGBA:
-        """The level's last window at a part of its size; a rim that fills no pixel is left out."""
-        held = self._shrunk.get(level)
-        if held is None or held[0] != shrink:
-            window = self._windows[level][2]
-            height, width = window.shape[0] // shrink, window.shape[1] // shrink
-            small = cv2.resize(
-                window[: height * shrink, : width * shrink],
-                (width, height),
-                interpolation=cv2.INTER_AREA,
-            )
-            self._shrunk[level] = held = shrink, np.asarray(small, np.uint8)
-        return held[1]
 
     def _assembled(self, level: int, x: int, y: int, width: int, height: int) -> ImageRGBA:
         side = self._grid.tile_px
