@@ -45,10 +45,11 @@ def _is_whole(view: ComparedView, index: int) -> bool:
     """Whether a box lies on known ground, off the view's rim, and is no large part of the view."""
     height, width = view.changed.shape
     x, y, w, h = (int(each) for each in view.boxes[index])
-    rim = _RIM_PX
-    is_inside = x >= rim and y >= rim and x + w <= width - rim and y + h <= height - rim
+    is_inside = (
+        x >= _RIM_PX and y >= _RIM_PX and x + w <= width - _RIM_PX and y + h <= height - _RIM_PX
+    )
     is_small = w * h <= _MOST_OF_VIEW * width * height
-    return is_inside and is_small and _is_known_around(view.valid, x, y, w, h, _MOST_UNKNOWN)
+    return is_inside and is_small and _is_known_around(view.valid, x, y, w, h)
 
 
 def _blob(view: ComparedView, index: int) -> Blob | None:
@@ -98,8 +99,10 @@ def standing_outline_m(view: ComparedView, blob: Blob) -> PointsM | None:
 def _around(view: ComparedView, box: int) -> tuple[int, int, Mask, Mask]:
     """What changed in one of the view's boxes and close around it, and the thing in that: left, top, both masks."""
     x, y, w, h = (int(each) for each in view.boxes[box])
-    reach = _AROUND_PX
-    window = slice(max(y - reach, 0), y + h + reach), slice(max(x - reach, 0), x + w + reach)
+    window = (
+        slice(max(y - _AROUND_PX, 0), y + h + _AROUND_PX),
+        slice(max(x - _AROUND_PX, 0), x + w + _AROUND_PX),
+    )
     changed = view.changed[window] > 0
     thing = thing_of(changed, (view.shade[window] & Shade.LATER) > 0)
     return window[1].start, window[0].start, changed, thing
@@ -121,8 +124,7 @@ def _foot_m(
     thing, changed = ((each - camera_m[:2]) @ site_from_lean.T for each in (thing_m, changed_m))
     (_, left), (far, right) = thing.min(axis=0), thing.max(axis=0)
     width_m = right - left + m_per_px
-    person_m = _PERSON_M
-    nearest = far * (1 - person_m / max(float(camera_m[2]), 2 * person_m)) - width_m
+    nearest = far * (1 - _PERSON_M / max(float(camera_m[2]), 2 * _PERSON_M)) - width_m
     behind = changed[
         (changed[:, 1] >= left) & (changed[:, 1] <= right) & (changed[:, 0] >= nearest), 0
     ]
@@ -134,8 +136,8 @@ def _foot_m(
     return np.asarray(corners @ site_from_lean + camera_m[:2])
 
 
-def _is_known_around(valid: Mask, x: int, y: int, w: int, h: int, most_unknown: float) -> bool:
+def _is_known_around(valid: Mask, x: int, y: int, w: int, h: int) -> bool:
     rim = 2 * (w + h)
     part = valid[max(y - 1, 0) : y + h + 1, max(x - 1, 0) : x + w + 1]
     unknown = part.size - int(np.count_nonzero(part))
-    return unknown < most_unknown * rim
+    return unknown < _MOST_UNKNOWN * rim

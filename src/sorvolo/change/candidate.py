@@ -489,7 +489,7 @@ class Seeds:
                 kept.append(seed)
             elif (votes > 0).any() and not (owner > 0).any():
                 kept.append(seed)
-                self._ask(seed, view, kept_view)
+                self._ask(seed, kept_view)
                 weak[here] = False
         self._seeds = kept
         if most_pictures <= 0 or not weak.any():
@@ -497,7 +497,7 @@ class Seeds:
         for window in self._new(laid, weak)[:most_pictures]:
             seed = Candidate(0, window, view.time_ns)
             seed.pictures.show(view, *window.box_m(self._cell_m), self._m_per_px)
-            self._ask(seed, view, kept_view)
+            self._ask(seed, kept_view)
             self._seeds.append(seed)
         # Let the oldest go where there are too many: a large site has hundreds that only its
         # first photos show.
@@ -505,7 +505,7 @@ class Seeds:
         while len(sizes) > _MOST_SEEDS and sum(sizes) > _MOST_SEEDS_PX:
             del sizes[0], self._seeds[0]
 
-    def _ask(self, seed: Candidate, view: ComparedView, kept_view: KeptView) -> None:
+    def _ask(self, seed: Candidate, kept_view: KeptView) -> None:
         seed.ask(kept_view, self._grid.read(seed.cells).changed > 0, self._cell_m)
 
     def _new(self, laid: LaidView, weak: Mask) -> list[CellWindow]:

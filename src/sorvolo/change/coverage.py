@@ -138,7 +138,6 @@ class GroundCoverage:
         outlines, (N, 2) each, of what is reported: other ground that differs is not explained."""
         plain, faint = sensitivities(self._planted)[:2]
         runs: dict[tuple[int, int, int], list[tuple[float, float, float, float]]] = {}
-        cell_m = _CELL_M
         for (column, row), chunk in self._chunks.items():
             # (rows, columns) which cells of a chunk lie in a reported change, or beside it.
             cells = np.zeros((CHUNK, CHUNK), np.uint8)
@@ -152,9 +151,9 @@ class GroundCoverage:
             explained = np.asarray(cells > 0)
             labels = self._labels(chunk, explained, plain, faint)
             for label, x0, x1, y in _runs(labels):
-                west, north = (column * CHUNK + x0) * cell_m, -(row * CHUNK + y) * cell_m
-                east = (column * CHUNK + x1) * cell_m
-                runs.setdefault(label, []).append((west, north - cell_m, east, north))
+                west, north = (column * CHUNK + x0) * _CELL_M, -(row * CHUNK + y) * _CELL_M
+                east = (column * CHUNK + x1) * _CELL_M
+                runs.setdefault(label, []).append((west, north - _CELL_M, east, north))
         parts = [self._part(label, np.array(boxes)) for label, boxes in runs.items()]
         return sorted(parts, key=lambda each: (each.gap is not None, str(each.gap), -each.area_m2))
 
@@ -196,9 +195,8 @@ class GroundCoverage:
 
     def _step_of(self, sizes_m: Floats) -> Ints32:
         """1 + the place of the next larger step; 0 where the size is not known or larger than all."""
-        steps_m = _STEPS_M
-        place = np.searchsorted(steps_m, np.nan_to_num(sizes_m, nan=np.inf))
-        return np.where(place < len(steps_m), place + 1, 0).astype(np.int32)
+        place = np.searchsorted(_STEPS_M, np.nan_to_num(sizes_m, nan=np.inf))
+        return np.where(place < len(_STEPS_M), place + 1, 0).astype(np.int32)
 
     def _step_m(self, number: int) -> float:
         return _STEPS_M[number - 1] if number else float("nan")
@@ -234,9 +232,7 @@ class GroundCoverage:
 
         marks = np.full(view.valid.shape, _CLEAN, np.uint8)
         gray = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY)
-        is_black = np.minimum(
-            *(_mean_grey(each, _BLACK_PX) for each in (view.image, view.reference))
-        )
+        is_black = np.minimum(*(_mean_grey(each) for each in (view.image, view.reference)))
         marks[is_black < _BLACK] = mark(Gap.DARK)
         if doubted is not None:
             marks[doubted] = mark(Gap.LEANING)
@@ -322,7 +318,7 @@ def _runs(labels: Ints32) -> Iterator[tuple[tuple[int, int, int], int, int, int]
                 yield (kind, first, second), int(start), int(end), y
 
 
-def _mean_grey(image: ImageRGB, side_px: int) -> Bytes:
+def _mean_grey(image: ImageRGB) -> Bytes:
     return np.asarray(
-        cv2.blur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (side_px, side_px)), np.uint8
+        cv2.blur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (_BLACK_PX, _BLACK_PX)), np.uint8
     )

@@ -571,7 +571,7 @@ class EvidenceMap:
         evidence = self._grid.read(seed.cells)
         if seed.number:
             return
-        cells, single = self._late_cells(seed, evidence), self._single_cells(seed, evidence)
+        cells, single = self._late_cells(evidence), self._single_cells(seed, evidence)
         is_seen_once = np.count_nonzero(single) >= self._least_cells and self._is_confirmed(
             seed, single, confirms
         )
@@ -588,8 +588,8 @@ class EvidenceMap:
         self._grid.own(seed.cells, cells, seed.number)
         self._found[seed.number] = seed
 
-    def _late_cells(self, seed: Candidate, evidence: CellEvidence) -> Mask:
-        """The cells of a seed that enough of the few views show."""
+    def _late_cells(self, evidence: CellEvidence) -> Mask:
+        """The cells that enough of the few views show."""
         settings, seen = self._settings, evidence.seen.astype(float)
         needed = np.maximum(
             _LEAST_VIEWS, np.ceil(settings.k * np.minimum(seen, settings.n) / settings.n)

@@ -59,7 +59,6 @@ def learned_difference(
                 held,
                 _LEAST_MIDDLE[row],
                 _LEAST_SPREAD[row],
-                _MOST_SPREADS,
             )
             larger = cv2.resize(
                 spreads, (columns * stride, rows * stride), interpolation=cv2.INTER_LINEAR
@@ -89,7 +88,7 @@ def _padded(image: Bytes, stride: int) -> Bytes:
 
 
 def _in_spreads(
-    measure: Floats32, held: Mask, least_middle: float, least_spread: float, most: float
+    measure: Floats32, held: Mask, least_middle: float, least_spread: float
 ) -> Floats32:
     """A measure (rows, columns) less its median where `held`, in spreads, at most this many."""
     median = float(np.median(measure[held]))
@@ -97,7 +96,7 @@ def _in_spreads(
         SIGMA_PER_MEDIAN_DEVIATION * float(np.median(np.abs(measure[held] - median))), least_spread
     )
     away = (measure - np.float32(max(median, least_middle))) / np.float32(spread)
-    return np.asarray(np.clip(away, -most, most), np.float32)
+    return np.asarray(np.clip(away, -_MOST_SPREADS, _MOST_SPREADS), np.float32)
 
 
 def _apart(one: Floats32, other: Floats32, held: Mask) -> tuple[Floats32, Floats32]:

@@ -1,6 +1,5 @@
 """One picture in the light of another: a power law per channel for the camera, a smooth gain for clouds' shadows."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -51,10 +50,9 @@ def moved_shades(before: Image, after: Image, known: Mask | None) -> Floats32 | 
         if shaded.any():
             octaves = np.zeros(apart.shape, np.float32) if octaves is None else octaves
             x, y, wide, high = cv2.boundingRect(shaded)
-            near = _NEAR_PX
             part = (
-                slice(max(0, y - near), y + high + near),
-                slice(max(0, x - near), x + wide + near),
+                slice(max(0, y - _NEAR_PX), y + high + _NEAR_PX),
+                slice(max(0, x - _NEAR_PX), x + wide + _NEAR_PX),
             )
             octaves[part] += _octaves(shaded[part], apart[part])
     if octaves is not None and known is not None:
@@ -268,7 +266,7 @@ def fit_light(reference: Bgr, query: Bgr, known: Mask | None = None) -> PairLigh
     if sure is not None:
         same[~sure] = 0
     steps = cv2.medianBlur(local, _MEDIAN_CELLS).astype(np.float32) - 128
-    octaves = _spread(steps, same, _REACHES) / STEPS_PER_OCTAVE
+    octaves = _spread(steps, same) / STEPS_PER_OCTAVE
     unevenness = float(_chosen(octaves, sure).mean(axis=1).std())
     factors = None if shades is None else np.exp2(shades)
     return PairLight(exponents, offsets, np.exp2(octaves).astype(np.float32), unevenness, factors)
@@ -323,19 +321,18 @@ def _sameness(reference: Bgr, query: Bgr) -> Floats32:
     grays = np.asarray(before, np.uint8), np.asarray(after, np.uint8)
     products = detail_products(*grays, _LOG, _DETAIL_PX, _FINE)
     sums = [cv2.blur(each, (5, 5)) for each in products]
-    noise = _FLAT
-    alike = sums[0] / np.sqrt((sums[1] + noise) * (sums[2] + noise))
+    alike = sums[0] / np.sqrt((sums[1] + _FLAT) * (sums[2] + _FLAT))
     least, most = _LIGHT_ALIKE
     sure = np.clip((alike - least) / (most - least), 0, 1)
-    flat = np.exp(-(sums[1] + sums[2]) / (2 * noise)) * np.float32(_FLAT_TRUST)
+    flat = np.exp(-(sums[1] + sums[2]) / (2 * _FLAT)) * np.float32(_FLAT_TRUST)
     return np.asarray(np.maximum(cv2.erode(sure, np.ones((3, 3), np.uint8)), flat), np.float32)
 
 
-def _spread(values: Floats32, weights: Floats32, reaches: Sequence[tuple[int, float]]) -> Floats32:
+def _spread(values: Floats32, weights: Floats32) -> Floats32:
     """Values (h, w, 3) smoothed with weights (h, w); where there are none, those of the nearest around."""
     stack = np.dstack([values * weights[..., None], weights])
     total = np.zeros_like(stack)
-    for reach, weight in reaches:
+    for reach, weight in _REACHES:
         total += np.float32(weight) * cv2.blur(stack, (reach, reach))
     return np.asarray(total[..., :3] / (total[..., 3:] + np.float32(1e-6)), np.float32)
 

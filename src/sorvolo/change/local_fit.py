@@ -147,16 +147,14 @@ def _rest(agreement: Floats32, halves: tuple[Floats32, Floats32], reach: int) ->
     _, moved, sure = _field(agreement, halves[1], reach)
     if not sure.any():
         return 1.0
-    before, after = (
-        float(_capped(each, _BAND_PX) @ sure.ravel()) for each in (moved, moved - field)
-    )
+    before, after = (float(_capped(each) @ sure.ravel()) for each in (moved, moved - field))
     return after / max(before, 1e-9)
 
 
-def _capped(moved: Floats, band: float) -> Floats:
+def _capped(moved: Floats) -> Floats:
     """(N,) lengths squared, of which those far beyond the band count alike."""
     square: Floats = np.square(moved).sum(axis=2).ravel()
-    capped: Floats = square / (square + 9.0 * band**2)
+    capped: Floats = square / (square + 9.0 * _BAND_PX**2)
     return capped
 
 

@@ -253,8 +253,8 @@ def find_regions(
     channels = [difference, chroma, activity, light_before, light_after, came, went, colour]
     frame = np.array([noise, rest_px, unevenness, np.log1p(len(boxes))])
     green = (
-        _green(reference, boxes, _GREEN_CELL_PX),
-        _green(query, boxes, _GREEN_CELL_PX),
+        _green(reference, boxes),
+        _green(query, boxes),
     )
     features = _measured(labels, boxes, channels, green, frame, scratch)
     # along its outline a thing's values are new, while the ground's are still to be seen near
@@ -274,7 +274,7 @@ def _measured(
     searched = scratch.take(
         "searched", (labels.shape[0], labels.shape[1]), margin_px=_MATCH_REACH_PX
     )
-    part, corner = _looked_at(boxes, labels.shape, _WIDE_PX + _DETAIL_PX)
+    part, corner = _looked_at(boxes, labels.shape)
     labels, *channels = (np.ascontiguousarray(each[part]) for each in (labels, *channels))
     difference, chroma, activity, light_before, level, came, went, colour = channels
     boxes = boxes - corner
@@ -293,8 +293,8 @@ def _measured(
     ) = planes.reshape(-1)[: 10 * labels.size].reshape(10, height, width)
     cv2.LUT(light_before, LOGARITHMS, dst=log_before)
     cv2.LUT(level, LOGARITHMS, dst=log_after)
-    _details(log_before, detail_before, _DETAIL_PX)
-    _details(log_after, detail_after, _DETAIL_PX)
+    _details(log_before, detail_before)
+    _details(log_after, detail_after)
     window = np.ones((3, 3), np.uint8)
     cv2.addWeighted(log_after, 0.5, log_before, -0.5, 128, dst=ratio)
     cv2.morphologyEx(log_after, cv2.MORPH_GRADIENT, window, dst=edges_after)
@@ -322,14 +322,19 @@ def _measured(
     rim = _moments(measure_regions(_rims(labels), boxes, [sharp, steep], 0))[0][:, 0]
     around_wide = measure_regions(labels, boxes, [ratio, detail], _WIDE_PX)
     wide, wide_spreads = (each[:, 1] for each in _moments(around_wide))
-    reach = _MATCH_REACH_PX
-    searched = searched.reshape(-1)[: (height + 2 * reach) * (width + 2 * reach)].reshape(
-        height + 2 * reach, -1
+    searched = searched.reshape(-1)[
+        : (height + 2 * _MATCH_REACH_PX) * (width + 2 * _MATCH_REACH_PX)
+    ].reshape(height + 2 * _MATCH_REACH_PX, -1)
+    cv2.copyMakeBorder(
+        detail_before,
+        _MATCH_REACH_PX,
+        _MATCH_REACH_PX,
+        _MATCH_REACH_PX,
+        _MATCH_REACH_PX,
+        cv2.BORDER_REFLECT,
+        dst=searched,
     )
-    cv2.copyMakeBorder(detail_before, reach, reach, reach, reach, cv2.BORDER_REFLECT, dst=searched)
-    matched = match_regions(
-        detail_after, searched, _grown(boxes, labels.shape, _MATCH_MARGIN_PX), reach
-    )
+    matched = match_regions(detail_after, searched, _grown(boxes, labels.shape), _MATCH_REACH_PX)
     long, short = boxes[:, 2:].max(axis=1), boxes[:, 2:].min(axis=1)
     area = sums[:, 0, 0].astype(np.float64)
     difference_in, noise = within[:, 0], frame[0]
@@ -376,7 +381,7 @@ def _measured(
         wide_spreads[:, 0],
         wide[:, 1],
         *green,
-        *_standing_out(boxes, area * difference_in, _NEIGHBOUR_PX),
+        *_standing_out(boxes, area * difference_in),
     ]
     return np.column_stack(columns + [np.full(len(boxes), value) for value in frame])
 
@@ -400,12 +405,10 @@ def _structure(means: Floats, spreads: Floats) -> tuple[Floats, Floats, Floats]:
     return alike, spreads[..., 1], spreads[..., 2]
 
 
-def _standing_out(
-    boxes: Ints32, strength: Floats, neighbour_px: float
-) -> tuple[Floats, Floats, Floats]:
+def _standing_out(boxes: Ints32, strength: Floats) -> tuple[Floats, Floats, Floats]:
     """Each region's strength (N,) against the strongest, and against all near, in logarithms; how many are near."""
     middles = boxes[:, :2] + boxes[:, 2:] / 2
-    near = np.abs(middles[:, None] - middles[None]).max(axis=2) < neighbour_px
+    near = np.abs(middles[:, None] - middles[None]).max(axis=2) < _NEIGHBOUR_PX
     strength = strength + 1.0
     return (
         np.log(strength / strength.max()),
@@ -414,12 +417,10 @@ def _standing_out(
     )
 
 
-def _looked_at(
-    boxes: Ints32, shape: tuple[int, ...], margin_px: int
-) -> tuple[tuple[slice, slice], Ints32]:
+def _looked_at(boxes: Ints32, shape: tuple[int, ...]) -> tuple[tuple[slice, slice], Ints32]:
     """The part of a picture of `shape` (h, w) that determines the measures of regions in boxes (N, 4); its corner."""
-    corner = np.maximum(boxes[:, :2].min(axis=0) - margin_px, 0)
-    right, bottom = (boxes[:, :2] + boxes[:, 2:]).max(axis=0) + margin_px
+    corner = np.maximum(boxes[:, :2].min(axis=0) - (_WIDE_PX + _DETAIL_PX), 0)
+    right, bottom = (boxes[:, :2] + boxes[:, 2:]).max(axis=0) + (_WIDE_PX + _DETAIL_PX)
     part = np.s_[
         int(corner[1]) : min(int(bottom), shape[0]), int(corner[0]) : min(int(right), shape[1])
     ]
@@ -431,10 +432,10 @@ def _rims(labels: Bytes) -> Bytes:
     return labels * (cv2.erode(labels, np.ones((3, 3), np.uint8)) == 0)
 
 
-def _green(image: Image, boxes: Ints32, cell_px: int) -> Floats:
+def _green(image: Image, boxes: Ints32) -> Floats:
     """How much greener (N,) than red and blue a BGR picture (h, w, 3) is in the middle of boxes, grey levels."""
-    columns, rows = ((boxes[:, :2] + boxes[:, 2:] // 2) // cell_px * cell_px).T
-    y, x = np.mgrid[:cell_px, :cell_px]
+    columns, rows = ((boxes[:, :2] + boxes[:, 2:] // 2) // _GREEN_CELL_PX * _GREEN_CELL_PX).T
+    y, x = np.mgrid[:_GREEN_CELL_PX, :_GREEN_CELL_PX]
     y, x = (
         np.minimum(start[:, None, None] + step, side - 1)
         for start, step, side in ((rows, y, image.shape[0]), (columns, x, image.shape[1]))
@@ -443,13 +444,13 @@ def _green(image: Image, boxes: Ints32, cell_px: int) -> Floats:
     return np.asarray(green - (red + blue) / 2)
 
 
-def _details(logarithm: Image, to: Image, detail_px: int) -> None:
-    cv2.blur(logarithm, (detail_px, detail_px), dst=to)
+def _details(logarithm: Image, to: Image) -> None:
+    cv2.blur(logarithm, (_DETAIL_PX, _DETAIL_PX), dst=to)
     cv2.addWeighted(logarithm, 1, to, -1, 128, dst=to)
 
 
-def _grown(boxes: Ints32, shape: tuple[int, ...], margin_px: int) -> Ints32:
+def _grown(boxes: Ints32, shape: tuple[int, ...]) -> Ints32:
     """Boxes with a margin, inside the picture."""
-    low = np.maximum(boxes[:, :2] - margin_px, 0)
-    high = np.minimum(boxes[:, :2] + boxes[:, 2:] + margin_px, [shape[1], shape[0]])
+    low = np.maximum(boxes[:, :2] - _MATCH_MARGIN_PX, 0)
+    high = np.minimum(boxes[:, :2] + boxes[:, 2:] + _MATCH_MARGIN_PX, [shape[1], shape[0]])
     return np.ascontiguousarray(np.hstack([low, high - low]), np.int32)

@@ -64,8 +64,7 @@ class ReliefMap:
 
         `site_from_image` and `picture_from_site` hold for level ground; `size` is the image's width and height.
         """
-        coarser = _COARSER
-        small = max(2, size[0] // coarser), max(2, size[1] // coarser)
+        small = max(2, size[0] // _COARSER), max(2, size[1] // _COARSER)
         coarse_m = _grounds(site_from_image, size, small)
         up_m = self.meet_m(coarse_m, camera_m)
         earlier_ground_m = _lowered(_raised(coarse_m, camera_m, up_m), earlier_m, up_m)

@@ -256,7 +256,7 @@ def compare_robust(
     scratch = scratch_of_thread()
     examined = examine(reference, query, valid, settings, scratch)
     scores = how_sure(examined.regions.features, trained_trees())
-    return _result(examined, scores, settings, query.shape[1::-1], scratch)
+    return _result(examined, scores, settings, query.shape[1::-1])
 
 
 class Examined(NamedTuple):
@@ -342,7 +342,6 @@ def _result(
     scores: Floats,
     settings: RobustSettings,
     size: tuple[int, int],
-    scratch: Scratch,
 ) -> RobustResult:
     """The answer at full `size` (w, h): the regions whose scores (N,) suffice."""
     regions, light, settling, known, views = examined
@@ -361,9 +360,9 @@ def _result(
         [_around(box, pieces.get(each)) for each, box in enumerate(regions.boxes)], np.float64
     )
     if settling.moved_px < _SAME_PLACE_PX or not (sure & went).any():
-        half_mask = _filled(sure, regions, pieces, settings)
+        half_mask = _filled(sure, regions, pieces)
     else:  # what disappeared is seen in the reference: it keeps the reference's pixels
-        gone = _filled(sure & went, regions, pieces, settings)
+        gone = _filled(sure & went, regions, pieces)
         gone = np.asarray(
             cv2.warpPerspective(gone, settling.reference_from_query, half, flags=cv2.INTER_LINEAR),
             np.uint8,
@@ -371,7 +370,7 @@ def _result(
         stays = sure & ~went
         half_mask = gone
         if stays.any():
-            here = _filled(stays, regions, pieces, settings)
+            here = _filled(stays, regions, pieces)
             half_mask = np.asarray(cv2.max(here, gone), np.uint8)
         middle = boxes_px[:, :2] + boxes_px[:, 2:] / 2
         moved = np.column_stack([middle, np.ones(len(middle))]) @ settling.reference_from_query.T
@@ -421,9 +420,7 @@ def _went(regions: Regions) -> Mask:
     return np.asarray(came[part] < 0)
 
 
-def _filled(
-    chosen: Mask, regions: Regions, pieces: Mapping[int, ThingPixels], settings: RobustSettings
-) -> ImageGray:
+def _filled(chosen: Mask, regions: Regions, pieces: Mapping[int, ThingPixels]) -> ImageGray:
     """The things of the `chosen` (N,) regions: their `pieces`, and where there is none the region with the weakly
     differing ground that is its own; without gaps.
 

@@ -96,7 +96,7 @@ def _groups(patch: Patch, changed: Mask) -> list[tuple[Mask, ChangeKind]]:
     if len(pieces) < 2:
         return []
     distances = [_distance(each) * patch.m_per_px for each in pieces]
-    group = _group_of_pieces(patch, pieces, distances, _GAP_M)
+    group = _group_of_pieces(patch, pieces, distances)
     if len(set(group)) < 2:
         return []
     nearest = np.array(group)[np.argmin(distances, axis=0)]
@@ -105,14 +105,14 @@ def _groups(patch: Patch, changed: Mask) -> list[tuple[Mask, ChangeKind]]:
 
 
 def _group_of_pieces(
-    patch: Patch, pieces: Sequence[Mask], distances_m: Sequence[Floats32], gap_m: float
+    patch: Patch, pieces: Sequence[Mask], distances_m: Sequence[Floats32]
 ) -> list[int]:
     """The group of each piece: those near each other are one, unless one came and the other left."""
     kinds = [kind_of(replace(patch, changed=each)) for each in pieces]
     group = list(range(len(pieces)))
     for first, second in combinations(range(len(pieces)), 2):
         is_contrary = _CONTRARY.get(kinds[first]) is kinds[second]
-        if not is_contrary and float(distances_m[first][pieces[second]].min()) < gap_m:
+        if not is_contrary and float(distances_m[first][pieces[second]].min()) < _GAP_M:
             group = [group[first] if each == group[second] else each for each in group]
     return group
 
@@ -142,7 +142,7 @@ def _things_of_group(
 def _lit_things(bare: Mask, m_per_px: float) -> list[Mask]:
     """The solid things, the largest first, in the part of a change that is no shadow."""
     lit = cv2.morphologyEx(bare.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    labels = _joined(np.asarray(lit > 0), m_per_px, _APART_M)
+    labels = _joined(np.asarray(lit > 0), m_per_px)
     areas_m2 = np.bincount(labels[lit > 0]) * m_per_px**2
     large = [
         (labels == each) & (lit > 0)
@@ -165,9 +165,9 @@ def _hull(mask: Mask | Bytes) -> Mask:
     return hull.view(bool)
 
 
-def _joined(mask: Mask, m_per_px: float, apart_m: float) -> Ints32:
+def _joined(mask: Mask, m_per_px: float) -> Ints32:
     """The number from 1 on of the thing that each pixel of a mask (h, w) belongs to, and those near it; else 0."""
-    reach = 2 * round(apart_m / 2 / m_per_px) + 1
+    reach = 2 * round(_APART_M / 2 / m_per_px) + 1
     padded = cv2.copyMakeBorder(
         mask.view(np.uint8), reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=0
     )
