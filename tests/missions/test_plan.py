@@ -119,6 +119,8 @@ def test_strips_are_so_close_that_enough_pictures_show_each_spot_between_crowns(
     assert half.views * 0.5 > 12 and dense.views * 0.03 == pytest.approx(12)
     assert dense.strip_spacing_m < half.strip_spacing_m
     assert "detector" not in half.height_bounds_m
+    named = through_trees(PlanSettings(height_m=45.0, model="thermal"), 0.5)
+    assert answer_questions(thermal, named).height_bounds_m["detector"] < 120
     closer = through_trees(PlanSettings(forward_overlap=0.97, side_overlap=0.95), 0.5)
     assert (closer.forward_overlap, closer.side_overlap) == (0.97, 0.95)
     shown = run("--camera", "aov=50", "--height", 45, "--through-trees", 0.5, "--size", "512x512")

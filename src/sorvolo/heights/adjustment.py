@@ -33,6 +33,7 @@ class AdjustmentSettings:
     sigma_px: float = 0.5  # of a feature's place
     # of all the map's attitudes in common: they lean where the ground is not level
     attitude_sigma_deg: float = 3.0
+    lens_freedom: float = 1.0  # times the usual sigmas of the lens
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +220,8 @@ def _linearise(scene: Scene, priors: Priors, settings: AdjustmentSettings) -> _N
     gradient[:-_SHARED] = -_summed(_pulls(by_camera, residual), scene.view, views).ravel()
     gradient[-_SHARED:] = -_pulls(by_shared, residual).sum(axis=0)
     cost += _add_priors(scene, priors, settings, system, gradient)
-    lens_sigma = np.array([_FOCAL_SIGMA, *_RADIAL_SIGMA, *2 * (_CENTRE_SIGMA,)])
+    usual = np.array([_FOCAL_SIGMA, *_RADIAL_SIGMA, *2 * (_CENTRE_SIGMA,)])
+    lens_sigma = settings.lens_freedom * usual
     system[-_SHARED:, -_SHARED:] += np.diag(1 / lens_sigma**2)
     gradient[-_SHARED:] -= scene.shared / lens_sigma**2
     cost += float(((scene.shared / lens_sigma) ** 2).sum())

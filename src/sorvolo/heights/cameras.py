@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, ImageGray, Mask, PointsM, Rows
 from sorvolo.geometry.camera import Camera
-from sorvolo.geometry.pose import Pose
+from sorvolo.geometry.pose import Pose, rotation_from_vector
 from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 from sorvolo.heights.adjustment import (
     LEAST_SIGMA_PX,
@@ -42,6 +42,7 @@ _MARGIN = 0.2  # of a picture: features so far beside what two views share on le
 _NEARLY_ALL = 0.9  # of two views' features: what these do not share, all of them do not
 _REJECTED_PX = (8.0, 3.0)  # observations farther off are dropped, round by round
 _LEAST_SIGMA_M = 0.02  # of a fix
+_STEADY_DEG = 10.0, 1.0, 0.3  # sigma of a gimbal's tilt about the one found before, round by round
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,22 +235,15 @@ def solve_cameras(
     return solve_tracks(views, find_tracks(views, gray))
 
 
-def solve_tracks(
-    views: Sequence[View], tracks: Tracks, attitude_sigma_deg: float | None = None
-) -> Cameras3D:
-    """The cameras of a flight by points found before; None: attitudes may lean as the map's do on a slope.
+def solve_tracks(views: Sequence[View], tracks: Tracks) -> Cameras3D:
+    """The cameras of a flight by points found before; attitudes may lean as the map's do on a slope.
 
     Raises InputError where photos share too little for it.
     """
-    held = np.bincount(tracks.view, minlength=len(views)) >= _LEAST_INLIERS
-    if held.sum() < 3:
-        raise InputError(
-            f"only {int(held.sum())} of {len(views)} photos share enough points for heights, 3 were needed; "
-            "fly with at least 70 % overlap along and 60 % across the strips"
-        )
+    held = _held(views, tracks)
     # the attitudes lean alike on a slope: N of them know no more of its tilt than one
     alike_deg = AdjustmentSettings().attitude_sigma_deg * float(np.sqrt(len(views)))
-    settings = AdjustmentSettings(attitude_sigma_deg=attitude_sigma_deg or alike_deg)
+    settings = AdjustmentSettings(attitude_sigma_deg=alike_deg)
     priors = _priors(views)
     scene = _first(views, tracks)
     for limit_px in (*_REJECTED_PX, None):
@@ -257,7 +251,86 @@ def solve_tracks(
         if limit_px is not None:
             scene = scene.keeping(_fitting(scene, limit_px))
             priors = _reweighed(scene, priors)
-    return _solved(views, scene, priors, held, settings)
+    # The pictures weighed as they fit (their residuals' median), which is better than the
+    # settings assume.
+    fit_px = SIGMA_PER_MEDIAN_DEVIATION * float(np.nanmedian(np.abs(scene.residuals_px())))
+    weighed = replace(settings, sigma_px=max(fit_px, LEAST_SIGMA_PX))
+    return replace(
+        _solved(views, scene, priors, held),
+        height_sigma=SmoothSigma.fitted(
+            scene.points_m[:, :2], height_deviations(scene, priors, weighed)
+        ),
+        point_sigma_m=matched_deviations(scene, priors, weighed),
+    )
+
+
+def solve_steady(views: Sequence[View], tracks: Tracks) -> Cameras3D:
+    """The cameras of a flight whose gimbal holds one tilt, unknown, through the flight, and whose lens is the map's.
+
+    For crowns, which hold no free cameras: few pictures share a point, and none shows points far below. Heights have no
+    sigma. Raises InputError where photos share too little for it.
+    """
+    held, priors = _held(views, tracks), _priors(views)
+    priors = replace(
+        priors,
+        fixes_m=np.where(
+            np.isfinite(priors.fixes_m),
+            priors.fixes_m,
+            [each.site_from_camera.translation_m for each in views],
+        ),
+        rotations=_one_tilt(priors.rotations),
+    )
+    began = [
+        replace(view, site_from_camera=Pose(*place))
+        for view, *place in zip(views, priors.rotations, priors.fixes_m)
+    ]
+    scene = _first(began, tracks)
+    for sigma_deg in _STEADY_DEG:
+        scene = adjust(
+            scene, priors, AdjustmentSettings(attitude_sigma_deg=sigma_deg, lens_freedom=0.1)
+        )
+        scene = _laid(scene, priors, held)
+        scene = scene.keeping(_fitting(scene, _REJECTED_PX[sigma_deg < _STEADY_DEG[0]]))
+        priors = replace(priors, rotations=_one_tilt(scene.rotations))
+    return _solved(views, scene, priors, held)
+
+
+def _held(views: Sequence[View], tracks: Tracks) -> Mask:
+    """(N,) the views that tracks hold. Raises InputError for fewer than three."""
+    held = np.bincount(tracks.view, minlength=len(views)) >= _LEAST_INLIERS
+    if held.sum() < 3:
+        raise InputError(
+            f"only {int(held.sum())} of {len(views)} photos share enough points for heights, 3 were needed; "
+            "fly with at least 70 % overlap along and 60 % across the strips"
+        )
+    return np.asarray(held)
+
+
+def _one_tilt(rotations: Floats) -> Floats:
+    """(N, 3, 3) the rotations site_from_camera with the least turn that gives all of them their usual tilt."""
+    usual = np.median(rotations[:, 2], axis=0)
+    turn = np.cross(usual / np.linalg.norm(usual), rotations[:, 2])
+    return rotations @ rotation_from_vector(turn)
+
+
+def _laid(scene: Scene, priors: Priors, held: Mask) -> Scene:
+    """The scene turned, scaled and shifted as one to fixes and attitudes: an adjustment's steps, which each point
+    resists, end before it is there."""
+    centres, fixes = scene.centres_m[held], priors.fixes_m[held]
+    middle, there = centres.mean(axis=0), fixes.mean(axis=0)
+    sigma_m = float(priors.sigmas_m.mean())
+    turns = priors.rotations[held] @ scene.rotations[held].transpose(0, 2, 1)
+    across = (fixes - there).T @ (centres - middle) / sigma_m**2
+    # all have one tilt: N attitudes know no more of it than one
+    lean = turns.mean(axis=0) / np.radians(_STEADY_DEG[0]) ** 2
+    u, _, vt = np.linalg.svd(across + lean)
+    turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
+    turned = (centres - middle) @ turn.T
+    scale = float(((fixes - there) * turned).sum() / (turned**2).sum())
+    centres_m, points_m = (
+        scale * (each - middle) @ turn.T + there for each in (scene.centres_m, scene.points_m)
+    )
+    return replace(scene, centres_m=centres_m, points_m=points_m, rotations=turn @ scene.rotations)
 
 
 def _first(views: Sequence[View], tracks: Tracks) -> Scene:
@@ -317,9 +390,7 @@ def _sigmas_m(scatter_m: Floats, count: int, freedom: float) -> Floats:
     return np.asarray(np.broadcast_to(np.maximum(spread, _LEAST_SIGMA_M), (count, 3)))
 
 
-def _solved(
-    views: Sequence[View], scene: Scene, priors: Priors, held: Mask, settings: AdjustmentSettings
-) -> Cameras3D:
+def _solved(views: Sequence[View], scene: Scene, priors: Priors, held: Mask) -> Cameras3D:
     scale = float(np.exp(scene.shared[0]))
     moved = tuple(
         replace(
@@ -339,11 +410,6 @@ def _solved(
     pieces = np.asarray(connected_components(ties, directed=False)[1], int)
     with np.errstate(invalid="ignore"):
         off = (scene.centres_m - priors.fixes_m)[held]
-    # The pictures weighed as they fit (their residuals' median), which is better than the
-    # settings assume.
-    fit_px = SIGMA_PER_MEDIAN_DEVIATION * float(np.nanmedian(np.abs(residual)))
-    weighed = replace(settings, sigma_px=max(fit_px, LEAST_SIGMA_PX))
-    sigma = SmoothSigma.fitted(scene.points_m[:, :2], height_deviations(scene, priors, weighed))
     return Cameras3D(
         moved,
         tuple(view.name for k, view in enumerate(views) if not held[k]),
@@ -353,11 +419,11 @@ def _solved(
         (float(scene.shared[1]), float(scene.shared[2])),
         np.sqrt(np.nanmean(off**2, axis=0)),
         len(scene.view),
-        sigma,
-        matched_deviations(scene, priors, weighed),
-        np.bincount(scene.point, minlength=len(scene.points_m)),
-        np.array([np.nanmedian(miss_px[scene.view == k]) for k in np.flatnonzero(held)]),
-        pieces[: len(views)][held],
+        point_views=np.bincount(scene.point, minlength=len(scene.points_m)),
+        view_residuals_px=np.array(
+            [np.nanmedian(miss_px[scene.view == k]) for k in np.flatnonzero(held)]
+        ),
+        view_pieces=pieces[: len(views)][held],
     )
 
 

@@ -171,7 +171,7 @@ def through_trees(settings: PlanSettings, hidden: float) -> PlanSettings:
     """The flight that `search --through-trees` needs below crowns that hide this share of the floor.
 
     Pictures overlap as settings ask for, or more: strips tie to each other, and enough pictures show each spot between
-    crowns. Raises SettingsError for a share that no flight looks through.
+    crowns. No detector has to see, unless one is named. Raises SettingsError for a share that no flight looks through.
     """
     most = 1 - _FREE_VIEWS * (1 - _MOST_OVERLAP) ** 2
     if not 0 <= hidden <= most:
@@ -182,7 +182,7 @@ def through_trees(settings: PlanSettings, hidden: float) -> PlanSettings:
     apart = min(1 - _TIED_OVERLAP, (1 - hidden) / (_FREE_VIEWS * (1 - _MOST_OVERLAP)))
     return replace(
         settings,
-        model="none",
+        model="none" if settings.model == PlanSettings.model else settings.model,
         forward_overlap=max(settings.forward_overlap, _MOST_OVERLAP),
         side_overlap=max(settings.side_overlap, 1 - apart),
     )

@@ -14,7 +14,7 @@ from sorvolo.canopy.integral import LEAST_VIEWS, Floor, Picture, UnderTrees, lay
 from sorvolo.canopy.planting import PlantedFloor, free_share, plant_on_floor
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats32, ImageRGBA, Numbers
-from sorvolo.heights.cameras import Cameras3D, find_tracks, solve_tracks
+from sorvolo.heights.cameras import Cameras3D, find_tracks, solve_steady, solve_tracks
 from sorvolo.heights.field import HeightField
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.views import View, ground_outlines_m
@@ -44,8 +44,10 @@ from sorvolo.survey.wording import counted
 _PICTURES_BYTES = 224 << 20
 _LEAST_CELL_M = 0.08  # a body is ten cells long; finer ones cost more and show no more
 _GRAY = 12  # levels between the colours of a pixel in a thermal picture, at most
-_FLOOR_M = -30.0, 5.0  # where the floor is looked for, above the map's level ground
-_ATTITUDE_SIGMA_DEG = 0.5  # of the map's attitudes where points alone do not hold the cameras
+_FLOOR_M = (
+    -40.0,
+    5.0,
+)  # where the floor is looked for, above the map's level ground: that may be crowns
 _MOST_STRETCH = 0.06  # of the focal length, three sigmas of what it may be off
 _POD = "pod", "pod_low", "pod_high"
 _RING_M = 2.0  # around a find
@@ -111,7 +113,7 @@ def search_under_trees(
         def picture(number: int) -> Floats32:
             return np.asarray(kept.get(number, lambda: load(number)) * np.float32(0.5))
 
-        lattice = Lattice.over(ground_outlines_m(views), height_grid(site, cell_m))
+        lattice = Lattice.over(ground_outlines_m(views, _FLOOR_M[0]), height_grid(site, cell_m))
         under, floor, finds = look_under_trees(views, picture, lattice, *_FLOOR_M)
         planted = None
         if is_thermal:
@@ -172,16 +174,16 @@ def _solved(
     """The cameras in space, as solved before where heights are made, else none, and a warning where they are not what
     they should be.
 
-    Where crowns share few points, cameras that are free end anywhere; then the map's attitudes hold them.
+    Where crowns share few points, cameras that are free end anywhere; then a gimbal's one tilt and the fixes hold them.
     """
     try:
         tracks = None
-        for sigma_deg, most_lost in ((None, 0.1), (_ATTITUDE_SIGMA_DEG, 0.3)):
-            if sigma_deg is None and before is not None:
+        for is_free, most_lost in ((True, 0.1), (False, 0.3)):
+            if is_free and before is not None:
                 solved = before
             else:
                 tracks = tracks or find_tracks(views, pictures.gray)
-                solved = solve_tracks(views, tracks, sigma_deg)
+                solved = (solve_tracks if is_free else solve_steady)(views, tracks)
             why = (
                 f"points hold {len(solved.views)} of {len(views)} pictures, and a focal length "
                 f"{solved.focal_scale:.2f} times the map's"
@@ -190,8 +192,8 @@ def _solved(
                 len(solved.lost) <= most_lost * len(views)
                 and abs(np.log(solved.focal_scale)) < _MOST_STRETCH
             ):
-                held = f"{why}: people may be missed; fly slower and with narrower strips"
-                return solved, "" if sigma_deg is None else held
+                held = f"{why}: the camera's tilt was taken as steady, and people may be missed if it was not"
+                return solved, "" if is_free else held
     except InputError as error:
         why = f"{error}"
     return None, (
@@ -200,11 +202,11 @@ def _solved(
 
 
 def _at_body_size(views: Sequence[View]) -> tuple[list[View], float]:
-    """The views with pixels no finer than the cells, and the cells' side, m."""
+    """The views with pixels on the lowest floor no finer than the cells, and the cells' side, m."""
     height_m = float(np.median([each.site_from_camera.translation_m[2] for each in views]))
-    pixel_m = height_m / views[0].camera.fx_px
-    cell_m = float(f"{max(pixel_m, _LEAST_CELL_M):.3g}")
-    share = min(1.0, pixel_m / cell_m * 1.25)
+    focal_px = views[0].camera.fx_px
+    cell_m = float(f"{max(height_m / focal_px, _LEAST_CELL_M):.3g}")
+    share = min(1.0, (height_m - _FLOOR_M[0]) / focal_px / cell_m * 1.25)
     smaller = [
         each.camera.resized(
             *(max(32, round(n * share)) for n in (each.camera.width_px, each.camera.height_px))
