@@ -42,7 +42,8 @@ _MARGIN = 0.2  # of a picture: features so far beside what two views share on le
 _NEARLY_ALL = 0.9  # of two views' features: what these do not share, all of them do not
 _REJECTED_PX = (8.0, 3.0)  # observations farther off are dropped, round by round
 _LEAST_SIGMA_M = 0.02  # of a fix
-_STEADY_DEG = 10.0, 1.0, 0.3  # sigma of a gimbal's tilt about the one found before, round by round
+# sigma of a gimbal's tilt about the one found before, round by round
+_STEADY_DEG = (10.0, 10.0, 3.0, 1.0, 0.3)
 
 
 @dataclass(frozen=True, eq=False)
