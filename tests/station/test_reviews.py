@@ -228,11 +228,14 @@ def test_what_a_watch_found_is_reviewed_as_all_findings_are(client: TestClient) 
 
 
 def test_two_watches_of_one_flight_find_each_thing_once(client: TestClient) -> None:
-    for run in ("run-1", "run-2"):
-        watch_run(client.app.state.station, run)
+    """Whatever its clock states."""
+    for run, day in (("run-1", "2026-05-01"), ("run-2", "2026-05-01"), ("run-3", "2031-05-01")):
+        watch_run(client.app.state.station, run, day=day)
     found = client.get("/api/sites/field/collections/objects/items").json()["features"]
     assert [each["properties"]["class"] for each in found] == ["person", "car"]
-    assert [sorted(each["properties"]["missions"]) for each in found] == [["run-1", "run-2"]] * 2
+    assert [sorted(each["properties"]["missions"]) for each in found] == [
+        ["run-1", "run-2", "run-3"]
+    ] * 2
 
 
 def test_a_watch_needs_no_site_and_others_see_nothing_of_it(client: TestClient) -> None:

@@ -15,7 +15,11 @@ PICTURE = jpeg_from_image(np.full((32, 32, 3), 120, np.uint8))
 
 
 def watch_run(
-    station: Station, run: str, site: str = "field", place: tuple[float, float] = (11.0, 46.0)
+    station: Station,
+    run: str,
+    site: str = "field",
+    place: tuple[float, float] = (11.0, 46.0),
+    day: str = "2026-05-01",
 ) -> Path:
     """A watch of a site that found a person, with a picture, and a car, without; the folder of its results."""
     began, ended = "2026-05-01T10:00:00Z", "2026-05-01T10:01:00Z"
@@ -30,8 +34,8 @@ def watch_run(
     (results / "objects" / "1.jpg").write_bytes(PICTURE)
     common = {
         "score": 0.9,
-        "first_seen": "2026-05-01T10:00:00Z",
-        "last_seen": "2026-05-01T10:00:09Z",
+        "first_seen": f"{day}T10:00:00Z",
+        "last_seen": f"{day}T10:00:09Z",
         "path": [1],
     }
     rows = [
