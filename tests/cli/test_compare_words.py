@@ -7,11 +7,7 @@ import pytest
 from rich.console import Console
 
 from sorvolo.cli.compare import _class_words, show_results
-from sorvolo.cli.printing import announce_people
-from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.missions.compare.report import comparison_headline
-from sorvolo.store.site.archive import Archive
-from sorvolo.survey.flight import Site
 
 COVERED = {
     "in_short": "1 car came",
@@ -61,16 +57,6 @@ def test_withdrawn_changes_are_named(tmp_path: Path) -> None:
     assert "withdrawn (not confirmed by the whole flight): b-4, b-7" in console.export_text()
     show_results([result | {"withdrawn": []}], tmp_path, console)
     assert "withdrawn (" not in console.export_text()
-
-
-def test_a_person_whom_a_comparison_found_is_announced(tmp_path: Path) -> None:
-    """With the bell, in a line with the place."""
-    with Archive.open(tmp_path, write=True) as archive:
-        archive.create_site(Site("field", Geodetic(41.9, 12.6, 0.0), "EPSG:32633", 0.03))
-    person = {"id": "b-o1", "class": "person", "east_m": 0.0, "north_m": 0.0, "score": 0.8}
-    console = Console(record=True, width=120, file=(out := StringIO()))
-    announce_people({"list": [person]}, tmp_path, console)
-    assert "PERSON FOUND  b-o1 at 41.9" in out.getvalue()
 
 
 def test_notices_and_the_report_are_shown_as_by_map(tmp_path: Path) -> None:

@@ -159,11 +159,13 @@ def test_the_headline_counts_what_was_looked_at_and_people_are_events(
     events = [json.loads(each) for each in lines.getvalue().splitlines()]
     people = [row for row in objects["list"] if row["class"] == "person"]
     assert [each["type"] for each in events] == [worker.PERSON_FOUND] * len(people) != []
-    assert {each["data"]["feature"]["properties"]["id"] for each in events} >= {
-        row["id"] for row in people
-    }
+    told = {each["data"]["feature"]["properties"]["id"] for each in events}
+    with Archive.open(mapped, write=False) as archive:
+        findings = [each for each in archive.register().findings if each.id in told]
+    seen = {sighting.id for each in findings for sighting in each.sightings}
+    assert seen == {row["id"] for row in people}
 
-    announce_people(objects, mapped, Console(force_terminal=True, width=200))
+    announce_people(report, mapped, Console(force_terminal=True, width=200))
     shown = capsys.readouterr().out
     assert shown.count("\a") == shown.count("PERSON FOUND") == len(people)
 

@@ -4,6 +4,7 @@ import json
 import sqlite3
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
+from io import BytesIO, StringIO
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -15,11 +16,14 @@ from fake_changes import SEEN_NS, fake_change, fake_comparison
 from fake_flights import LOCAL_SITE, SITE, frame, map_flight, tile
 from hypothesis import given
 from hypothesis import strategies as st
+from rich.console import Console
 
 from sealing import seal_again
+from sorvolo.cli.printing import announce_people
 from sorvolo.errors import InputError, StoreError
 from sorvolo.findings.importance import between
 from sorvolo.geometry.polygons import signed_area
+from sorvolo.missions.worker import PERSON_FOUND, Journal, _add_people
 from sorvolo.store.exports.change_files import changes_geojson, mask_name, write_view_masks
 from sorvolo.store.exports.places import Placemark, gpx_bytes, kml_bytes, longitude_latitude
 from sorvolo.store.site.archive import Archive
@@ -270,6 +274,21 @@ def test_changes_enter_the_register_by_the_order_of_flights(folder: Path) -> Non
             ("c", "", False),
         }
         assert between(archive.register(), "a", "b").endswith("1 thing left")
+
+
+def test_a_person_whom_a_comparison_alone_found_is_announced(folder: Path) -> None:
+    """Who walks, and is found in no frame by itself: with the bell, in a line with the place, and to a station."""
+    walks = fake_change(1, kind=ChangeKind.MOVING, velocity_m_s=(1.0, 0.0))
+    with Archive.open(folder, write=True) as archive:
+        compare(archive, "b", [replace(walks, class_after="person"), fake_change(2)])
+    console = Console(force_terminal=True, width=120, file=(out := StringIO()))
+    announce_people({"flight": "b", "objects": {"model": "default"}}, folder, console)
+    assert out.getvalue().count("\a") == out.getvalue().count("PERSON FOUND") == 1
+    assert " at 46.4999" in out.getvalue()
+    lines = BytesIO()
+    _add_people(Journal(lines), folder, ["a", "b"])
+    (told,) = (json.loads(each) for each in lines.getvalue().splitlines())
+    assert told["type"] == PERSON_FOUND and told["data"]["feature"]["properties"]["score"] == 0.8
 
 
 @pytest.mark.usefixtures("kind")

@@ -238,7 +238,7 @@ def show_results(
 
     for result in results:
         _show_result(result, console, form, sort, least_m)
-        announce_people(result["objects"], site, console)
+        announce_people(result, site, console)
         folder = site / "flights" / result["flight"]
         show_path("page", folder / "changes.html", console)
         show_path("list", features_path(folder, "changes"), console)

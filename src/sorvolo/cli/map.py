@@ -242,7 +242,7 @@ def show_reports(reports: Sequence[Mapping[str, Any]], site: Path, console: Cons
             if text:
                 table.add_row(name, text)
         console.print(escape(report["headline"]["text"]), style="bold")
-        announce_people(report["objects"], site, console)
+        announce_people(report, site, console)
         console.print(table)
         show_notices_and_warnings(report, console)
     for name, path in _map_files(site).items():

@@ -39,19 +39,21 @@ def announce_person(words: str, console: Console) -> None:
     console.print(f"[bold red]PERSON FOUND[/bold red]  {escape(words)}", soft_wrap=True)
 
 
-def announce_people(objects: Mapping[str, Any], folder: Path, console: Console) -> None:
-    """Print each person that a map shows, by a report's part on objects; `folder` has the site."""
-    import numpy as np
-
+def announce_people(report: Mapping[str, Any], folder: Path, console: Console) -> None:
+    """Print each person that a map or a comparison found, by its report; `folder` has the site."""
+    from sorvolo.geometry.coordinates import Coordinates, place_text
+    from sorvolo.store.site.archive import Archive
     from sorvolo.survey.objects import PERSON
 
-    people = [row for row in objects.get("list", ()) if row["class"] == PERSON]
-    if not people:
+    if not report["objects"].get("model"):
         return
-    words = place_words(site_of(folder), "latlon")
-    for row in people:
-        place = words(np.array([row["east_m"], row["north_m"], 0.0]))
-        announce_person(f"{row['id']} at {place}, score {row['score']:.2f}", console)
+    with Archive.open(folder, write=False) as archive:
+        people, is_local = archive.findings(report["flight"], PERSON), archive.site().is_local
+    for each in people:
+        x, y = each["geometry"]["coordinates"]
+        place = f"{x:+.1f}, {y:+.1f}" if is_local else place_text(y, x, Coordinates("latlon"))
+        score = each["properties"]["score"]
+        announce_person(f"{each['id']} at {place}, score {score:.2f}", console)
 
 
 def show_path(name: str, path: Path, console: Console) -> None:

@@ -235,7 +235,7 @@ def _map_all(
         )
         mapped = run_on_site(mapping, place, lambda rows: show_progress(rows, console), "mapped")
     for folder in mapped:
-        announce_people(read_json(folder / "report.json")["objects"], place.folder, console)
+        announce_people(read_json(folder / "report.json"), place.folder, console)
 
 
 def _map_of(inputs: Sequence[str]) -> str:

@@ -408,21 +408,15 @@ def _add_people(
     journal: Journal, site: Path, flights: Sequence[str], *, below_crowns: bool = False
 ) -> None:
     """Write each person that flights of the site found, in single pictures or by a look below crowns."""
-    from sorvolo.store.exports.change_files import objects_geojson
+    from sorvolo.findings.register import KnownBy
     from sorvolo.store.site.archive import Archive
-    from sorvolo.store.site.change_records import is_under_trees
     from sorvolo.survey.objects import PERSON
 
     with Archive.open(site, write=False) as archive:
-        people = [
-            each
-            for flight in flights
-            for each in archive.objects(flight)
-            if each.thing.label == PERSON and is_under_trees(each.thing.id) == below_crowns
-        ]
-        place = archive.site()
-    for feature in objects_geojson(people, place, crops_from_site=True)["features"]:
-        journal.add(PERSON_FOUND, {"feature": feature, "is_local": place.is_local})
+        is_local = archive.site().is_local
+        for feature in (each for flight in flights for each in archive.findings(flight, PERSON)):
+            if (KnownBy.UNDER_TREES in feature["properties"]["origins"]) == below_crowns:
+                journal.add(PERSON_FOUND, {"feature": feature, "is_local": is_local})
 
 
 def _add_frame(journal: Journal, view: "FrameView | None", name: str, status: str) -> None:

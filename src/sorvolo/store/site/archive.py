@@ -256,8 +256,9 @@ class Archive:
         the site does not keep."""
         return self.catalogue_rows(site_register, flights, others, their_looks)
 
-    def findings(self, flight_id: str | None = None) -> FeatureList:
-        """Each thing on the ground that any mission found, once, as a point; of one flight, what that saw.
+    def findings(self, flight_id: str | None = None, label: str = "") -> FeatureList:
+        """Each thing on the ground that any mission found, once, as a point; of one flight, what that saw; of a class,
+        what any of these sightings has for one.
 
         `gone` names the flight that looked there and did not find it, null where it still stands.
         """
@@ -265,7 +266,10 @@ class Archive:
         found = [
             each
             for each in ordered(self.register().findings)
-            if flight_id is None or flight_id in each.dates
+            if any(
+                flight_id in (None, seen.date) and label in ("", seen.label)
+                for seen in each.sightings
+            )
         ]
         features = []
         for each in found:
@@ -279,6 +283,7 @@ class Archive:
                         "score": rounded(each.newest.score, 4),
                         "sigma_m": rounded(each.sigma_m, 3),
                         "length_m": rounded(each.newest.length_m, 2),
+                        "origins": sorted({seen.origin.value for seen in each.sightings}),
                         "flights": list(each.dates),
                         "gone": each.gone or None,
                         "first_seen": utc_text(each.first_ns),
