@@ -281,7 +281,7 @@ def test_a_person_whom_a_comparison_alone_found_is_announced(folder: Path) -> No
     walks = fake_change(1, kind=ChangeKind.MOVING, velocity_m_s=(1.0, 0.0))
     with Archive.open(folder, write=True) as archive:
         compare(archive, "b", [replace(walks, class_after="person"), fake_change(2)])
-    console = Console(force_terminal=True, width=120, file=(out := StringIO()))
+    console = Console(force_terminal=True, highlight=False, file=(out := StringIO()))
     announce_people({"flight": "b", "objects": {"model": "default"}}, folder, console)
     assert out.getvalue().count("\a") == out.getvalue().count("PERSON FOUND") == 1
     assert " at 46.4999" in out.getvalue()
