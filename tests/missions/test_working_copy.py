@@ -17,11 +17,13 @@ from sorvolo.cli.main import main
 from sorvolo.errors import SorvoloWarning, StoreError
 from sorvolo.missions.site.copy import copy_site
 from sorvolo.missions.site.history import site_history
+from sorvolo.missions.site.review import list_changes, review_changes, withdraw_reviews
 from sorvolo.missions.site.working_copy import fetch_site, send_site
 from sorvolo.store.copies.bucket import BucketEnd
 from sorvolo.store.copies.object_store import open_objects
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.files import ORIGIN, UNSENT
+from sorvolo.survey.findings import Verdict
 
 
 @pytest.fixture(scope="module")
@@ -104,6 +106,20 @@ def test_two_machines_add_flights_in_turn(
         BucketEnd(open_objects(address)).manifest().generation == 2
         and open_objects(address).sizes("") == before
     )
+
+
+def test_a_verdict_that_another_machine_withdrew_is_gone(
+    machine: Callable[[str], None], states: dict[str, Path]
+) -> None:
+    address = f"s3://{BUCKET}/withdrawn"
+    here = work(states["first"], address)
+    (first, *_) = review_changes(here, [list_changes(here)[0].id], Verdict.CONFIRMED)
+    ended(send_site(address))
+    machine("two")
+    withdraw_reviews(fetched(address, writes=True), [first.id])
+    ended(send_site(address))
+    machine("one")
+    assert [each.verdict for each in list_changes(fetched(address))] == [None, None]
 
 
 def test_tiles_and_pictures_come_when_they_are_asked_for(

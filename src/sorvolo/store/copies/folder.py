@@ -260,6 +260,9 @@ _OF_THE_FOLDER = frozenset(
 class FolderEnd:
     """A folder that a site is copied from or to."""
 
+    may_lose = False
+    """Whether the site here may be replaced by a state that lacks what it holds."""
+
     def __init__(self, folder: Path, catalogues: Catalogues | None = None) -> None:
         """A new copy's catalogue goes where `catalogues` has it; None: a file in the folder."""
         self.folder, self.name, self._catalogues = folder, str(folder), catalogues
@@ -332,7 +335,8 @@ class FolderEnd:
             held, files, _ = self._snapshot(scratch / f"held-{CATALOGUE}")
             if held is not None:
                 refuse_other(self.name, held.identity, new.held)
-                refuse_loss(self.name, missing_from(held, files, new))
+                if not self.may_lose:
+                    refuse_loss(self.name, missing_from(held, files, new))
         self.folder.mkdir(exist_ok=True)
         note = {"identity": new.held.identity, "newest_version": new.held.newest}
         atomic_write_bytes(self.folder / COPYING, json.dumps(note).encode())

@@ -198,6 +198,8 @@ class StoreOrigin:
 class _WorkingFolder(FolderEnd):
     """The folder of a working copy: what is fetched when asked for need not be there; the store replaces it."""
 
+    may_lose = True  # all that was added here was sent before
+
     @property
     def has_map(self) -> bool:
         """Whether a flight was ever completed."""
@@ -206,11 +208,6 @@ class _WorkingFolder(FolderEnd):
     def lacks(self, state: SiteState) -> list[SiteFile]:
         """Nothing that comes when it is asked for."""
         return [each for each in super().lacks(state) if not each.is_lasting]
-
-    def _refuse_loss(
-        self, held: CatalogueState, files: Mapping[str, SiteFile], new: SiteState
-    ) -> None:
-        """All that was added here was sent before."""
 
 
 def known_manifest(folder: Path) -> Manifest | None:
