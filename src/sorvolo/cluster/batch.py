@@ -238,7 +238,7 @@ def _read(path: Path) -> dict[tuple[str, str], BatchRow]:
                     )
             elif plain is not None:
                 if (seen := plain["scouted"]) is not None:
-                    seen = Scouted(**{**seen, "box": tuple(seen["box"]) if seen["box"] else None})
+                    seen = Scouted(**seen)
                 row = BatchRow(**{**plain, "scouted": seen})
                 rows.pop((row.mission, row.source), None)  # from when its files could not be read
                 rows[row.key] = row
@@ -328,9 +328,7 @@ def run_batch(
             if ending is None or row.state == "waiting":
                 continue
             if row.state == "done":
-                box = ending.inspected["box"]
-                scouted = Scouted(**{**ending.inspected, "box": tuple(box) if box else None})
-                row = replace(_new_row_of(row), scouted=scouted)
+                row = replace(_new_row_of(row), scouted=Scouted(**ending.inspected))
             looked[row.source] = row
         rows = [looked.get(row.source, row) for row in rows]
 

@@ -95,6 +95,10 @@ class Scouted:
     start_ns: int
     box: Box | None
 
+    def __post_init__(self) -> None:
+        if self.box is not None:  # JSON has lists
+            object.__setattr__(self, "box", tuple(self.box))
+
 
 @dataclass(frozen=True)
 class ExistingSite:

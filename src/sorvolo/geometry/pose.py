@@ -1,6 +1,7 @@
 """Rigid motion between two frames, and the attitudes that telemetry speaks in."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -102,6 +103,16 @@ def body_nadir_angles_from_rotation(
         _ENU_FROM_NED.T @ site_from_camera_rotation @ (_NADIR_MOUNT @ _GIMBAL_FROM_CAMERA).T
     )
     return _angles_from_ned(ned_from_body)
+
+
+def body_angles_deg(w: Any, x: Any, y: Any, z: Any) -> dict[str, Any]:
+    """Body angles (deg, z-y-x) of unit quaternions from body axes (forward, right, down) to north, east, down: numbers,
+    or arrays of one shape; named as telemetry's columns are."""
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    names = ("body_yaw_deg", "body_pitch_deg", "body_roll_deg")
+    return dict(zip(names, map(np.degrees, (yaw, pitch, roll))))
 
 
 def gimbal_angles_from_rotation(site_from_camera_rotation: Matrix3) -> tuple[float, float, float]:

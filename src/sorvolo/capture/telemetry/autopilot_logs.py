@@ -16,6 +16,7 @@ from sorvolo.capture.telemetry.cleaning import clean, notice, sigma_from_hdop_m
 from sorvolo.capture.telemetry.nmea import Epoch
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats
+from sorvolo.geometry.pose import body_angles_deg
 from sorvolo.survey.flight import Notice, Telemetry
 
 _ULOG = b"ULog\x01\x12\x35"  # PX4's developer guide, "ULog File Format"
@@ -137,8 +138,8 @@ class UlogReader:
             fixes.add((boot_us[row] + zero_us) / 1e6, **_ulog_fix(gps, row))
         turned = found.get("vehicle_attitude", {})
         for row, time_us in enumerate(turned.get("timestamp", ())):
-            angles = _angles_deg(*(float(turned[f"q[{each}]"][row]) for each in range(4)))
-            attitude.add((time_us + zero_us) / 1e6, **angles)
+            turn = (float(turned[f"q[{each}]"][row]) for each in range(4))
+            attitude.add((time_us + zero_us) / 1e6, **body_angles_deg(*turn))
         local = found.get("vehicle_local_position", {})
         for row, time_us in enumerate(local.get("timestamp", ())):
             above_m = float(local["z"][0] - local["z"][row])
@@ -162,17 +163,6 @@ def _ulog_fix(gps: Mapping[str, Floats], row: int) -> dict[str, float]:
         "horizontal_sigma_m": value("eph", "", 1.0),
         "vertical_sigma_m": value("epv", "", 1.0),
         "speed_m_s": value("vel_m_s", "", 1.0),
-    }
-
-
-def _angles_deg(w: float, x: float, y: float, z: float) -> dict[str, float]:
-    """Body angles from the turn of body axes (forward, right, down) into north, east, down."""
-    return {
-        "body_yaw_deg": float(np.degrees(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))),
-        "body_pitch_deg": float(np.degrees(np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0)))),
-        "body_roll_deg": float(
-            np.degrees(np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)))
-        ),
     }
 
 

@@ -23,6 +23,7 @@ from sorvolo.capture.telemetry.cleaning import (
 )
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, Mask, TimesNs
+from sorvolo.geometry.pose import body_angles_deg
 from sorvolo.geometry.units import SECOND_NS
 from sorvolo.survey.flight import Notice, Telemetry
 
@@ -317,7 +318,11 @@ def _attitude_of(numbers: Mapping[str, Floats]) -> dict[str, Floats]:
     parts = [numbers[f"quaternion_{axis}"] for axis in "wxyz" if f"quaternion_{axis}" in numbers]
     if len(parts) < 4:
         return {}
-    return dict(zip(("body_yaw_deg", "body_pitch_deg", "body_roll_deg"), _angles(*parts)))
+    norm = np.sqrt(sum(each * each for each in parts))
+    with np.errstate(divide="ignore", invalid="ignore"):  # NaN for no rotation
+        parts = [np.where(np.abs(norm - 1) < 0.1, each / norm, np.nan) for each in parts]
+    angles_deg = body_angles_deg(*parts)
+    return {**angles_deg, "body_yaw_deg": angles_deg["body_yaw_deg"] % 360}
 
 
 def _has_numbers(columns: Mapping[str, Floats], key: str) -> bool:
@@ -331,19 +336,6 @@ def _repeats_height(columns: Mapping[str, Floats]) -> bool:
     apart_m = np.abs(columns["orthometric_height_m"] - columns["height_above_takeoff_m"])
     known = np.isfinite(apart_m)
     return bool(known.any() and (apart_m[known] <= _SAME_HEIGHT_M).all())
-
-
-def _angles(w: Floats, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats, Floats]:
-    """Yaw, pitch, roll (deg, z-y-x) of quaternions from body to north-east-down; NaN for no rotation."""
-    norm = np.sqrt(w * w + x * x + y * y + z * z)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        w, x, y, z = (
-            np.where(np.abs(norm - 1) < 0.1, each / norm, np.nan) for each in (w, x, y, z)
-        )
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    return np.degrees(yaw) % 360, np.degrees(pitch), np.degrees(roll)
 
 
 def _times(

@@ -1,5 +1,6 @@
 """Single pictures of many small sites, each seen once from its own height, angle and light, with the truth."""
 
+import os
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
@@ -356,7 +357,7 @@ def _place(
     return float(east), float(north), float(rng.uniform(0, 360))
 
 
-_MOST_THREADS = 8  # each holds a picture that is drawn, of tens of megabytes
+_THREADS = min(8, os.cpu_count() or 1)  # each holds a picture that is drawn, of tens of megabytes
 
 
 @dataclass(frozen=True)
@@ -387,7 +388,7 @@ def simulate_pictures(folder: AnyPath, settings: PictureSettings) -> Iterator[Pi
         pictures = in_order(
             lambda index: simulate_picture(settings, index),
             range(settings.pictures),
-            most_threads=_MOST_THREADS,
+            threads=_THREADS,
         )
         for picture in pictures:
             row = _image_row(picture, settings.seed)

@@ -1,5 +1,6 @@
 """Make a folder of simulated flights with everything that drones leave behind, and the truth beside it."""
 
+import os
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
@@ -39,7 +40,7 @@ from sorvolo.store.atomic import make_folder, writing
 from sorvolo.store.rasters.geotiff import write_cog
 
 _CRF = 20  # x264's quality, lower is better; by choice
-_MOST_THREADS = 4  # each holds a frame that is drawn, of tens of megabytes
+_THREADS = min(4, os.cpu_count() or 1)  # each holds a frame that is drawn, of tens of megabytes
 _SUFFIXES = {"csv": ".csv", "srt": ".srt", "nmea": ".nmea", "gpx": ".gpx"}
 
 
@@ -125,7 +126,7 @@ def _write_flight(flight: SimulatedFlight, folder: Path) -> Iterator[int]:
         with writing(folder):
             (folder / "photos").mkdir()
         rows = _photo_rows(flight)
-        for frame in in_order(flight.frame, range(len(flight)), most_threads=_MOST_THREADS):
+        for frame in in_order(flight.frame, range(len(flight)), threads=_THREADS):
             write_photo(folder / "photos" / frame.name, frame, flight.camera, rows[frame.index])
             yield frame.index + 1
         return
@@ -133,7 +134,7 @@ def _write_flight(flight: SimulatedFlight, folder: Path) -> Iterator[int]:
     with video_writer(
         folder / f"{flight.name}.mp4", size_px, flight.settings.imaging.fps, flight.started_ns, _CRF
     ) as write:
-        for frame in in_order(flight.frame, range(len(flight)), most_threads=_MOST_THREADS):
+        for frame in in_order(flight.frame, range(len(flight)), threads=_THREADS):
             write(frame.image)
             yield frame.index + 1
 

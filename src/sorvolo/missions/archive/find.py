@@ -1,13 +1,14 @@
 """The memory of a place over a whole archive: which flights of which sites saw it, and what they found there."""
 
-from datetime import UTC, date, datetime, time
+from datetime import UTC, datetime, time, timedelta
 from pathlib import Path
 
 from sorvolo.errors import InputError, SettingsError
+from sorvolo.store.exports.plain import moment_of
 from sorvolo.store.index.archive_index import ArchiveIndex
 from sorvolo.store.index.finding import EARLIEST_NS, LATEST_NS, FoundFlight, Place
 
-_MICROSECOND_NS = 1000
+_MICROSECOND = timedelta(microseconds=1)
 
 
 def find_place(
@@ -52,18 +53,5 @@ def _degrees(text: str) -> tuple[float, float]:
 
 def _nanoseconds(text: str, of_day: time) -> int:
     """A moment, ns since 1970; a date stands for its first or last one."""
-    try:
-        moment = datetime.combine(date.fromisoformat(text), of_day, UTC)
-    except ValueError:
-        try:
-            moment = datetime.fromisoformat(text)
-        except ValueError as error:
-            raise SettingsError(
-                f"{text!r} is not a date; give 2026-05-31, or 2026-05-31T12:00"
-            ) from error
-    moment = moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
-    since = moment - datetime(1970, 1, 1, tzinfo=UTC)
-    nanoseconds = (
-        (since.days * 86_400 + since.seconds) * 1_000_000 + since.microseconds
-    ) * _MICROSECOND_NS
-    return min(max(nanoseconds, EARLIEST_NS), LATEST_NS)
+    since = moment_of(text, of_day) - datetime(1970, 1, 1, tzinfo=UTC)
+    return min(max(since // _MICROSECOND * 1000, EARLIEST_NS), LATEST_NS)

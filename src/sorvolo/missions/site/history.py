@@ -3,12 +3,13 @@
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, date, datetime, time, timedelta
+from datetime import datetime, time, timedelta
 from pathlib import Path
 
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.findings.importance import between
 from sorvolo.store.exports.map_pictures import write_kmz, write_preview
+from sorvolo.store.exports.plain import moment_of
 from sorvolo.store.rasters.geotiff import write_cog, write_mbtiles_or_pdf
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import VersionEntry
@@ -182,16 +183,7 @@ def _moment(text: str) -> datetime:
 
     A list shows times without their seconds: what it lists as complete at a minute was so at the minute's end.
     """
-    try:
-        return datetime.combine(date.fromisoformat(text), time.max, UTC)
-    except ValueError:
-        pass
-    try:
-        moment = datetime.fromisoformat(text)
-    except ValueError as error:
-        raise SettingsError(
-            f"{text!r} is no version and no date; give a number, 2026-05-31, or 2026-05-31T12:00"
-        ) from error
+    moment = moment_of(text, time.max, "a version's number or a date")
     time_of_day = re.search(r"[Tt ]([\d:.,]+)", text)
     step = _STEPS.get(sum(letter.isdecimal() for letter in time_of_day[1])) if time_of_day else None
     return moment if step is None else moment + step - timedelta(microseconds=1)

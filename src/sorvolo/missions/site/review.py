@@ -29,11 +29,7 @@ def review_changes(
     """
     if not ids:
         raise InputError("no change was named; give the ids that `sorvolo review SITE` lists")
-    with Archive.open(
-        site, write=False
-    ):  # without a site there is nothing to review: do not make one
-        pass
-    with Archive.open(site, write=True) as archive:
+    with Archive.open(site, write=True, makes=False) as archive:
         _require_flight(archive, flight)
         if flight is None:
             _demand_whole_ids(archive, ids)
@@ -52,11 +48,7 @@ def withdraw_reviews(site: Path, ids: Sequence[str]) -> None:
 
     Raises InputError for an unknown id, StoreError when the folder is no site or another process is writing.
     """
-    with Archive.open(
-        site, write=False
-    ):  # without a site there is nothing to withdraw: do not make one
-        pass
-    with Archive.open(site, write=True) as archive:
+    with Archive.open(site, write=True, makes=False) as archive:
         archive.withdraw_review(ids)
 
 

@@ -493,14 +493,8 @@ def _warnings(site: Site, mapped: Mapping[str, Any], frames: Sequence[CorrectedF
     return warnings
 
 
-_LEAST = {
-    "clock": 0.04,
-    "heading": 0.5,
-    "tilt": 0.5,
-    "height": 0.3,
-}  # s, deg, deg, m: smaller ones matter to nobody
-_NOT_KNOWN = {"clock": 1.0, "heading": 10.0, "height": 10.0}
-"""s (10 m of flight, or less), deg, m: right within more than this is no knowledge; by choice."""
+_LEAST_TILT_DEG = 0.5  # a smaller one matters to nobody
+_MOST_HEADING_DEG = 10.0  # within more than this "right" is no knowledge; by choice
 _TOO_FEW = "too few frames have a fix"
 _MOST_NAMED = 6  # frames in a sentence
 
@@ -508,50 +502,78 @@ _MOST_NAMED = 6  # frames in a sentence
 def fault_sentences(faults: TelemetryFaults, names: Sequence[str]) -> list[str]:
     """One sentence for each quantity that telemetry states; `names` are those of the compared frames."""
     return [
-        *_clock_words(faults.clock_s),
-        *_heading(faults.heading_deg, faults.path),
+        *_bias_words(
+            faults.clock_s,
+            (0.04, 1.0, 0.01),
+            "the clocks cannot be compared: the motion does not show an offset",
+            "whether the clocks agree cannot be known: the flight turns too little to show an offset",
+            "the clocks agree within {:.2f} s",
+            "the telemetry's clock was {value:.2f} s {side} the pictures (1 sigma {sigma:.2f} s)",
+            ("ahead of", "behind"),
+        ),
+        *_bias_words(
+            faults.heading_deg,
+            (0.5, _MOST_HEADING_DEG, 0.1),
+            "telemetry has no heading to compare",
+            f"whether the compass was right cannot be known: {_why_unknown(faults.path)}",
+            "the compass was right within {:.1f} deg",
+            "the compass was {value:.1f} deg off, too far {side} (1 sigma {sigma:.1f} deg; scatter {scatter:.1f} deg)",
+            ("clockwise", "counter-clockwise"),
+        ),
         *_outlying(faults, names),
         *_misplaced(faults, names),
         *_tilt(faults.tilt_deg),
-        *_height(faults.height_m, faults.path),
+        *_bias_words(
+            faults.height_m,
+            (0.3, 10.0, 0.1),
+            "telemetry has no height above the ground to compare",
+            "whether heights above the ground were right cannot be known: "
+            + (
+                "the GPS track is too short for its scatter"
+                if isfinite(faults.path.scale.value)
+                else _TOO_FEW
+            ),
+            "heights above the ground were right within {:.1f} m",
+            "heights above the ground were {value:.1f} m {side} (1 sigma {sigma:.1f} m)",
+            ("too high", "too low"),
+        ),
         *_map(faults.path),
         f"fixes scatter by {faults.position_m.scatter:.2f} m about the path in the pictures (1 sigma per axis)",
     ]
 
 
-def _clock_words(found: Bias) -> list[str]:
-    if not isfinite(found.value):
-        return ["the clocks cannot be compared: the motion does not show an offset"]
-    if _is_unknown(found, "clock"):
-        return [
-            "whether the clocks agree cannot be known: the flight turns too little to show an offset"
-        ]
-    if abs(found.value) < _LEAST["clock"] or not found.is_significant:
-        return [f"the clocks agree within {_within(found, 0.01):.2f} s"]
-    side = "ahead of" if found.value > 0 else "behind"
-    return [
-        f"the telemetry's clock was {abs(found.value):.2f} s {side} the pictures (1 sigma {found.sigma:.2f} s)"
-    ]
+def _bias_words(
+    found: Bias,
+    limits: tuple[float, float, float],
+    absent: str,
+    unknown: str,
+    right: str,
+    wrong: str,
+    sides: tuple[str, str],
+) -> list[str]:
+    """What a bias amounts to: not measured, not known, right within so much, or so far to one side.
 
-
-def _heading(found: Bias, path: PathFit) -> list[str]:
+    `limits`: smaller ones matter to nobody; within more than the second "right" would mislead, and the third is what
+    the words resolve. One that surely is an error is known, however large its sigma.
+    """
+    least, most, step = limits
     if not isfinite(found.value):
-        return ["telemetry has no heading to compare"]
-    if _is_unknown(found, "heading"):
-        return [f"whether the compass was right cannot be known: {_why_unknown(path)}"]
-    if abs(found.value) < _LEAST["heading"] or not found.is_significant:
-        return [f"the compass was right within {_within(found, 0.1):.1f} deg"]
-    side = "clockwise" if found.value > 0 else "counter-clockwise"
+        return [absent]
+    is_sure = isfinite(found.sigma) and found.is_significant
+    if not 2 * found.sigma <= most and not is_sure:
+        return [unknown]
+    if abs(found.value) < least or not found.is_significant:
+        return [right.format(max(abs(found.value) + 2 * found.sigma, step))]
+    side = sides[found.value < 0]
     return [
-        f"the compass was {abs(found.value):.1f} deg off, too far {side} (1 sigma {found.sigma:.1f} deg; scatter "
-        f"{found.scatter:.1f} deg)"
+        wrong.format(value=abs(found.value), side=side, sigma=found.sigma, scatter=found.scatter)
     ]
 
 
 def _why_unknown(path: PathFit) -> str:
     if not isfinite(path.turn_deg.value):
         return _TOO_FEW
-    if 2 * path.turn_deg.sigma > _NOT_KNOWN["heading"]:
+    if 2 * path.turn_deg.sigma > _MOST_HEADING_DEG:
         return f"the GPS track is too short for its scatter (its direction: 1 sigma {path.turn_deg.sigma:.0f} deg)"
     return "the frames' angles disagree with each other"
 
@@ -609,36 +631,8 @@ def _named(rows: Sequence[int], names: Sequence[str]) -> str:
 
 
 def _tilt(found: Bias) -> list[str]:
-    if not isfinite(found.value) or found.value < _LEAST["tilt"] or not found.is_significant:
+    if not isfinite(found.value) or found.value < _LEAST_TILT_DEG or not found.is_significant:
         return []
     return [
         f"the camera looked {found.value:.1f} deg beside where telemetry puts it (1 sigma {found.sigma:.1f} deg)"
     ]
-
-
-def _height(found: Bias, path: PathFit) -> list[str]:
-    if not isfinite(found.value):
-        return ["telemetry has no height above the ground to compare"]
-    if _is_unknown(found, "height"):
-        why = (
-            "the GPS track is too short for its scatter" if isfinite(path.scale.value) else _TOO_FEW
-        )
-        return [f"whether heights above the ground were right cannot be known: {why}"]
-    if abs(found.value) < _LEAST["height"] or not found.is_significant:
-        return [f"heights above the ground were right within {_within(found, 0.1):.1f} m"]
-    side = "too high" if found.value > 0 else "too low"
-    return [
-        f"heights above the ground were {abs(found.value):.1f} m {side} (1 sigma {found.sigma:.1f} m)"
-    ]
-
-
-def _is_unknown(found: Bias, what: str) -> bool:
-    """Whether an error could be so large that "right within" would mislead; one that surely is an error is known."""
-    return not 2 * found.sigma <= _NOT_KNOWN[what] and not (
-        isfinite(found.sigma) and found.is_significant
-    )
-
-
-def _within(found: Bias, least: float) -> float:
-    """What an error that is not significant hardly exceeds (2 sigma)."""
-    return max(abs(found.value) + 2 * found.sigma, least)

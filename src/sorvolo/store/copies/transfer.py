@@ -1,12 +1,11 @@
 """A site copied from one end to another, or compared with its copy, file by file, each by its SHA-256."""
 
-from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from sorvolo.errors import StoreError
+from sorvolo.store.ahead import in_order
 from sorvolo.store.copies.bucket import BucketEnd
 from sorvolo.store.copies.folder import FolderEnd, SiteFile
 from sorvolo.store.nofollow import sha256_of
@@ -77,7 +76,7 @@ def copy(
             room(total, target.free_bytes())
             faults: dict[str, str] = {}
             done = done_bytes = 0
-            for file, outcome in in_parallel(move, lacking, threads):
+            for file, outcome in zip(lacking, in_order(move, lacking, threads=threads)):
                 if outcome in ("missing", "damaged"):
                     faults[file.path] = outcome
                 elif not outcome:
@@ -131,7 +130,7 @@ def verify(
         return "" if found == expected else "damaged" if file.sha256 else "differs"
 
     done = done_bytes = 0
-    for file, fault in in_parallel(compare, both, threads):
+    for file, fault in zip(both, in_order(compare, both, threads=threads)):
         if fault:
             faults[file.path] = fault
         done, done_bytes = done + 1, done_bytes + file.size
@@ -150,22 +149,3 @@ def _sha256_at(end: SiteEnd, file: SiteFile) -> str:
             return sha256_of(stream)
     except FileNotFoundError:
         return ""
-
-
-def in_parallel(
-    work: Callable[[SiteFile], str], files: Iterable[SiteFile], threads: int
-) -> Iterator[tuple[SiteFile, str]]:
-    """What `work` returns of each file, in order; few are begun ahead. An error ends it, and nothing more is begun."""
-    waiting: deque[tuple[SiteFile, Future[str]]] = deque()
-    pool = ThreadPoolExecutor(threads, thread_name_prefix="copy")
-    try:
-        for file in files:
-            waiting.append((file, pool.submit(work, file)))
-            if len(waiting) > 4 * threads:
-                first, result = waiting.popleft()
-                yield first, result.result()
-        while waiting:
-            first, result = waiting.popleft()
-            yield first, result.result()
-    finally:
-        pool.shutdown(cancel_futures=True)

@@ -14,7 +14,6 @@ from sorvolo.errors import StoreError
 from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.store.copies.bucket import SHOWN, BucketEnd, Manifest, key_of
 from sorvolo.store.copies.folder import (
-    CatalogueState,
     FolderEnd,
     SiteFile,
     SiteState,

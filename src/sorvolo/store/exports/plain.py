@@ -4,13 +4,14 @@ import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, is_dataclass
-from datetime import UTC, datetime
+from datetime import UTC, date, datetime, time
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sorvolo.errors import SettingsError
 from sorvolo.geometry.units import DAY_NS
 
 NO_PLACE_FILES = "No GeoJSON, KML or GPX is written, since these hold places on Earth."
@@ -123,6 +124,24 @@ def utc_text(time_ns: int) -> str:
     seconds, rest_ns = divmod(time_ns, 1_000_000_000)
     day = datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%dT%H:%M:%S")
     return f"{day}.{rest_ns // 1000:06d}Z" if rest_ns % 1000 == 0 else f"{day}.{rest_ns:09d}Z"
+
+
+def moment_of(text: str, of_day: time, wanted: str = "a date") -> datetime:
+    """A moment of ISO 8601, UTC unless it names a zone; a date stands for this time of its day.
+
+    Raises SettingsError, which says what was `wanted`, for any other text.
+    """
+    try:
+        return datetime.combine(date.fromisoformat(text), of_day, UTC)
+    except ValueError:
+        pass
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError as error:
+        raise SettingsError(
+            f"{text!r} is not {wanted}; give 2026-05-31, or 2026-05-31T12:00"
+        ) from error
+    return moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
 
 
 def time_words(time_ns: int) -> str:

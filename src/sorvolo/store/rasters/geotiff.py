@@ -303,7 +303,7 @@ def _write_plain(
     with rasterio.open(path, "w", **profile) as sink:
         sink.colorinterp = [ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha]
         by_row = sorted(tiles, key=lambda index: (index[1], index[0]))
-        for index, tile in zip(by_row, in_order(tiles.__getitem__, by_row, most_threads=1)):
+        for index, tile in zip(by_row, in_order(tiles.__getitem__, by_row, threads=1)):
             x0, y0, _, _ = grid.tile_window(index)
             window = Window(x0 - left, y0 - top, grid.tile_px, grid.tile_px)
             sink.write(_bands(tile), window=window)

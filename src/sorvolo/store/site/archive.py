@@ -108,21 +108,27 @@ class Archive:
         )  # files, by size and time, whose bytes were looked at
 
     @classmethod
-    def open(cls, folder: AnyPath, *, write: bool, catalogues: Catalogues | None = None) -> Self:
+    def open(
+        cls,
+        folder: AnyPath,
+        *,
+        write: bool,
+        makes: bool = True,
+        catalogues: Catalogues | None = None,
+    ) -> Self:
         """Open a site folder, to read it (while another process writes it, too) or as its only writer.
 
-        Writing creates the folder, removes what a killed run left and repairs derived files. A new catalogue goes, and
+        Writing creates the folder (where it `makes` one), removes what a killed run left and repairs derived files. A new catalogue goes, and
         one that lies elsewhere is looked for, where `catalogues` has it; None: where the environment has it. Raises
         StoreError when the folder is no site, is being written by another process, cannot be written, is
         damaged, holds a link, or has another format version; then nothing in it was changed.
         """
         folder = Path(folder)
-        folder = Path(folder)
+        if not (write and makes) and not is_site(folder):
+            raise NotFoundError(
+                f"no site at {folder}; make one with: sorvolo map INPUT --site {folder}"
+            )
         if not write:
-            if not is_site(folder):
-                raise NotFoundError(
-                    f"no site at {folder}; make one with: sorvolo map INPUT --site {folder}"
-                )
             # those are read link by link
             refuse_traps(folder, skipped=frozenset({"tiles", "keyframes"}))
             return cls(folder, Catalogue.open(folder, write=False, catalogues=catalogues), None)
