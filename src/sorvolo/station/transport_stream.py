@@ -4,7 +4,6 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
 from math import isfinite
 from pathlib import Path
 from typing import BinaryIO
@@ -14,7 +13,8 @@ from sorvolo.errors import StoreError
 from sorvolo.station.messages import Kind, Message, MessageSample, sample_from_json, with_delimiter
 
 _PACKET, _BODY = 188, 184
-_PAT, _PMT, _VIDEO, _METADATA, _MARK = 0x0000, 0x1000, 0x0100, 0x0101, 0x1FE0
+_PIDS = _PAT, _PMT, _VIDEO, _METADATA = 0x0000, 0x1000, 0x0100, 0x0101
+_MARK = 0x1FE0
 _TYPES = {"h264": 0x1B, "hevc": 0x24}
 _FIRST_90KHZ = (
     900_000  # the flight's zero, 10 s: pictures that are decoded before they are shown stay above 0
@@ -23,20 +23,6 @@ _PCR_LEAD_90KHZ = 18_000  # 0.2 s, what a receiver may hold back
 _MARK_HEAD = struct.Struct(">4sQqIIcB4B")
 _MARK_NAME = b"SVL1"
 _SEARCHED_BYTES = 64_000_000  # at a file's end, for the last whole message
-
-
-@dataclass
-class _Counters:
-    """The continuity counters, which every packet of a PID increases by one (ISO 13818-1, 2.4.3.3)."""
-
-    by_pid: dict[int, int] = field(
-        default_factory=lambda: dict.fromkeys((_PAT, _PMT, _VIDEO, _METADATA), 0)
-    )
-
-    def next(self, pid: int) -> int:
-        number = self.by_pid[pid]
-        self.by_pid[pid] = (number + 1) & 15
-        return number
 
 
 class FlightFile:
@@ -49,7 +35,7 @@ class FlightFile:
 
     def __init__(self, path: Path, codec: str) -> None:
         self._codec = codec
-        self._counters = _Counters()
+        self._counters = dict.fromkeys(_PIDS, 0)  # of continuity, by PID (ISO 13818-1, 2.4.3.3)
         self.last_seq, self.last_pts_us = 0, -1
         self._file: BinaryIO = path.open("r+b" if path.exists() else "w+b", buffering=0)
         self._recover(path)
@@ -61,7 +47,7 @@ class FlightFile:
 
     def append(self, message: Message) -> None:
         """Write a video or telemetry message. Raises OSError where the disk does not take it; the file stays whole."""
-        before, counted = self._file.tell(), dict(self._counters.by_pid)
+        before, counted = self._file.tell(), dict(self._counters)
         chunk = self._packets(message)
         mark = self._mark(message, chunk)
         try:
@@ -69,15 +55,13 @@ class FlightFile:
         except OSError:
             self._file.truncate(before)
             self._file.seek(before)
-            self._counters.by_pid = counted
+            self._counters = counted
             raise
         self.last_seq, self.last_pts_us = message.seq, max(self.last_pts_us, message.pts_us)
 
     def sync(self) -> None:
         """Wait until the disk has all that was written."""
-        os.fdatasync(self._file.fileno()) if hasattr(os, "fdatasync") else os.fsync(
-            self._file.fileno()
-        )
+        getattr(os, "fdatasync", os.fsync)(self._file.fileno())
 
     def close(self) -> None:
         """Let go of the file, which the disk then has."""
@@ -109,7 +93,7 @@ class FlightFile:
     def _table(self, pid: int, table: int, body: bytes) -> bytes:
         section = struct.pack(">BH", table, 0xB000 | len(body) + 4) + body
         section += _crc(section).to_bytes(4, "big")
-        head = struct.pack(">BHB", 0x47, 0x4000 | pid, 0x10 | self._counters.next(pid))
+        head = struct.pack(">BHB", 0x47, 0x4000 | pid, 0x10 | self._next(pid))
         return (head + b"\x00" + section).ljust(_PACKET, b"\xff")
 
     def _split(self, pid: int, data: bytes, clock: bytes) -> Iterator[bytes]:
@@ -118,7 +102,7 @@ class FlightFile:
         while at < len(data):
             left = len(data) - at
             room = _BODY - (1 + len(clock) if clock else 0)
-            number = self._counters.next(pid)
+            number = self._next(pid)
             if left >= room and not clock:
                 yield struct.pack(">BHB", 0x47, start | pid, 0x10 | number) + data[at : at + _BODY]
                 at += _BODY
@@ -130,6 +114,11 @@ class FlightFile:
                 at += len(body)
             start, clock = 0, b""
 
+    def _next(self, pid: int) -> int:
+        number = self._counters[pid]
+        self._counters[pid] = number + 1 & 15
+        return number
+
     def _mark(self, message: Message, chunk: bytes) -> bytes:
         body = _MARK_HEAD.pack(
             _MARK_NAME,
@@ -139,7 +128,7 @@ class FlightFile:
             zlib.crc32(chunk),
             message.kind.encode(),
             int(message.is_key),
-            *(self._counters.by_pid[pid] for pid in (_PAT, _PMT, _VIDEO, _METADATA)),
+            *self._counters.values(),
         )
         body += zlib.crc32(body).to_bytes(4, "big")
         return struct.pack(">BHB", 0x47, _MARK, 0x10 | message.seq & 15) + body.ljust(
@@ -164,7 +153,7 @@ class FlightFile:
             _, self.last_seq, self.last_pts_us, _, _, _, _, *numbers = _MARK_HEAD.unpack_from(
                 mark, 4
             )
-            self._counters.by_pid = dict(zip((_PAT, _PMT, _VIDEO, _METADATA), numbers))
+            self._counters = dict(zip(_PIDS, numbers))
         keep = first + (end or 0)
         if keep < size:
             self._file.truncate(keep)
