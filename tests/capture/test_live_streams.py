@@ -22,8 +22,7 @@ from live_sender import (
 )
 from rtsp_server import RtspServer
 
-from sorvolo.capture.live.addresses import StreamAddress, live_address
-from sorvolo.capture.live.opening import open_stream
+from sorvolo.capture.live.addresses import StreamAddress, live_address, open_stream
 from sorvolo.capture.live.reader import StreamReader
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.stream import LiveStream

@@ -10,10 +10,9 @@ from typing import Any, Protocol
 
 import av
 
-from sorvolo.capture.live.addresses import StreamAddress
+from sorvolo.capture.live.addresses import StreamAddress, open_stream
 from sorvolo.capture.live.klv import LocalSet, local_sets
 from sorvolo.capture.live.klv_telemetry import klv_streams
-from sorvolo.capture.live.opening import open_stream
 from sorvolo.capture.live.reconnect import Backoff, LiveSettings, Outages
 from sorvolo.capture.telemetry.cleaning import notice
 from sorvolo.capture.video_stream import PIXEL_LIMIT
