@@ -188,7 +188,9 @@ def _seen(
         for each in load_objects(connection, _only(flights))
         if flights is None or each.flight_id in flights
     ]
-    ranks = {row.id: float(row.rank) for row in connection.execute(select(schema.flights))}
+    complete = select(schema.runs.c.flight_id).where(schema.runs.c.status == "complete")
+    whole = select(schema.flights).where(schema.flights.c.id.in_(complete))
+    ranks = {row.id: float(row.rank) for row in connection.execute(whole)}
     spans = {name: span for name, _, *span in flown_flights(connection)}
     for change in load_changes(connection, _only(flights)):
         is_known = flights is None or change.flight_id in flights
