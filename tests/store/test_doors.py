@@ -431,6 +431,13 @@ def test_values_that_no_sorvolo_wrote_are_named(
         archive.keyframes(), archive.changes(), archive.site()
 
 
+@pytest.mark.parametrize("column", ["flight_id", "created_utc"])
+def test_a_version_whose_text_is_none_is_named(site: Path, column: str) -> None:
+    craft(site, f"UPDATE versions SET {column} = x'ff00'")
+    with Archive.open(site, write=False) as archive, pytest.raises(StoreError, match="damaged"):
+        archive.versions()
+
+
 def _png(width: int, height: int) -> bytes:
     """A PNG of so many transparent pixels, small as a file."""
 

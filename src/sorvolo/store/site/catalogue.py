@@ -35,7 +35,7 @@ from sorvolo.store.rasters.geotiff import COMPRESSIONS
 from sorvolo.store.site import schema
 from sorvolo.store.site.catalogue_place import Catalogues, open_database
 from sorvolo.store.site.database import Database, SqliteDatabase
-from sorvolo.store.site.files import checked_crs, checked_image_path, checked_sha256
+from sorvolo.store.site.files import checked_crs, checked_image_path, checked_name, checked_sha256
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import Status
 
@@ -87,6 +87,9 @@ class VersionEntry:
     run_id: int
     flown_ns: int = -1
     compress: str = "deflate"
+
+    def __post_init__(self) -> None:
+        datetime.fromisoformat(self.created_utc)
 
     @property
     def flown_utc(self) -> str:
@@ -283,6 +286,7 @@ def list_versions(connection: Connection) -> list[VersionEntry]:
         VersionEntry(
             **{
                 **_named(row, VersionEntry),
+                "flight_id": checked_name(row.flight_id, "flight"),
                 "export_crs": checked_crs(row.export_crs),
                 "flown_ns": flown_ns.get(row.id, -1),
                 "compress": compressions[row.id],
