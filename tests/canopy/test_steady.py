@@ -26,7 +26,7 @@ def test_a_gimbals_one_tilt_is_found_from_fixes_and_crowns() -> None:
         view, point = [*view, np.full(len(rows), number)], [*point, rows]
         seen.append(CAMERA.rays_from_pixels(noisy)[:, :2])
     tracks = Tracks(
-        np.concatenate(view), np.concatenate(point), np.concatenate(seen), np.zeros((0, 2), int), len(crowns_m)
+        np.concatenate(view), np.concatenate(point), np.concatenate(seen), len(crowns_m)
     )  # fmt: skip
     off = NADIR_CAMERA_NORTH_UP.T @ tilt
     mapped = []

@@ -48,12 +48,11 @@ _STEADY_DEG = (10.0, 10.0, 3.0, 1.0, 0.3)
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """M observations of P points: `view` and `point` (M,) rows, `seen` (M, 2) normalised rays; matched pairs (K, 2)."""
+    """M observations of P points: `view` and `point` (M,) rows, `seen` (M, 2) normalised rays."""
 
     view: Rows
     point: Rows
     seen: Floats
-    pairs: Rows
     count: int
 
 
@@ -61,14 +60,13 @@ def find_tracks(views: Sequence[View], gray: Callable[[int], ImageGray]) -> Trac
     """The points that pictures have in common; `gray(i)` is the picture of view i at any size."""
     found = [_features(gray(number), view) for number, view in enumerate(views)]
     starts = np.concatenate([[0], np.cumsum([len(each.rays) for each in found])])
-    left, right, pairs = [], [], []
+    left, right = [], []
     for i, j in _pairs(views):
         matched = _shared(found[i], found[j])
         if len(matched):
             left.append(starts[i] + matched[:, 0])
             right.append(starts[j] + matched[:, 1])
-            pairs.append((i, j))
-    return _joined(left, right, pairs, starts, np.concatenate([each.rays for each in found]))
+    return _joined(left, right, starts, np.concatenate([each.rays for each in found]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,15 +167,11 @@ def _agreeing(left: Floats, right: Floats, threshold: float) -> NDArray[np.bool_
     return np.zeros(len(left), bool) if inliers is None else inliers[:, 0] > 0
 
 
-def _joined(
-    left: list[Rows], right: list[Rows], pairs: list[tuple[int, int]], starts: Rows, rays: Floats
-) -> Tracks:
+def _joined(left: list[Rows], right: list[Rows], starts: Rows, rays: Floats) -> Tracks:
     """Pairs chained into tracks; a chain that meets two features of one picture loses both of them."""
     total = len(rays)
     if not left:
-        return Tracks(
-            np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), np.zeros((0, 2), int), 0
-        )
+        return Tracks(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), 0)
     a, b = np.concatenate(left), np.concatenate(right)
     _, label = connected_components(
         coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(total, total)), False
@@ -196,7 +190,6 @@ def _joined(
         view[long],
         point,
         rays[used[long]],
-        np.array(pairs),
         int(point.max()) + 1 if len(point) else 0,
     )
 
