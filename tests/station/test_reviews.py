@@ -250,6 +250,8 @@ def test_a_watch_needs_no_site_and_others_see_nothing_of_it(client: TestClient) 
     assert client.get("/api/sites/nothing/collections/findings/items").status_code == 404
     (results / "tracks.geojson").write_text("broken")
     assert client.get("/api/sites/field/collections/objects/items").json()["features"] == []
+    (results / "tracks.geojson").unlink()  # of a watch that found nothing yet
+    assert client.get(items).json()["features"] == []
 
 
 def test_a_vote_on_what_a_watch_found_stays_when_the_flight_is_mapped(

@@ -188,8 +188,7 @@ class Reviews:
         try:
             return site_id, self._shelf.open(site_id).created_utc or _OF_WATCHES
         except Problem:
-            if not self._ids(site_id, "object"):
-                raise
+            self._collections.get(site_id, FINDINGS)  # raises where there is no watch either
             return site_id, _OF_WATCHES
 
     def _from_site(self, site_id: str, known: Mapping[str, Review]) -> dict[str, Review]:
