@@ -313,9 +313,10 @@ class LiveFootage:
     def _open(self, left_s: float) -> Any:
         within_s = min(self._address.opens_s, left_s)
         container = open_stream(self._address, within_s, self._settings)
-        if not container.streams.video:
-            container.close()
-            raise ValueError("a stream without video")
+        contexts = [each.codec_context for each in container.streams.video[:1]]
+        if not contexts or (contexts[0] is not None and not contexts[0].width):
+            container.close()  # a slow camera's size comes later
+            raise ValueError("a stream without video, or without the size of its pictures")
         return container
 
     def _read(self, container: Any) -> Iterator[FootagePiece]:

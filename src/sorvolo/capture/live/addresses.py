@@ -250,6 +250,9 @@ class _Relay:
             except OSError as error:
                 dialled.set_exception(error)
                 return
+            except UnicodeError as error:  # of a name that no server can have
+                dialled.set_exception(OSError(f"{error}"))
+                return
             dialled.set_result(None)
             calling = asyncio.get_running_loop().sock_accept(listener)
             try:
