@@ -2076,7 +2076,9 @@ def test_what_a_watch_found_is_judged_with_the_keyboard(opened: Watched, served:
         page.locator(f".strip button[data-id='{person}']").click()
         page.keyboard.press("c")
         page.locator(f".strip button.confirmed[data-id='{person}']").wait_for()
-        wait_for(lambda: served.ask("/api/sites/field/reviews?kind=object"))  # shown at once, sent then
+        wait_for(
+            lambda: served.ask("/api/sites/field/reviews?kind=object")
+        )  # shown at once, sent then
         (given,) = served.ask("/api/sites/field/reviews?kind=object")
         assert (given["id"], given["verdict"]) == (person, "confirmed")
     finally:
