@@ -48,6 +48,7 @@ _FLOOR_M = (
     -40.0,
     5.0,
 )  # where the floor is looked for, above the map's level ground: that may be crowns
+_TILT = float(np.tan(np.radians(10)))  # as far as fixes alone hold the tilt that cameras share
 _MOST_STRETCH = 0.06  # of the focal length, three sigmas of what it may be off
 _POD = "pod", "pod_low", "pod_high"
 _RING_M = 2.0  # around a find
@@ -120,14 +121,22 @@ def search_under_trees(
             yield UnderTreesUpdate(name, "planted bodies", 2)
             planted = plant_on_floor(under, views, picture, finds.people, plants)
         free = free_share(under, views, picture)
-        found = _objects(name, finds, views, keyframes, picture)
+        sigma_m = float(np.median([each.sigma_m for each in keyframes]))
+        if warning:  # of cameras that share a tilt, which nothing but their fixes holds
+            above_m = np.median([each.site_from_camera.translation_m[2] for each in views])
+            sigma_m = float(np.hypot(sigma_m, _TILT * (above_m - np.median(floor.up_m))))
+        found = _objects(
+            name, finds, sigma_m, keyframes, [_crop(each, views, picture) for each in finds.people]
+        )
         archive.keep_under_trees(name, found)
-        report = _report(name, site, under, floor, finds, planted)
+        report = _report(name, site, under, floor, finds, planted, sigma_m)
         report |= {"pictures": len(views), "warnings": [warning] if warning else []}
         report |= {"run": run_of(keyframes), "cell_m": cell_m}
         report["headline"]["complete"] = not warning
         if warning:
-            report["headline"]["text"] += "; the cameras may be off, and people missed"
+            report["headline"]["text"] += (
+                f"; the cameras may be off: places are good to {sigma_m:.0f} m, and people may be missed"
+            )
         report["notices"] = [asdict(each) for each in archive.notices]
     make_folder(folder)
     zero_m = site.origin.height_m
@@ -182,6 +191,8 @@ def _solved(
             if is_free and before is not None:
                 solved = before
             else:
+                if before is not None:  # its lens is what free cameras made of crowns
+                    views = [_with_focal(view, 1 / before.focal_scale) for view in views]
                 tracks = tracks or find_tracks(views, pictures.gray)
                 solved = (solve_tracks if is_free else solve_steady)(views, tracks)
             why = (
@@ -199,6 +210,13 @@ def _solved(
     return None, (
         f"cameras are as mapped, not solved in space ({why}): 0.5 m or 1 degree of error hides people"
     )
+
+
+def _with_focal(view: View, scale: float) -> View:
+    """A view by a lens of so many times its focal length, its centre in the picture's middle."""
+    camera = view.camera.with_focal_px(scale * view.camera.fx_px)
+    middle_px = (camera.width_px - 1) / 2, (camera.height_px - 1) / 2
+    return replace(view, camera=replace(camera, cx_px=middle_px[0], cy_px=middle_px[1]))
 
 
 def _at_body_size(views: Sequence[View]) -> tuple[list[View], float]:
@@ -223,6 +241,7 @@ def _report(
     floor: Floor,
     finds: Finds,
     planted: PlantedFloor | None,
+    sigma_m: float,
 ) -> dict[str, Any]:
     seen = under.views >= LEAST_VIEWS
     seen_m2 = float(seen.sum()) * under.lattice.cell_m**2
@@ -240,7 +259,7 @@ def _report(
     return {
         "flight": name,
         "headline": {"text": text},
-        "people": [_properties(each, site) for each in finds.people],
+        "people": [_properties(each, site) | {"sigma_m": sigma_m} for each in finds.people],
         "refused": dict(finds.refused),
         "seen_m2": seen_m2,
         "views_median": float(np.median(under.views[seen])),
@@ -264,11 +283,11 @@ def _properties(find: Find, site: Site) -> dict[str, Any]:
 def _objects(
     name: str,
     finds: Finds,
-    views: Sequence[View],
+    sigma_m: float,
     keyframes: Sequence[StoredKeyframe],
-    picture: Picture,
+    crops: Sequence[Any],
 ) -> list[MapObject]:
-    """The finds as objects of the flight."""
+    """The finds, each with its crop, as objects of the flight."""
     times_ns = {each.name: each.time_ns for each in keyframes}
     return [
         MapObject(
@@ -276,7 +295,7 @@ def _objects(
             PERSON,
             float(np.clip(find.weakest_half, 0, 1)),
             find.place_m[:2],
-            float(np.median([each.sigma_m for each in keyframes])),
+            sigma_m,
             *find.size_m,
             find.views,
             find.views,
@@ -284,9 +303,9 @@ def _objects(
             max(times_ns[each] for each in find.pictures),
             class_scores={PERSON: 1.0},
             best_frame=find.pictures[0],
-            crop_jpeg=jpeg_from_image(_crop(find, views, picture)),
+            crop_jpeg=jpeg_from_image(crop),
         )
-        for number, find in enumerate(finds.people, start=1)
+        for number, (find, crop) in enumerate(zip(finds.people, crops, strict=True), start=1)
     ]
 
 
