@@ -66,17 +66,21 @@ _LEAST_AREA_SCORE = 0.3  # 0 to 1
 class GatheredGround:
     """What a flight's views show together. Only `add` changes it.
 
-    Views are looked at `larger` times as large, for things; for areas at a small size, with `larger` None.
+    Views are looked at `larger` times as large; at a small size, where areas alone are asked, with `larger` None.
     """
 
     def __init__(self, larger: float | None = None) -> None:
         self._larger = larger
         self._ground = GroundSums(_SUMS, _MOST_CELLS)
+        self._cells_of_area = 1
 
     def add(self, view: ComparedView, leans: Mask | None = None) -> None:
         """Take in one view, of which earlier pictures show that some ground `leans` (h, w)."""
         height, width = view.valid.shape
-        times = self._larger or min(1.0, _SMALL_PX / max(height, width))
+        small = min(1.0, _SMALL_PX / max(height, width))
+        times = small if self._larger is None else self._larger
+        if self._ground.is_empty:
+            self._cells_of_area = max(1, round(times / small))
         m_per_px = view.m_per_px / times
         window = self._ground.window_of(view, _CELL_PX * m_per_px, min(m_per_px, view.m_per_px))
         if window is None:
@@ -240,7 +244,7 @@ class GatheredGround:
 
     def _things(self) -> Iterator[Change]:
         """Connected ground that lies apart, without an id."""
-        mean = self._means()
+        mean = self._means(1)
         for own, corner in _pieces_of(mean["apart"] > _SPREADS, 1, 3, _LEAST_CELLS):
             part = _part_at(corner, own)
             height = _OF_HEIGHT * float(np.percentile(mean["apart"][part][own], _HIGHEST))
@@ -256,7 +260,8 @@ class GatheredGround:
         """After the last view: all areas, the largest first, numbered from `first_number` on."""
         if self._ground.is_empty:
             return ()
-        mean, cell_m = self._means(), self._ground.cell_m
+        times = self._cells_of_area
+        mean, cell_m = self._means(times), self._ground.cell_m * times
         least = max(_LEAST_AREA_CELLS, _LEAST_AREA_M2 / cell_m**2)
         found = []
         for own, corner in _pieces_of(mean["apart"] > _AREA_SPREADS, _GAP_CELLS, _GAP_CELLS, least):
@@ -264,7 +269,7 @@ class GatheredGround:
             apart, agree = (float(mean[name][part][own].mean()) for name in ("apart", "agree"))
             score = agree * min(1.0, apart / _SURE_SPREADS)
             views = agree * float(mean["seen"][part][own].mean())
-            change = self._record(own, corner, score)
+            change = self._record(own, corner, score, times)
             is_shown = agree >= _AGREEING_SHARE and views >= _AGREEING_VIEWS
             if change is not None and is_shown and score >= _LEAST_AREA_SCORE:
                 area_m2 = float(np.count_nonzero(own)) * cell_m**2
@@ -275,25 +280,43 @@ class GatheredGround:
             for place, each in enumerate(found)
         )
 
-    def _means(self) -> dict[str, Floats32]:
-        """How many views saw the cells, and the means of the other sums; of ground that too few saw, nothing."""
-        seen = self._ground.sums["seen"]
+    def _means(self, times: int) -> dict[str, Floats32]:
+        """How many views saw the cells, each `times` times as wide as the raster's, and the means of the other sums;
+        of ground that too few saw, nothing."""
+        rows, columns = (max(side // times, 1) for side in self._ground.window.shape)
+        sums = {
+            name: np.asarray(
+                cv2.resize(
+                    each[: rows * times, : columns * times],
+                    (columns, rows),
+                    interpolation=cv2.INTER_AREA,
+                ),
+                np.float32,
+            )
+            for name, each in self._ground.sums.items()
+        }
+        seen = sums.pop("seen")
         return {"seen": seen} | {
-            name: np.where(seen >= _LEAST_VIEWS, self._ground.sums[name] / np.maximum(seen, 1), 0)
-            for name in _SUMS[1:]
+            name: np.where(seen >= _LEAST_VIEWS, each / np.maximum(seen, 1), 0)
+            for name, each in sums.items()
         }
 
-    def _record(self, cells: Mask, corner: tuple[int, int], score: float) -> Change | None:
-        """The record of some cells, (h, w) from a corner on."""
-        cell_m = self._ground.cell_m
+    def _record(
+        self, cells: Mask, corner: tuple[int, int], score: float, times: int = 1
+    ) -> Change | None:
+        """The record of some cells, (h, w) from a corner on, each `times` times as wide as the raster's."""
+        cell_m = self._ground.cell_m * times
         own_from_cells = np.array([[1, 0, corner[0]], [0, 1, corner[1]], [0, 0, 1.0]])
-        site_from_cell = self._ground.window.site_from_cell(cell_m)
-        outline_m = outline_of(cells, site_from_cell @ own_from_cells, 0.5, 1.0)
+        site_from_cell = self._ground.window.site_from_cell(self._ground.cell_m)
+        outline_m = outline_of(
+            cells, site_from_cell @ resized(times, times) @ own_from_cells, 0.5, 1.0
+        )
         if outline_m is None:
             return None
         patch, size = self._ground.patch(outline_m), measures(outline_m)
         sigma_m = place_sigma_m(self._ground.residual_m, np.sqrt(12) * cell_m, 0.0)
-        views = float(self._ground.sums["agree"][_part_at(corner, cells)][cells].mean())
+        rows, columns = ((np.array(np.nonzero(cells)).T + corner[::-1]) * times).T
+        views = float(self._ground.sums["agree"][rows, columns].mean())
         return Change(
             "",
             kind_of(patch),

@@ -69,8 +69,8 @@ class FlightChanges:
     ) -> None:
         self._flight, self._views, self._site, self._settings = flight, views, site, settings
         self._evidence: EvidenceMap | None = None
-        self._areas = GatheredGround()
-        self._gathered = GatheredGround(plan.larger) if plan.gathers else None
+        self._finds_things = plan.gathers
+        self._gathered = GatheredGround(plan.larger if plan.gathers else None)
         self._selection = StretchSelection(plan.overlap or 0.0, keep_all=plan.overlap is None)
         self._numbers = itertools.count(
             1
@@ -86,20 +86,18 @@ class FlightChanges:
             )
         announced = self._evidence.add(view)
         if self._settings.method is None and self._selection.take(view.outline_m):
-            self._areas.add(view, leans)
-            if self._gathered is not None:
-                self._gathered.add(view, leans)
+            self._gathered.add(view, leans)
         return announced
 
     def conclude(self) -> Sequence[Change]:
         """All changes of the flight, after its last view."""
         if self._evidence is None:
             return ()
-        evidence, gathered = self._evidence, self._gathered
+        evidence, gathered = self._evidence, self._gathered if self._finds_things else None
         things = evidence.conclude() if gathered is None else evidence.conclude(gathered.shows_once)
         first = evidence.next_number
         # in the dark the ground has neither its structure nor its colour
-        areas = () if self._views.brightness < NIGHT else self._areas.areas(self._flight, first)
+        areas = () if self._views.brightness < NIGHT else self._gathered.areas(self._flight, first)
         self._numbers = itertools.count(first + len(areas))
         return reconcile(things, areas, gathered, self._flight, self._numbers, self._slides)
 
@@ -109,7 +107,7 @@ class FlightChanges:
         """After `conclude`: those objects, found on one date alone, that none of `changes`, as they are reported,
         holds, on ground that differs as well. Only where things are gathered."""
         result: list[Change] = []
-        if self._gathered is None:
+        if not self._finds_things:
             return result
         for kind, each in objects:
             length_m = each.newest.length_m
