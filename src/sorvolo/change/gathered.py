@@ -94,8 +94,6 @@ class GatheredGround:
             for each in (view.reference, view.image)
         )
         apart = learned_difference(before, after, known)
-        if not apart.any():  # too little is known of it
-            return
         if leans is not None:
             leaning = _laid(leans.view(np.uint8), size, cv2.INTER_NEAREST) > 0
             apart[leaning] = np.minimum(apart[leaning], 0)
@@ -283,7 +281,7 @@ class GatheredGround:
     def _means(self, times: int) -> dict[str, Floats32]:
         """How many views saw the cells, each `times` times as wide as the raster's, and the means of the other sums;
         of ground that too few saw, nothing."""
-        rows, columns = (max(side // times, 1) for side in self._ground.window.shape)
+        rows, columns = (side // times for side in self._ground.window.shape)
         sums = {
             name: np.asarray(
                 cv2.resize(

@@ -23,7 +23,7 @@ _LAYERS = ("finest", "fine", "coarse", "coarsest")  # at strides of 4, 8, 16 and
 _REACH = 1
 _LEAST_MIDDLE = (0.8, 0.55)  # of distance, in features' standard deviations, and of 1 - cosine:
 _LEAST_SPREAD = (0.25, 0.17)  # two dates have these at least; no pair is taken as calmer
-_LEAST_KNOWN = 24  # cells of a layer; fewer are too few to know unchanged ground by
+_LEAST_KNOWN = 64  # cells of a layer; too few to know unchanged ground by
 _MOST_SPREADS = 8.0  # spreads; beyond, more means no more
 _DIRECTION = 2.0  # weight of the angle between features, beside 1 of their distance
 
