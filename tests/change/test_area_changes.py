@@ -7,8 +7,13 @@ import cv2
 import numpy as np
 import pytest
 
-from sorvolo.change.corroboration import leaning, level_of
-from sorvolo.change.gathered import GatheredGround
+from sorvolo.change.areas import (
+    AreaMap,
+    GroundSigns,
+    leaning,
+    level_of,
+    segments,
+)
 from sorvolo.change.ground import GroundPictures
 from sorvolo.change.outlines import overlap
 from sorvolo.change.patches import PatchWindow, cut
@@ -46,7 +51,7 @@ def changes_of(
     light: Callable[[Rgb, int], Rgb] = same_light,
 ) -> tuple[Change, ...]:
     """The areas that a flight of nine views finds; `light` gives a view's picture its light."""
-    areas, rng = GatheredGround(), np.random.default_rng(3)
+    areas, rng = AreaMap(), np.random.default_rng(3)
     for index in range(9):
         x, y = 300 * (index % 3), 220 * (index // 3)
         part = np.s_[y : y + VIEW_PX[1], x : x + VIEW_PX[0]]
@@ -56,7 +61,7 @@ def changes_of(
                 before[part].copy(), np.clip(np.rint(seen), 0, 255).astype(np.uint8), index, x, y
             )
         )
-    return areas.areas("b", 7)
+    return areas.conclude("b", 7)
 
 
 def view_of(before: Rgb, after: Rgb, index: int = 0, x: int = 0, y: int = 0) -> ComparedView:
@@ -87,6 +92,22 @@ def laid(ground: Rgb, other: Rgb, outline_m: np.ndarray) -> Rgb:
     cv2.fillPoly(inside, [np.rint(outline_m / M_PER_PX * [1, -1]).astype(np.int32)], 255)
     share = cv2.GaussianBlur(inside, (0, 0), 1.0)[..., None] / 255.0
     return np.rint(ground * (1 - share) + other * share).astype(np.uint8)
+
+
+@pytest.mark.parametrize("deep", [30, 120, 200])
+def test_an_area_keeps_its_inside_however_far_from_unchanged_ground(deep):
+    """A band of so many of 260 cells, flooded; light is looked for within 35 cells at first."""
+    rng, shape = np.random.default_rng(1), (260, 260)
+    is_wet = np.arange(shape[0])[:, None] < np.full(shape[1], deep)
+    likeness = np.where(is_wet, 0.1, 0.85) + rng.normal(0, 0.03, shape)
+    colour = rng.normal(0, 0.02, (*shape, 2)) + np.array([0.5, -0.4]) * is_wet[..., None]
+    detail = rng.normal(0, 0.1, shape) - 2.0 * is_wet
+    signs = GroundSigns(
+        *(each.astype(np.float32) for each in (likeness, colour, detail, colour)),
+        known=np.ones(shape, bool),
+    )
+    found = np.any([cells for cells, _ in segments(signs)], axis=0)
+    assert found[is_wet].mean() > 0.97 and found[~is_wet].mean() < 0.05
 
 
 @pytest.mark.parametrize("kind", [GroundKind.URBAN, GroundKind.DIRT])

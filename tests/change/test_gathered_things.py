@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sorvolo.change.gathered import GatheredGround
+from sorvolo.change.gathered import GatheredThings
 from sorvolo.change.learned import learned_difference
 from sorvolo.change.things import without_shadow
 from sorvolo.geometry.arrays import ImageRGB
@@ -71,9 +71,9 @@ def test_where_hardly_anything_is_known_nothing_is_reported(ground):
 
 def gathered(
     before: ImageRGB, after: ImageRGB, views: int, shade: int | np.ndarray = 0, shrunk: int = 1
-) -> GatheredGround:
+) -> GatheredThings:
     """What some views show together, each `shrunk` times smaller and looked at as much larger."""
-    things, rng = GatheredGround(float(shrunk)), np.random.default_rng(3)
+    things, rng = GatheredThings(float(shrunk)), np.random.default_rng(3)
     size_px = VIEW_PX[0] // shrunk, VIEW_PX[1] // shrunk
     small_from_view = np.array(
         [[1 / shrunk, 0, 0.5 / shrunk - 0.5], [0, 1 / shrunk, 0.5 / shrunk - 0.5], [0, 0, 1]]
@@ -162,7 +162,7 @@ def test_other_changes_stay_but_where_features_hold_the_ground_for_the_same(grou
         each.id for each in things.conclude("b", count(8), [same, unseen, moves, area, beside])
     }
     assert concluded == {"b-2", "b-3", "b-4", "b-5", "b-8"}
-    assert GatheredGround().conclude("b", count(1), [same]) == [same]
+    assert GatheredThings().conclude("b", count(1), [same]) == [same]
 
 
 def test_what_one_view_alone_shows_is_confirmed_where_it_lies_apart_and_not_as_a_shadow_or_twice_seen(
@@ -205,7 +205,7 @@ def test_an_object_of_one_date_is_a_change_where_the_ground_differs_and_no_other
     assert gathered(ground, with_car(ground), 1).standing_at(place_m, 5.0, []) is None, (
         "seen by one view"
     )
-    assert GatheredGround().standing_at(place_m, 5.0, []) is None
+    assert GatheredThings().standing_at(place_m, 5.0, []) is None
 
 
 def middle_of(change: Change) -> np.ndarray:
@@ -219,7 +219,7 @@ def test_what_one_view_shows_or_may_be_a_shadow_is_not_reported(ground, views, s
 
 def test_unchanged_ground_in_another_light_and_no_flight_at_all_give_nothing(ground):
     assert gathered(ground, (0.7 * ground).astype(np.uint8), 4).conclude("b", count(1), []) == []
-    assert GatheredGround().conclude("b", count(1), []) == []
+    assert GatheredThings().conclude("b", count(1), []) == []
 
 
 EARLIER, LATER = slide_of(direction_from_angles(237, 29)), slide_of(direction_from_angles(165, 39))

@@ -1,4 +1,4 @@
-"""What all views of a flight together show, things and areas: learned differences gathered over its views."""
+"""Things that all views of a flight together show: learned differences gathered over its views."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -10,8 +10,8 @@ from sorvolo.change.ground import GroundSums
 from sorvolo.change.kinds import kind_of
 from sorvolo.change.learned import learned_difference
 from sorvolo.change.outlines import mask_of, measures, outline_of, overlap, place_sigma_m
-from sorvolo.geometry.arrays import Bytes, Floats, Floats32, Mask, PointsM
-from sorvolo.geometry.homography import apply_homography, resized
+from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, Mask, PointsM
+from sorvolo.geometry.homography import apply_homography
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Shade
 
 _SUMS = ("seen", "apart", "agree", "came", "left")
@@ -50,65 +50,39 @@ _LEAST_APART = 0.4  # spreads; ground of another change that lies less apart is 
 _LEAST_OF_OBJECT = 0.2  # spreads; an object that one date alone shows is evidence of its own
 
 
-# Which gathered ground is an area. Lengths in cells of views of the small size.
-_SMALL_PX = 384  # longest side at which views are looked at for areas alone: areas are large
-_AREA_SPREADS = 0.6  # by which the views of a cell lie apart on the mean
-_GAP_CELLS = 5  # a square of so many cells closes gaps, and cuts bridges
-# an area's size: of a view 140 m wide 85 m2; smaller things are found by their outline
-_LEAST_AREA_CELLS = 70
-# nor smaller, however low the flight: a car has 8 m2, what leans beside a roof 5 to 10
-_LEAST_AREA_M2 = 25.0
-_AGREEING_VIEWS = 2.5  # on the mean that show an area by themselves: two may lean alike
-_AGREEING_SHARE = 0.5  # of the views of an area's ground, each by itself
-_LEAST_AREA_SCORE = 0.3  # 0 to 1
+class GatheredThings:
+    """What a flight's views show together. Only `add` changes it. Views are looked at `larger` times as large."""
 
-
-class GatheredGround:
-    """What a flight's views show together. Only `add` changes it.
-
-    Views are looked at `larger` times as large; at a small size, where areas alone are asked, with `larger` None.
-    """
-
-    def __init__(self, larger: float | None = None) -> None:
+    def __init__(self, larger: float = 1.0) -> None:
         self._larger = larger
         self._ground = GroundSums(_SUMS, _MOST_CELLS)
-        self._cells_of_area = 1
 
     def add(self, view: ComparedView, leans: Mask | None = None) -> None:
         """Take in one view, of which earlier pictures show that some ground `leans` (h, w)."""
-        height, width = view.valid.shape
-        small = min(1.0, _SMALL_PX / max(height, width))
-        times = small if self._larger is None else self._larger
-        if self._ground.is_empty:
-            self._cells_of_area = max(1, round(times / small))
-        m_per_px = view.m_per_px / times
-        window = self._ground.window_of(view, _CELL_PX * m_per_px, min(m_per_px, view.m_per_px))
+        m_per_px = view.m_per_px / self._larger
+        window = self._ground.window_of(view, _CELL_PX * m_per_px, m_per_px)
         if window is None:
             return
-        size = round(width * times), round(height * times)
-        known = _laid(view.valid.view(np.uint8), size, cv2.INTER_NEAREST) > 0
+        if self._larger > 1:
+            view, leans = _enlarged(view, leans, self._larger)
         before, after = (
-            np.ascontiguousarray(
-                _laid(each, size, cv2.INTER_CUBIC if times > 1 else cv2.INTER_AREA)[..., ::-1]
-            )
-            for each in (view.reference, view.image)
+            np.ascontiguousarray(each[..., ::-1]) for each in (view.reference, view.image)
         )
-        apart = learned_difference(before, after, known)
+        apart = learned_difference(before, after, view.valid)
         if leans is not None:
-            leaning = _laid(leans.view(np.uint8), size, cv2.INTER_NEAREST) > 0
-            apart[leaning] = np.minimum(apart[leaning], 0)
-        shade = _laid(view.shade, size, cv2.INTER_NEAREST)
+            apart[leans] = np.minimum(apart[leans], 0)
         planes = {
             "apart": apart,
             "agree": (apart > _OWN_SPREADS).astype(np.float32),
             **{
-                name: ((shade & np.uint8(bit)) > 0).astype(np.float32)
+                name: ((view.shade & np.uint8(bit)) > 0).astype(np.float32)
                 for name, bit in _SHADES.items()
             },
         }
-        site_from_planes = view.site_from_image @ resized(width / size[0], height / size[1])
-        laid = self._ground.add(view, window, site_from_planes, planes, known.astype(np.float32))
-        self._ground.show(view, window, laid["apart"] > _AREA_SPREADS)
+        laid = self._ground.add(
+            view, window, view.site_from_image, planes, view.valid.astype(np.float32)
+        )
+        self._ground.show(view, window, laid["apart"] > _SPREADS)
 
     def shows_once(self, outline_m: PointsM) -> bool:
         """Whether one view alone saw most of an outline's ground, (N, 2), and lies as far apart there as a view must
@@ -169,7 +143,7 @@ class GatheredGround:
         for name, other, along in (("came", "left", step), ("left", "came", -step)):
             shade = own & shades[name]
             if np.count_nonzero(shade) > _IS_MOVED * np.count_nonzero(own):
-                return _share_moved(shade, shades[other], along) > _IS_MOVED
+                return _share_moved(shade, shades[other], along, _TALLEST_M) > _IS_MOVED
         return False
 
     def _around(
@@ -242,79 +216,39 @@ class GatheredGround:
 
     def _things(self) -> Iterator[Change]:
         """Connected ground that lies apart, without an id."""
-        mean = self._means(1)
-        for own, corner in _pieces_of(mean["apart"] > _SPREADS, 1, 3, _LEAST_CELLS):
-            part = _part_at(corner, own)
+        sums = self._ground.sums
+        seen = np.maximum(sums["seen"], 1)
+        mean = {name: sums[name] / seen for name in _SUMS[1:]}
+        differs = (sums["seen"] >= _LEAST_VIEWS) & (mean["apart"] > _SPREADS)
+        opened = cv2.morphologyEx(differs.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+        count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
+        for label in range(1, count):
+            x, y, wide, high, cells = (int(each) for each in stats[label])
+            if cells < _LEAST_CELLS:
+                continue
+            part = np.s_[y : y + high, x : x + wide]
+            own = labels[part] == label
             height = _OF_HEIGHT * float(np.percentile(mean["apart"][part][own], _HIGHEST))
             own &= mean["apart"][part] > height
             if not _LEAST_CELLS <= np.count_nonzero(own) <= _MOST_OF_CELLS:
                 continue
             apart, agree, came, left = (float(mean[name][part][own].mean()) for name in _SUMS[1:])
-            change = self._record(own, corner, agree * min(1.0, apart / _SURE_SPREADS))
+            change = self._record(own, (x, y), agree * min(1.0, apart / _SURE_SPREADS))
             if change is not None and came + left <= _MOST_DARK:
                 yield change
 
-    def areas(self, id_prefix: str, first_number: int) -> tuple[Change, ...]:
-        """After the last view: all areas, the largest first, numbered from `first_number` on."""
-        if self._ground.is_empty:
-            return ()
-        times = self._cells_of_area
-        mean, cell_m = self._means(times), self._ground.cell_m * times
-        least = max(_LEAST_AREA_CELLS, _LEAST_AREA_M2 / cell_m**2)
-        found = []
-        for own, corner in _pieces_of(mean["apart"] > _AREA_SPREADS, _GAP_CELLS, _GAP_CELLS, least):
-            part = _part_at(corner, own)
-            apart, agree = (float(mean[name][part][own].mean()) for name in ("apart", "agree"))
-            score = agree * min(1.0, apart / _SURE_SPREADS)
-            views = agree * float(mean["seen"][part][own].mean())
-            change = self._record(own, corner, score, times)
-            is_shown = agree >= _AGREEING_SHARE and views >= _AGREEING_VIEWS
-            if change is not None and is_shown and score >= _LEAST_AREA_SCORE:
-                area_m2 = float(np.count_nonzero(own)) * cell_m**2
-                found.append(replace(change, kind=ChangeKind.AREA, area_m2=area_m2))
-        found.sort(key=lambda each: -each.area_m2)
-        return tuple(
-            replace(each, id=f"{id_prefix}-{first_number + place}")
-            for place, each in enumerate(found)
-        )
-
-    def _means(self, times: int) -> dict[str, Floats32]:
-        """How many views saw the cells, each `times` times as wide as the raster's, and the means of the other sums;
-        of ground that too few saw, nothing."""
-        rows, columns = (side // times for side in self._ground.window.shape)
-        sums = {
-            name: np.asarray(
-                cv2.resize(
-                    each[: rows * times, : columns * times],
-                    (columns, rows),
-                    interpolation=cv2.INTER_AREA,
-                ),
-                np.float32,
-            )
-            for name, each in self._ground.sums.items()
-        }
-        seen = sums.pop("seen")
-        return {"seen": seen} | {
-            name: np.where(seen >= _LEAST_VIEWS, each / np.maximum(seen, 1), 0)
-            for name, each in sums.items()
-        }
-
-    def _record(
-        self, cells: Mask, corner: tuple[int, int], score: float, times: int = 1
-    ) -> Change | None:
-        """The record of some cells, (h, w) from a corner on, each `times` times as wide as the raster's."""
-        cell_m = self._ground.cell_m * times
-        own_from_cells = np.array([[1, 0, corner[0]], [0, 1, corner[1]], [0, 0, 1.0]])
-        site_from_cell = self._ground.window.site_from_cell(self._ground.cell_m)
+    def _record(self, cells: Mask, corner: tuple[int, int], score: float) -> Change | None:
+        cell_m = self._ground.cell_m
+        cell_from_own = np.array([[1, 0, corner[0]], [0, 1, corner[1]], [0, 0, 1.0]])
         outline_m = outline_of(
-            cells, site_from_cell @ resized(times, times) @ own_from_cells, 0.5, 1.0
+            cells, self._ground.window.site_from_cell(cell_m) @ cell_from_own, 0.5, 1.0
         )
         if outline_m is None:
             return None
         patch, size = self._ground.patch(outline_m), measures(outline_m)
+        rows, columns = np.nonzero(cells)
         sigma_m = place_sigma_m(self._ground.residual_m, np.sqrt(12) * cell_m, 0.0)
-        rows, columns = ((np.array(np.nonzero(cells)).T + corner[::-1]) * times).T
-        views = float(self._ground.sums["agree"][rows, columns].mean())
+        views = float(self._ground.sums["agree"][rows + corner[1], columns + corner[0]].mean())
         return Change(
             "",
             kind_of(patch),
@@ -329,8 +263,38 @@ class GatheredGround:
         )
 
 
-def _laid(picture: Bytes, size: tuple[int, int], how: int) -> Bytes:
-    return np.asarray(cv2.resize(picture, size, interpolation=how), np.uint8)
+def _enlarged(
+    view: ComparedView, leans: Mask | None, times: float
+) -> tuple[ComparedView, Mask | None]:
+    """A view, and what leans in it, with more pixels."""
+    height, width = view.valid.shape
+    size = round(width * times), round(height * times)
+    x, y = size[0] / width, size[1] / height
+    view_from_large = np.array(
+        [[1 / x, 0, (1 - x) / (2 * x)], [0, 1 / y, (1 - y) / (2 * y)], [0, 0, 1.0]]
+    )
+
+    def picture(image: ImageRGB) -> ImageRGB:
+        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), np.uint8)
+
+    def mask(values: Mask) -> Mask:
+        return cv2.resize(values.view(np.uint8), size, interpolation=cv2.INTER_NEAREST).view(bool)
+
+    def levels(values: ImageGray) -> ImageGray:
+        return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_NEAREST), np.uint8)
+
+    large = replace(
+        view,
+        site_from_image=view.site_from_image @ view_from_large,
+        image=picture(view.image),
+        reference=picture(view.reference),
+        valid=mask(view.valid),
+        changed=levels(view.changed),
+        boxes=np.rint(view.boxes * np.array([x, y, x, y])).astype(view.boxes.dtype),
+        residual_px=view.residual_px * times,
+        shade=levels(view.shade),
+    )
+    return large, None if leans is None else mask(leans)
 
 
 def _going_on(thing: Change, known: Change) -> Change:
@@ -344,15 +308,15 @@ def _going_on(thing: Change, known: Change) -> Change:
     )
 
 
-def _share_moved(own: Mask, other: Mask, step: Floats) -> float:
+def _share_moved(own: Mask, other: Mask, step: Floats, most: float) -> float:
     """The greatest share of a shade, `own` (h, w), that lies on the `other` date's shade when it is moved by a multiple
     up to `most` of `step`, (2,) columns and rows."""
     rows, columns = np.nonzero(own)
-    longest = float(np.abs(step).max()) * _TALLEST_M
+    longest = float(np.abs(step).max()) * most
     if not len(rows) or longest < 1:
         return 0.0
     best = 0
-    for times in np.arange(1.0, longest + 1) / longest * _TALLEST_M:
+    for times in np.arange(1.0, longest + 1) / longest * most:
         x, y = (
             np.rint(each + times * along).astype(int)
             for each, along in ((columns, step[0]), (rows, step[1]))
@@ -360,24 +324,3 @@ def _share_moved(own: Mask, other: Mask, step: Floats) -> float:
         inside = (x >= 0) & (y >= 0) & (x < other.shape[1]) & (y < other.shape[0])
         best = max(best, int(np.count_nonzero(other[y[inside], x[inside]])))
     return best / len(rows)
-
-
-def _pieces_of(
-    differs: Mask, gap: int, bridge: int, least: float
-) -> Iterator[tuple[Mask, tuple[int, int]]]:
-    """The connected pieces of cells, and the corner, column and row, of each: gaps as wide as `gap` cells closed,
-    bridges as wide as `bridge` cut, of `least` cells."""
-    closed = cv2.morphologyEx(
-        differs.view(np.uint8), cv2.MORPH_CLOSE, np.ones((gap, gap), np.uint8)
-    )
-    opened = cv2.morphologyEx(closed, cv2.MORPH_OPEN, np.ones((bridge, bridge), np.uint8))
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
-    for label in range(1, count):
-        x, y, wide, high, cells = (int(each) for each in stats[label])
-        if cells >= least:
-            yield labels[y : y + high, x : x + wide] == label, (x, y)
-
-
-def _part_at(corner: tuple[int, int], cells: Mask) -> tuple[slice, slice]:
-    (x, y), (high, wide) = corner, cells.shape
-    return slice(y, y + high), slice(x, x + wide)

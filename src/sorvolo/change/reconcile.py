@@ -6,7 +6,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from sorvolo.change.gathered import GatheredGround
+from sorvolo.change.gathered import GatheredThings
 from sorvolo.change.outlines import (
     KnownPlace,
     area_sigma_m,
@@ -28,7 +28,7 @@ _EXPLAINED = 0.5  # share of an area within things: it is nothing more than they
 def reconcile(
     changes: Sequence[Change],
     areas: Sequence[Change],
-    gathered: GatheredGround | None,
+    gathered: GatheredThings | None,
     id_prefix: str,
     numbers: Iterator[int],
     slides: Callable[[Change], tuple[Floats, Floats] | None],
@@ -65,7 +65,7 @@ def with_areas(
         for each in changes
         if each.kind is not ChangeKind.MOVING
         and any(_inside(each, area.outline_m) > _INSIDE for area in areas)
-        and not _is_thing(each.patch)
+        and not _is_thing(each.patch, _STANDS_OUT)
     ]
     things = [each for each in changes if each not in parts]
     still = [each for each in things if each.kind is not ChangeKind.MOVING]
@@ -89,7 +89,7 @@ def _inside(change: Change, outline_m: PointsM) -> float:
     return float((own & theirs).sum() / max(1, own.sum()))
 
 
-def _is_thing(patch: Patch) -> bool:
+def _is_thing(patch: Patch, stands_out: float) -> bool:
     """Whether what changed differs from the ground around it by more than that ground varies, before or after."""
     reach = max(3, round(0.15 * max(patch.changed.shape)))
     near = cv2.dilate(patch.changed.astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) > 0
@@ -101,7 +101,7 @@ def _is_thing(patch: Patch) -> bool:
         levels = np.log2(picture[..., :3].astype(np.float32) + 8.0)
         spread = levels[ring].std(axis=0) + 0.1
         contrast = np.median(levels[own], axis=0) - np.median(levels[ring], axis=0)
-        if float(np.abs(contrast / spread).max()) > _STANDS_OUT:
+        if float(np.abs(contrast / spread).max()) > stands_out:
             return True
     return False
 

@@ -9,6 +9,7 @@ import numpy as np
 from cv2.typing import MatLike
 
 from sorvolo.change.alignment import Aligned, Aligner, AlignStep, Caution, FlightPlace
+from sorvolo.change.areas import leaning, level_of
 from sorvolo.change.compare import PairMethod
 from sorvolo.change.corroboration import (
     LEAST_SCORE,
@@ -16,8 +17,6 @@ from sorvolo.change.corroboration import (
     Difference,
     believed,
     is_whole,
-    leaning,
-    level_of,
     unwitnessed,
 )
 from sorvolo.change.earlier_pictures import EarlierPictures
@@ -400,7 +399,7 @@ class ViewMaker:
         if changed > _ALL_CHANGED:
             return replace(outcome, status=ViewStatus.ALL_CHANGED, reason=_ALL_CHANGED_REASON)
         view = self._view(frame, aligned, (compared.image, compared.reference, valid), found)
-        doubted = _doubted(compared.found, found)
+        doubted = _doubted(compared.found, found, SURE)
         planted = self._plant(view, compared)
         return replace(outcome, view=view, doubted=doubted, leans=leans, planted=planted)
 
@@ -603,10 +602,11 @@ class ViewMaker:
 
     def _settings_now(self) -> RobustSettings | None:
         """Those of the robust method as the flight has set them so far; None for another method."""
+        least_score = LEAST_SCORE
         return (
             None
             if self._tuning is None
-            else replace(self._tuning.settings(), least_score=LEAST_SCORE)
+            else replace(self._tuning.settings(), least_score=least_score)
         )
 
 
@@ -615,9 +615,9 @@ def _laid(aligned: Aligned, image: ImageRGB, known: Mask) -> tuple[ImageRGB, Mas
     return (image, known) if aligned.local is None else aligned.local.warped(image, known)
 
 
-def _doubted(found: Difference, kept: Difference) -> Mask:
+def _doubted(found: Difference, kept: Difference, least_score: float) -> Mask:
     """(h, w) what a view surely shows to differ from the map, less what was kept of it."""
     sure = np.zeros(found.mask.shape, bool)
-    for x, y, w, h in found.boxes[found.scores >= SURE]:
+    for x, y, w, h in found.boxes[found.scores >= least_score]:
         sure[y : y + h, x : x + w] = True
     return sure & (found.mask > 0) & (kept.mask == 0)

@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from sorvolo.capture.source import LiveSource, Source
+from sorvolo.change.areas import AreaMap
 from sorvolo.change.evidence import EvidenceMap, EvidenceSettings
-from sorvolo.change.gathered import GatheredGround
+from sorvolo.change.gathered import GatheredThings
 from sorvolo.change.reconcile import reconcile
 from sorvolo.change.views import ViewMaker
 from sorvolo.findings.register import GroundFinding
@@ -33,13 +34,13 @@ class ComparePlan:
 
     side_px: int  # longest side of a compared picture
     finer: float  # times as fine as frame and map a compared picture may be
-    gathers: bool  # things, not areas alone, of learned differences: where the map shows them with few pixels
+    gathers: bool  # learned differences: where the map shows things with few pixels
     overlap: float | None  # of the frames that they are gathered of; None: of all
-    larger: float  # times as large as they are compared, frames are looked at for things
+    larger: float  # times as large as they are compared, frames are looked at for them
 
     @classmethod
     def of(cls, source: Source, map_m_per_px: float, settings: CompareSettings) -> "ComparePlan":
-        """Plan a comparison; a stream leaves no time to gather things."""
+        """Plan a comparison; a stream leaves no time for learned differences."""
         is_photos = source.kind == "photos"
         fine = 1.0
         if settings.method is None:
@@ -56,7 +57,7 @@ class ComparePlan:
 class FlightChanges:
     """The changes of a flight. `add` takes a view in, `conclude` follows the last one.
 
-    `plan` says whether learned differences are gathered for things, too, or for areas alone.
+    `plan` says whether learned differences are gathered too.
     """
 
     def __init__(
@@ -69,8 +70,8 @@ class FlightChanges:
     ) -> None:
         self._flight, self._views, self._site, self._settings = flight, views, site, settings
         self._evidence: EvidenceMap | None = None
-        self._finds_things = plan.gathers
-        self._gathered = GatheredGround(plan.larger if plan.gathers else None)
+        self._areas = AreaMap()
+        self._gathered = GatheredThings(plan.larger) if plan.gathers else None
         self._selection = StretchSelection(plan.overlap or 0.0, keep_all=plan.overlap is None)
         self._numbers = itertools.count(
             1
@@ -85,7 +86,9 @@ class FlightChanges:
                 self._flight,
             )
         announced = self._evidence.add(view)
-        if self._settings.method is None and self._selection.take(view.outline_m):
+        if self._settings.method is None:
+            self._areas.add(view, leans)
+        if self._gathered is not None and self._selection.take(view.outline_m):
             self._gathered.add(view, leans)
         return announced
 
@@ -93,11 +96,11 @@ class FlightChanges:
         """All changes of the flight, after its last view."""
         if self._evidence is None:
             return ()
-        evidence, gathered = self._evidence, self._gathered if self._finds_things else None
+        evidence, gathered = self._evidence, self._gathered
         things = evidence.conclude() if gathered is None else evidence.conclude(gathered.shows_once)
         first = evidence.next_number
         # in the dark the ground has neither its structure nor its colour
-        areas = () if self._views.brightness < NIGHT else self._gathered.areas(self._flight, first)
+        areas = () if self._views.brightness < NIGHT else self._areas.conclude(self._flight, first)
         self._numbers = itertools.count(first + len(areas))
         return reconcile(things, areas, gathered, self._flight, self._numbers, self._slides)
 
@@ -105,9 +108,9 @@ class FlightChanges:
         self, changes: Sequence[Change], objects: Sequence[tuple[ChangeKind, GroundFinding]]
     ) -> list[Change]:
         """After `conclude`: those objects, found on one date alone, that none of `changes`, as they are reported,
-        holds, on ground that differs as well. Only where things are gathered."""
+        holds, on ground that differs as well. Only where learned differences are gathered."""
         result: list[Change] = []
-        if not self._finds_things:
+        if self._gathered is None:
             return result
         for kind, each in objects:
             length_m = each.newest.length_m
