@@ -322,19 +322,12 @@ def _measured(
     rim = _moments(measure_regions(_rims(labels), boxes, [sharp, steep], 0))[0][:, 0]
     around_wide = measure_regions(labels, boxes, [ratio, detail], _WIDE_PX)
     wide, wide_spreads = (each[:, 1] for each in _moments(around_wide))
-    searched = searched.reshape(-1)[
-        : (height + 2 * _MATCH_REACH_PX) * (width + 2 * _MATCH_REACH_PX)
-    ].reshape(height + 2 * _MATCH_REACH_PX, -1)
-    cv2.copyMakeBorder(
-        detail_before,
-        _MATCH_REACH_PX,
-        _MATCH_REACH_PX,
-        _MATCH_REACH_PX,
-        _MATCH_REACH_PX,
-        cv2.BORDER_REFLECT,
-        dst=searched,
+    reach = _MATCH_REACH_PX
+    searched = searched.reshape(-1)[: (height + 2 * reach) * (width + 2 * reach)].reshape(
+        height + 2 * reach, -1
     )
-    matched = match_regions(detail_after, searched, _grown(boxes, labels.shape), _MATCH_REACH_PX)
+    cv2.copyMakeBorder(detail_before, reach, reach, reach, reach, cv2.BORDER_REFLECT, dst=searched)
+    matched = match_regions(detail_after, searched, _grown(boxes, labels.shape), reach)
     long, short = boxes[:, 2:].max(axis=1), boxes[:, 2:].min(axis=1)
     area = sums[:, 0, 0].astype(np.float64)
     difference_in, noise = within[:, 0], frame[0]
