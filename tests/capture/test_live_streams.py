@@ -22,8 +22,8 @@ from live_sender import (
 )
 from rtsp_server import RtspServer
 
-from sorvolo.capture.live.addresses import StreamAddress, live_address, open_stream
-from sorvolo.capture.live.reader import StreamReader
+from sorvolo.capture.live.addresses import StreamAddress, live_address
+from sorvolo.capture.live.reader import StreamReader, open_stream
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.stream import LiveStream
 from sorvolo.capture.source import open_sources, opened_sources

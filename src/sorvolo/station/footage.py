@@ -18,12 +18,11 @@ from sorvolo.capture.live.addresses import (
     StreamAddress,
     is_live_address,
     live_address,
-    open_stream,
 )
 from sorvolo.capture.live.klv import LocalSet, local_sets
 from sorvolo.capture.live.klv_telemetry import columns_of, klv_streams
 from sorvolo.capture.live.links import LINK_FORMS, TelemetryLink, is_link
-from sorvolo.capture.live.reader import REFUSALS
+from sorvolo.capture.live.reader import REFUSALS, open_stream
 from sorvolo.capture.live.reconnect import Backoff, LiveSettings, Outages
 from sorvolo.capture.source import Source, open_sources, safe_name
 from sorvolo.capture.telemetry.nmea import Epoch
