@@ -9,6 +9,7 @@ from forest_site import forest_site
 from thermal_forest import fly, make_forest
 
 from sorvolo.missions.heights.run import flight_views, solved_before
+from sorvolo.missions.search.through_trees import _by_given_lens
 from sorvolo.store.site.archive import Archive
 
 
@@ -47,6 +48,13 @@ def test_cameras_of_the_same_run_are_taken_and_those_of_an_earlier_one_are_not(
         assert [each.site_from_camera.translation_m[2] for each in solved.views] == [30, 31]
         assert solved.views[0].camera.fx_px == 500 and solved.views[0].camera.cy_px == 260
         assert np.allclose(solved.views[0].fix_m, mapped[0].fix_m)
+        # the lens as given: 500 / 0.9 px, whether the map kept it, or the solved one
+        given = [replace(each, camera=each.camera.with_focal_px(500 / 0.9)) for each in mapped]
+        assert [each.camera for each in _by_given_lens(given, solved)] == [
+            each.camera for each in given
+        ]
+        (taken_back, *_) = _by_given_lens(solved.views, solved)
+        assert np.allclose(taken_back.camera.matrix, given[0].camera.matrix)
         report.write_text(json.dumps({"run": "an earlier one", "cameras": cameras}))
         assert solved_before(archive, keyframes, mapped) is None
         report.write_text(json.dumps({"run": run, "cameras": {}}))

@@ -312,8 +312,8 @@ class LiveFootage:
     def _open(self, left_s: float) -> Any:
         within_s = min(self._address.opens_s, left_s)
         container = open_stream(self._address, within_s, self._settings)
-        contexts = [each.codec_context for each in container.streams.video[:1]]
-        if not contexts or (contexts[0] is not None and not contexts[0].width):
+        video = container.streams.video
+        if not video or getattr(video[0].codec_context, "width", None) == 0:
             container.close()  # a slow camera's size comes later
             raise ValueError("a stream without video, or without the size of its pictures")
         return container

@@ -183,13 +183,13 @@ class _Relay:
         dialled.result()
 
     async def _run(self, listener: socket.socket, dialled: Future[None]) -> None:
-        scheme, host = self._server.scheme, self._server.hostname
+        scheme = self._server.scheme
         # cameras sign their certificates themselves
         tls = ssl._create_unverified_context() if scheme == "rtsps" else None
         with listener:
             try:
                 dialling = asyncio.open_connection(
-                    host, self._server.port or _PORTS[scheme], ssl=tls
+                    self._server.hostname, self._server.port or _PORTS[scheme], ssl=tls
                 )
                 answers, there = await asyncio.wait_for(dialling, self._within_s)
             except OSError as error:

@@ -191,8 +191,8 @@ def _solved(
             if is_free and before is not None:
                 solved = before
             else:
-                if before is not None:  # its lens is what free cameras made of crowns
-                    views = [_with_focal(view, 1 / before.focal_scale) for view in views]
+                if before is not None:
+                    views = _by_given_lens(views, before)
                 tracks = tracks or find_tracks(views, pictures.gray)
                 solved = (solve_tracks if is_free else solve_steady)(views, tracks)
             why = (
@@ -212,11 +212,15 @@ def _solved(
     )
 
 
-def _with_focal(view: View, scale: float) -> View:
-    """A view by a lens of so many times its focal length, its centre in the picture's middle."""
-    camera = view.camera.with_focal_px(scale * view.camera.fx_px)
-    middle_px = (camera.width_px - 1) / 2, (camera.height_px - 1) / 2
-    return replace(view, camera=replace(camera, cx_px=middle_px[0], cy_px=middle_px[1]))
+def _by_given_lens(views: Sequence[View], before: Cameras3D) -> Sequence[View]:
+    """Views by the lens that the flight was mapped with, not by that which free cameras made of crowns: a map over
+    heights keeps theirs, and a flat one its own. Where it is taken back its centre is the picture's middle."""
+    camera, focal_px = views[0].camera, before.views[0].camera.fx_px / before.focal_scale
+    if np.isclose(camera.fx_px, focal_px):
+        return views
+    x_px, y_px = (camera.width_px - 1) / 2, (camera.height_px - 1) / 2
+    given = replace(camera.with_focal_px(focal_px), cx_px=x_px, cy_px=y_px)
+    return [replace(view, camera=given) for view in views]
 
 
 def _at_body_size(views: Sequence[View]) -> tuple[list[View], float]:
