@@ -101,8 +101,7 @@ class ModelInfo:
     model finds a class well. `stride`: the sides of its input are multiples of it. `thermal`: it was trained on
     thermal frames; `daylight`: on daylight. `thermal_by`: the installed model that looks at thermal frames
     in its place, "" for none. `precision` is float32 or int8. `on_request`: classes too unsure to be reported unless a
-    person asks for them. `turned`: pictures from straight above are looked at twice, once turned by a quarter, and each
-    class is reported from this mean score on; empty: once. `second_look`: classes whose reports are looked at again.
+    person asks for them. `second_look`: classes whose reports are looked at again.
     `pyramid`: classes that are looked for in several sizes where a picture's scale is not known. `second_only`: it only
     looks again at what other models report, and whole pictures mean nothing to it. `layout`: whose convention a foreign
     network follows (`layouts`), "" for ours; `columns`: the class of each of its scores, "" for none.
@@ -123,7 +122,6 @@ class ModelInfo:
     trained_on: str = ""
     created: str = ""
     on_request: tuple[str, ...] = ()
-    turned: Mapping[str, float] = field(default_factory=dict)
     second_look: Mapping[str, SecondLook] = field(default_factory=dict)
     pyramid: Mapping[str, Pyramid] = field(default_factory=dict)
     calibration: Mapping[str, ScoreCalibration] = field(default_factory=dict)
@@ -169,8 +167,7 @@ def _info(fields: Mapping[str, Any]) -> ModelInfo:
     classes = tuple(str(each) for each in fields["classes"])
     if not classes or len(set(classes)) != len(classes):
         raise ValueError(f"its classes must be one or more different names, not {list(classes)}")
-    thresholds, best_px = _thresholds(fields, "thresholds", classes), _best_px(fields, classes)
-    turned = _thresholds(fields, "turned", classes) if fields.get("turned") else {}
+    thresholds, best_px = _thresholds(fields, classes), _best_px(fields, classes)
     stride = int(fields.get("stride", _FALLBACK_STRIDE))
     if not 1 <= stride <= 256:
         raise ValueError(f"its stride must lie in 1 to 256, not {stride}")
@@ -215,7 +212,6 @@ def _info(fields: Mapping[str, Any]) -> ModelInfo:
         bool(fields.get("thermal", False)),
         bool(fields.get("daylight", True)),
         on_request=on_request,
-        turned=MappingProxyType(turned),
         second_look=MappingProxyType(found),
         pyramid=MappingProxyType(_pyramid(fields, classes)),
         calibration=MappingProxyType(_calibration(fields, classes)),
@@ -225,10 +221,10 @@ def _info(fields: Mapping[str, Any]) -> ModelInfo:
     )
 
 
-def _thresholds(fields: Mapping[str, Any], key: str, classes: Sequence[str]) -> dict[str, float]:
-    thresholds = {each: float(fields[key][each]) for each in classes}
+def _thresholds(fields: Mapping[str, Any], classes: Sequence[str]) -> dict[str, float]:
+    thresholds = {each: float(fields["thresholds"][each]) for each in classes}
     if not all(0 <= each <= 1 for each in thresholds.values()):
-        raise ValueError(f"its {key} must lie in 0 to 1, not {thresholds}")
+        raise ValueError(f"its thresholds must lie in 0 to 1, not {thresholds}")
     return thresholds
 
 

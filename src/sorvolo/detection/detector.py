@@ -12,14 +12,10 @@ import numpy as np
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.engine import Provider
 from sorvolo.detection.fusing import (
-    LOOK_QUARTERS,
     SeenTile,
-    agreed,
     agreed_in_sizes,
     calibrated,
     merge_tiles,
-    turned,
-    turned_back,
 )
 from sorvolo.detection.layouts import AUTO
 from sorvolo.detection.light import Picture, is_thermal, rgb_from_picture
@@ -277,8 +273,8 @@ class Detector:
         (grey is stretched as a thermal camera's). `tiles` cuts a large one: "auto" by `m_per_px` (the ground's
         sampling distance; None or NaN: not known), a number of its pixels a side, or None for the picture as a whole;
         docs/detector.md gives the rule. `least_score` None means each class's own threshold; `classes` None means all.
-        `from_above`: the camera looked about straight down; a model whose file asks for it (`turned`) then looks twice,
-        and people by day are not looked for where they are too small to be recognised (`is_too_small`).
+        `from_above`: the camera looked about straight down; people by day are then not looked for where they are too
+        small to be recognised (`is_too_small`).
         `overlapping`: others show the same (a video's frames), and none is worth looks in several sizes (`pyramid`).
         `early` is given the classes that have a look of their own (see `looks_for`), and what was
         found of them, while the picture is searched for the others; in the end the same objects are among all.
@@ -309,7 +305,7 @@ class Detector:
         def report(seen: Seen, names: Sequence[str]) -> Detections:
             """What is reported of these classes, in this detector's labels."""
             seen = calibrated(seen, info)
-            thresholds = _thresholds(info, from_above)
+            thresholds = info.thresholds
             least = np.array(
                 [
                     np.inf
@@ -330,17 +326,7 @@ class Detector:
             if early is not None and not info.second_look.keys() & set(names):
                 early(names, report(seen, names))
 
-        # from straight above nothing is upright: the picture as it is and a quarter turned
-        if from_above and info.turned:
-            size_px = rgb.shape[0], rgb.shape[1]
-            looks = []
-            for quarters in LOOK_QUARTERS:
-                seen = search.see(turned(rgb, quarters))
-                boxes_px = turned_back(seen.boxes_px, quarters, size_px)
-                looks.append(Seen(boxes_px, seen.scores, seen.labels))
-            seen = agreed(looks)
-        else:
-            seen = search.see(rgb, report_early)
+        seen = search.see(rgb, report_early)
         # a second look at the reports, by each model that has one
         second_look_by_label = {
             info.classes.index(name): how for name, how in info.second_look.items() if name in names
@@ -373,7 +359,7 @@ class Detector:
         `detect` looks for in it alone."""
         thermal = is_thermal(picture)
         info = self.info if self._is_own(thermal=thermal) else self._night_session().info
-        least = _thresholds(info, from_above)
+        least = info.thresholds
         sampling = math.nan if m_per_px is None else m_per_px
         too_small = _too_small(list(least), sampling, thermal=thermal, from_above=from_above)
         return {
@@ -459,7 +445,3 @@ def _too_small(
 ) -> list[str]:
     """Those of the classes that are not looked for in such a picture."""
     return [name for name in names if from_above and not thermal and is_too_small(name, m_per_px)]
-
-
-def _thresholds(info: ModelInfo, from_above: bool) -> Mapping[str, float]:
-    return info.turned if from_above and info.turned else info.thresholds

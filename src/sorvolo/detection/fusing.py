@@ -1,4 +1,4 @@
-"""Detections put together: looks at neighbouring tiles, turned copies and several sizes; and scores as shares (Platt 1999)."""
+"""Detections put together: looks at neighbouring tiles and in several sizes; and scores as shares (Platt 1999)."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -89,11 +89,9 @@ _TOUCH_SHARE, _TOUCH_PX = 0.2, 2.0
 # times the piece's area: a box of its own size is no whole that it is part of; by choice
 _MORE = 1.1
 
-# The thresholds on models' cards (`turned`, `pyramid`) hold for these values.
-LOOK_QUARTERS = (0, 1)  # quarter turns, one for each look at a picture from straight above
+# The thresholds on models' cards (`pyramid`) hold for these values.
 _LEAST_DOWN = 0.8  # of the optical axis: 37 degrees off straight down or less is from above
 _SAME_OBJECT_IOU = 0.5  # boxes of one class that overlap more are one object, as COCO counts them
-_UNSEEN = 0.02  # the score of what a turned look does not show: models report nothing below it
 _UNSEEN_ODDS = -4.5  # log-odds of what a sized look does not show: models report from -3.9 on
 _LEAST_SURE = 1e-4  # no score counts for less, nor for more than 1 less this
 _LEAST_TRUST = 1e-6  # of a look, beside the best one: it stays above zero, and its logarithm finite
@@ -266,39 +264,6 @@ def turned_back(boxes_px: BoxesPx, quarters: int, size_px: tuple[int, int]) -> B
         3: (top, height - right, bottom, height - left),
     }[quarters % 4]
     return np.column_stack(columns).astype(np.float32).reshape(-1, 4)
-
-
-def agreed(looks: Sequence[Seen]) -> Seen:
-    """What several looks at one picture saw, each object once, best first.
-
-    Boxes of a class that overlap are one object, at most one of each look. Its score is the mean over all looks, so
-    that what only one of them shows counts less; its box the mean of the looks' boxes by their scores.
-    """
-    boxes = np.concatenate([each.boxes_px for each in looks]).astype(np.float64)
-    scores = np.concatenate([each.scores for each in looks])
-    labels = np.concatenate([each.labels for each in looks])
-    of_look = np.repeat(np.arange(len(looks)), [len(each.scores) for each in looks])
-    kept: list[tuple[Floats, float, int]] = []
-    for label in np.unique(labels).tolist():
-        rows = np.flatnonzero(labels == label)
-        rows = rows[np.argsort(-scores[rows], kind="stable")]
-        for group in alike(boxes[rows]):
-            members = rows[group]
-            best = np.full(len(looks), _UNSEEN)
-            np.maximum.at(best, of_look[members], scores[members])
-            kept.append(
-                (
-                    np.average(boxes[members], axis=0, weights=scores[members]),
-                    float(best.mean()),
-                    label,
-                )
-            )
-    order = sorted(range(len(kept)), key=lambda k: -kept[k][1])
-    return Seen(
-        np.array([kept[k][0] for k in order], np.float32).reshape(-1, 4),
-        np.array([kept[k][1] for k in order]),
-        np.array([kept[k][2] for k in order], np.int64),
-    )
 
 
 def alike(boxes_px: Floats) -> Iterator[Rows]:
