@@ -62,17 +62,20 @@ def photo(
     )
     rays = rays / -rays[:, 2:]
     eye = view.site_from_camera.translation_m
-    up = np.full(len(rays), highest_m)
-    low = np.full(len(rays), lowest_m)
-    step = 0.05
-    met = np.zeros(len(rays), bool)
-    while not met.all() and up.min() > lowest_m:
+    up, step_m = np.full(len(rays), highest_m), 0.2
+
+    def met_at(up):
         at = eye + rays * (eye[2] - up)[:, None]
-        met |= heights(at[:, 0], at[:, 1]) >= up
-        up = np.where(met, up, np.maximum(up - step, low))
-        if (up <= lowest_m).any() and (met | (up <= lowest_m)).all():
-            break
-    at = eye + rays * (eye[2] - up)[:, None]
+        return heights(at[:, 0], at[:, 1]) >= up
+
+    while not (met := met_at(up) | (up <= lowest_m)).all():  # down in steps
+        up = np.where(met, up, np.maximum(up - step_m, lowest_m))
+    low, high = up, np.minimum(up + step_m, highest_m)
+    for _ in range(2):  # then to 5 cm within the step that met the ground
+        up = (low + high) / 2
+        met = met_at(up)
+        low, high = np.where(met, up, low), np.where(met, high, up)
+    at = eye + rays * (eye[2] - low)[:, None]
     colours = look(at[:, 0].reshape(x.shape), at[:, 1].reshape(x.shape))
     return np.clip(colours, 0, 255).astype(np.uint8)
 
