@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
-from toy_models import draw, rectangle_model
+from toy_models import draw, info_of, rectangle_model
 
 from sorvolo.detection.contract import CALIBRATED, METADATA_KEY, ScoreCalibration
 from sorvolo.detection.detector import Detector
@@ -94,9 +94,9 @@ def test_scores_at_the_ends_stay_between(score: float) -> None:
         ["person"],
     ],
 )
-def test_a_scale_that_cannot_be(tmp_path: Path, wrong: Any) -> None:
+def test_a_scale_that_cannot_be(wrong: Any) -> None:
     with pytest.raises(InputError, match="cannot be used"):
-        loaded(tmp_path, calibration=wrong)
+        info_of(calibration=wrong)
 
 
 @pytest.mark.parametrize(

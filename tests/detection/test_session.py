@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import onnxruntime
 import pytest
-from toy_models import METADATA, draw, onnx, rectangle_model, write_model
+from toy_models import METADATA, draw, info_of, onnx, rectangle_model, write_model
 
 from sorvolo.detection.models import find_model
 from sorvolo.detection.session import Session, read_info, usable_cores
@@ -126,11 +126,9 @@ def test_missing_outputs_and_answers_that_break_the_contract(tmp_path: Path) -> 
         ({"thresholds": None}, "cannot be used"),
     ],
 )
-def test_metadata_that_contradicts_itself(
-    tmp_path: Path, fields: dict[str, Any], message: str
-) -> None:
+def test_metadata_that_contradicts_itself(fields: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        Session(rectangle_model(tmp_path / "toy.onnx", **fields), "cpu")
+        info_of(**fields)
 
 
 def test_metadata_that_is_no_json(tmp_path: Path) -> None:

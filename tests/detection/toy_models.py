@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sorvolo.detection.contract import METADATA_KEY, ModelInfo, info_from_metadata
+
 onnx = pytest.importorskip("onnx")  # comes with the extra "training"
 pytest.importorskip("onnx.parser")
 pytest.importorskip("onnx.reference")
@@ -122,6 +124,11 @@ def rectangle_model(path: Path, *, fixed: tuple[int, int] | None = None, **chang
     height, width = fixed or ("H", "W")
     model = onnx.parser.parse_model(_RECTANGLES.format(height=height, width=width))
     return write_model(model, path, METADATA | changed)
+
+
+def info_of(**changed: Any) -> ModelInfo:
+    """What such a model states, without opening one: that takes a process of its own."""
+    return info_from_metadata({METADATA_KEY: json.dumps(METADATA | changed)}, "toy.onnx")
 
 
 def write_model(model: Any, path: Path, metadata: dict[str, Any] | None) -> Path:
