@@ -47,10 +47,14 @@ def chromium() -> Iterator[Any]:
 def context_of(browser: Any, *, keeps: bool = False, **options: Any) -> Any:
     """A browser's own world; `keeps`: with the page's service worker, whose requests no route of a test sees.
 
-    Its window is small and nothing in it moves by itself: most of a test's time would go into painting it.
+    Its window is small and coarse and nothing in it moves by itself: most of a test's time would go into painting it.
     """
     workers = "allow" if keeps else "block"
-    still = {"reduced_motion": "reduce", "viewport": {"width": 900, "height": 600}}
+    still = {
+        "reduced_motion": "reduce",
+        "viewport": {"width": 900, "height": 600},
+        "device_scale_factor": 0.5,
+    }
     return browser.new_context(**({"service_workers": workers} | still | options))
 
 
