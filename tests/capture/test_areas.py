@@ -292,6 +292,7 @@ def test_contains_does_not_depend_on_where_on_earth(latitude, longitude, corners
         (json.dumps(polygon(FIELD[:2])), "3 different points"),
         (json.dumps(polygon([FIELD[0]] * 5)), "3 different points"),
         (json.dumps(polygon([[12, 45], [13, "x"], [13, 46]])), "pair of numbers"),
+        (json.dumps(polygon([[12, 45], [13, True], [13, 46]])), "pair of numbers.*got true"),
         (json.dumps(polygon([[12], [13], [14]])), "pair of numbers"),
         (json.dumps(polygon([FIELD[0], FIELD[2], FIELD[1], FIELD[3]])), "crosses itself"),
         (json.dumps(polygon([[12, 45], [12.1, 45], [12.2, 45]])), "one line"),

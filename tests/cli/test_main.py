@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -359,8 +360,33 @@ def test_a_file_gives_options_and_a_name_that_is_none_is_refused(
         ("[plan]\nsped = 4\n", "[plan] there is no 'sped'; there are"),
         ("[plant]\n", "there is no 'plant'; there are archive, batch,"),
         ("plan = 4\n", "[plan] is no table of options, but 4"),
+        ("[plan]\nspeed = true\n", "[plan] speed takes a value, not true"),
         ("[plan\n", "no TOML file that can be read"),
     ):
         config.write_text(text)
         assert cli.main(command) == 1
         assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", [["watch"], ["map", "--site", "s"], ["search", "--site", "s"]])
+def test_an_input_that_is_not_there_is_refused_before_a_model_is_loaded(
+    command: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli.main([*command, "typo.mp4", "--model", "no-such.onnx"]) == 1
+    assert "no such file or folder: typo.mp4" in capsys.readouterr().err
+
+
+def test_verbose_logs_to_stderr_and_only_where_it_is_asked_for(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    secret = ["map", "rtsp://me:hidden@127.0.0.1:1/x", "--site", "s", "--model", "no-such.onnx"]
+    assert cli.main(["--verbose", *secret]) == 1
+    shown = capsys.readouterr().err
+    assert re.search(r"^\d{4}-.* INFO sorvolo\.missions: map_flights begins$", shown, re.M)
+    assert "hidden" not in shown
+    assert cli.main(secret) == 1
+    assert "INFO" not in capsys.readouterr().err

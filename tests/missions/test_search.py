@@ -411,6 +411,7 @@ def test_segments_need_probabilities_that_add_up(tmp_path: Path) -> None:
         [{"name": "x"}],
         [{"poa": 0.7}, {"poa": 0.7}],
         [{"poa": 3}],
+        [{"poa": True}],
         [{"poa": 10**400}],
         [],
     ):

@@ -376,6 +376,7 @@ WRONG: list[tuple[dict[str, Any], int]] = [
     ({"options": {"model": "../model"}}, 422),
     ({"options": {"alert_command": "rm"}}, 422),
     ({"options": {"overlap": 2}}, 422),
+    ({"options": {"votes": True}}, 422),  # it would count as 1
     ({"options": {"through_trees": True}}, 422),
     ({"mission": "compare", "site": "nowhere"}, 404),
     ({"mission": "search", "site": "nowhere", "input": None}, 404),

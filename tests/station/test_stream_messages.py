@@ -103,7 +103,15 @@ def test_a_hello_that_cannot_be_is_refused_in_words(text: str, words: str) -> No
 
 
 @pytest.mark.parametrize(
-    "text", ['{"time_ns": -1}', '{"time_ns": "soon"}', '{"time_ns": 1, "columns": 5}', "{}"]
+    "text",
+    [
+        '{"time_ns": -1}',
+        '{"time_ns": true}',
+        '{"time_ns": 1, "columns": {"speed_m_s": true}}',
+        '{"time_ns": "soon"}',
+        '{"time_ns": 1, "columns": 5}',
+        "{}",
+    ],
 )
 def test_telemetry_that_cannot_be_is_refused(text: str) -> None:
     with pytest.raises(InputError, match="telemetry"):

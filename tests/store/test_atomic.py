@@ -1,5 +1,6 @@
 """Files appear whole or not at all, also on a disk that is full."""
 
+import sqlite3
 import subprocess
 import sys
 from pathlib import Path
@@ -76,6 +77,38 @@ def test_a_file_that_grows_too_large_is_a_full_disk(tmp_path: Path) -> None:
     assert result.stdout.startswith("disk full: "), result.stderr
     assert (tmp_path / "x").read_bytes() == b"a" * 1000
     assert len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.parametrize("place", ["nowhere/x.kml", "file/x.kml", "folder", f"{'x' * 250}.kml"])
+def test_a_place_that_cannot_be_written_is_named_as_it_was_given(
+    place: str, tmp_path: Path
+) -> None:
+    """The temporary file beside it has a name that nobody knows; GDAL and SQLite would print it."""
+    (tmp_path / "file").write_bytes(b"x")
+    (tmp_path / "folder").mkdir()
+    path = tmp_path / place
+    with pytest.raises(StoreError, match="cannot write") as bytes_refused:
+        atomic_write_bytes(path, b"x")
+    with (
+        pytest.raises(StoreError, match="cannot write") as file_refused,
+        atomic_path(path) as temporary,
+    ):
+        sqlite3.connect(temporary).execute("CREATE TABLE t (x)").connection.close()
+    for refused in (bytes_refused, file_refused):
+        assert f"cannot write {path} (" in str(refused.value)
+        assert ".tmp-" not in str(refused.value)
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["file", "folder"]
+
+
+@pytest.mark.parametrize("name", ["nowhere", "file"])
+def test_a_scratch_folder_in_no_folder_names_that(name: str, tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"x")
+    with (
+        pytest.raises(StoreError, match="cannot write") as refused,
+        scratch_folder(tmp_path / name),
+    ):
+        pass
+    assert f"cannot write {tmp_path / name} (" in str(refused.value)
 
 
 @pytest.fixture

@@ -501,7 +501,7 @@ def test_what_is_written_follows_no_link(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(
         "sorvolo.store.atomic.temporary_beside", lambda path: path.with_name(".tmp-1-y")
     )
-    with pytest.raises(FileExistsError):
+    with pytest.raises(StoreError, match="File exists"):
         atomic_write_bytes(tmp_path / "y", b"new")
     assert (tmp_path / "victim").read_text() == "precious"
 

@@ -21,7 +21,7 @@ from defusedxml import ElementTree
 from defusedxml.common import DefusedXmlException
 from pyproj import Proj
 
-from sorvolo.capture.small_files import MOST_BYTES, read_small_file, text_of
+from sorvolo.capture.small_files import MOST_BYTES, as_number, read_small_file, text_of
 from sorvolo.errors import GeometryError, InputError
 from sorvolo.geometry.arrays import Floats
 from sorvolo.geometry.crs import crs_from_words, transformer
@@ -134,7 +134,7 @@ def _segment(
     name = str(properties.get("name") or f"segment {number}")
     shares = {"poa": 1.0, "POA": 1.0, "poa_percent": 0.01}
     stated = [
-        float(properties[key]) * share
+        as_number(properties[key]) * share
         for key, share in shares.items()
         if properties.get(key) is not None
     ]
@@ -247,7 +247,7 @@ def _geometries(tree: Any) -> Iterator[Any]:
 def _positions(path: Path, positions: Sequence[Any]) -> Floats:
     """Positions with or without a height as (N, 2)."""
     try:
-        pairs = np.array([[float(position[0]), float(position[1])] for position in positions])
+        pairs = np.array([[as_number(position[k]) for k in (0, 1)] for position in positions])
     except (TypeError, ValueError, IndexError, OverflowError) as error:
         raise InputError(f"{path}: a position is not a pair of numbers: {error}") from error
     return pairs.reshape(-1, 2)

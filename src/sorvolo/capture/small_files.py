@@ -1,6 +1,7 @@
 """Small text files that a person gives: read whole, within bounds, or refused in words."""
 
 from pathlib import Path
+from typing import Any
 
 from sorvolo.errors import InputError
 
@@ -35,3 +36,10 @@ def text_of(path: Path, raw: bytes, kind: str, needed: str) -> str:
     if not text:
         raise InputError(f"{path}: the {kind} is empty; {needed} is needed")
     return text
+
+
+def as_number(value: Any) -> float:
+    """A number of a JSON file or message. Raises TypeError for true and false, which would count as 1 and 0."""
+    if isinstance(value, bool):
+        raise TypeError(f"a number was expected, got {str(value).lower()}")
+    return float(value)

@@ -148,8 +148,10 @@ def open_sources(
         raise InputError(
             f"{given[0].name}: --telemetry or --camera was given for frames that have their own; give them to `frames`"
         )
+    demand_inputs(inputs)
     addresses = [live_address(text) for text in map(str, inputs) if is_live_address(text)]
-    videos, albums = _sort_inputs(_recorded(inputs))
+    recorded = [Path(each) for each in inputs if not is_live_address(str(each))]
+    videos, albums = _sort_inputs(recorded)
     names = _distinct_names(
         [*(each.chapters[0].resolve() for each in videos), *(album.place for album in albums)]
     )
@@ -265,13 +267,12 @@ def frames(
     return GivenFrames(name, kept, camera, telemetry)
 
 
-def _recorded(inputs: Sequence[Path | str]) -> list[Path]:
-    """The inputs that are files or folders; raises InputError for one that is not there."""
-    recorded = [str(each) for each in inputs if not is_live_address(str(each))]
-    for text in recorded:
-        if not (text and (Path(text).is_file() or Path(text).is_dir())):
+def demand_inputs(inputs: Iterable[Any]) -> None:
+    """Raise InputError for an input that is neither there, nor a live source's address, nor a package's or a program's."""
+    for text in (str(each) for each in inputs if not isinstance(each, GivenFrames)):
+        is_there = text and (Path(text).is_file() or Path(text).is_dir())
+        if not (is_there or is_live_address(text) or text.partition(":")[0] in added("sources")):
             raise InputError(_nothing_at(text))
-    return [Path(text) for text in recorded]
 
 
 @contextmanager

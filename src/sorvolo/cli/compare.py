@@ -28,6 +28,7 @@ from sorvolo.cli.options import (
     Telemetry,
     wanted_classes,
 )
+from sorvolo.cli.pdf import Pdf, write_pdfs
 from sorvolo.cli.printing import (
     TO_CHECK,
     Console,
@@ -112,6 +113,7 @@ def compare(
     sort: Sort = "importance",
     least: Least = 0.0,
     coordinates: PlaceFormatOption = "latlon",
+    pdf: Pdf = False,
     again: Again = False,
     as_json: AsJson = False,
 ) -> None:
@@ -171,6 +173,10 @@ def compare(
             print_json({"site": str(place.folder), "flights": results})
         else:
             show_results(results, place.folder, Console(), coordinates, sort, least)
+        if pdf:
+            folders = [place.folder / "flights" / result["flight"] for result in results]
+            names = ("changes.html", "report.html")
+            write_pdfs((each / name for each in folders for name in names), Console(stderr=as_json))
     if not all(is_good(result["comparison"]["headline"]) for result in results):
         raise typer.Exit(TO_CHECK)
 

@@ -1,5 +1,6 @@
 """The command `sorvolo`: its commands, and the one place where errors become exit codes."""
 
+import logging
 import os
 import signal
 import sys
@@ -179,6 +180,9 @@ def options(
     quiet: Annotated[
         bool, typer.Option("--quiet", help="Show no progress; results, warnings and errors stay.")
     ] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", help="Log each step to stderr, in place of bars.")
+    ] = False,
     config: Annotated[
         Path | None,
         typer.Option(help="A TOML file with a table of options for each command, such as `map`."),
@@ -189,7 +193,14 @@ def options(
     New here? Run `sorvolo demo`. With a flight of your own: `sorvolo inspect`, then `map`, `compare` or `watch`.
     """
     context.ensure_object(GlobalOptions).debug = debug
-    context.call_on_close(partial(IS_QUIET.reset, IS_QUIET.set(quiet)))
+    context.call_on_close(partial(IS_QUIET.reset, IS_QUIET.set(quiet or verbose)))
+    if verbose:
+        logger, handler = logging.getLogger("sorvolo"), logging.StreamHandler()
+        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+        logger.addHandler(handler)
+        logger.setLevel(logging.INFO)
+        context.call_on_close(partial(logger.setLevel, logging.NOTSET))
+        context.call_on_close(partial(logger.removeHandler, handler))
     if config is not None:
         try:
             tables = tomllib.loads(config.read_text(encoding="utf-8"))
@@ -206,21 +217,20 @@ def _defaults(command: Any, table: Mapping[str, Any], where: str) -> dict[str, A
     if not isinstance(table, Mapping):
         raise SettingsError(f"{where.rstrip(': ')} is no table of options, but {table!r}")
     below = getattr(command, "commands", {})
-    names = {
-        option.lstrip("-"): each.name
-        for each in command.params
-        for option in each.opts
-        if not below
-    }
-    if unknown := sorted(set(table) - {*names, *below}):
-        known = ", ".join(sorted({*names, *below} - {"help"}))
+    options = {} if below else {o.lstrip("-"): each for each in command.params for o in each.opts}
+    if unknown := sorted(set(table) - {*options, *below}):
+        known = ", ".join(sorted({*options, *below} - {"help"}))
         raise SettingsError(f"{where}there is no {unknown[0]!r}; there are {known}")
-    return {
-        names.get(name, name): _defaults(below[name], value, f"{where}[{name}] ")
-        if name in below
-        else value
-        for name, value in table.items()
-    }
+    defaults = {}
+    for name, value in table.items():
+        if name in below:
+            defaults[name] = _defaults(below[name], value, f"{where}[{name}] ")
+            continue
+        option = options[name]
+        if isinstance(value, bool) and not option.is_flag:
+            raise SettingsError(f"{where}{name} takes a value, not {str(value).lower()}")
+        defaults[option.name] = value
+    return defaults
 
 
 def _words_of(error: Exception) -> str:

@@ -29,6 +29,7 @@ from sorvolo.cli.options import (
     names,
     wanted_classes,
 )
+from sorvolo.cli.pdf import Pdf, write_pdfs
 from sorvolo.cli.printing import (
     TO_CHECK,
     Console,
@@ -108,6 +109,7 @@ def map_command(
     catalogue: CatalogueAddress = "",
     heights: WithHeights = None,
     refly: Refly = None,
+    pdf: Pdf = False,
     again: Again = False,
     as_json: AsJson = False,
 ) -> None:
@@ -172,6 +174,8 @@ def map_command(
             )
         reports = [read_json(folder / "report.json") for folder in folders]
         _print(reports, place.folder, catalogues, with_heights=bool(heights), as_json=as_json)
+        if pdf:
+            write_pdfs((folder / "report.html" for folder in folders), Console(stderr=as_json))
     if not all(is_good(report["headline"]) for report in reports):
         raise typer.Exit(TO_CHECK)
 

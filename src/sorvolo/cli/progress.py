@@ -1,5 +1,6 @@
 """How far a command is: a bar on a terminal, a line every ten seconds elsewhere, as in a log file."""
 
+import logging
 import time
 from collections.abc import Callable, Generator, Iterable
 from contextvars import ContextVar
@@ -13,6 +14,7 @@ from sorvolo.survey.wording import counted
 if TYPE_CHECKING:
     from sorvolo.survey.mosaic import MosaicUpdate
 
+_LOG = logging.getLogger("sorvolo.progress")
 _LINE_EVERY_S = 10.0  # a log file of an hour stays one to read; by choice
 
 T = TypeVar("T")
@@ -57,6 +59,9 @@ class ProgressReport:
 
     def show(self, task: str, done: int = 0, total: int | None = None, words: str = "") -> None:
         """`done` of `total` of a task (None: total unknown), and more in `words`; a new task, a new bar."""
+        so_far = f" {done:,} of {total:,}" if total else f" {done:,}" if done else ""
+        line = f"{task}{so_far}{', ' + words if words else ''}"
+        _LOG.info(line)
         if self._is_live:
             if task != self._task:
                 for earlier in self._bar.task_ids:
@@ -66,8 +71,6 @@ class ProgressReport:
             self._bar.update(self._bar.task_ids[-1], completed=done, total=total, words=words)
         elif not self._is_quiet and self._clock() - self._last_s >= _LINE_EVERY_S:
             self._last_s = self._clock()
-            so_far = f" {done:,} of {total:,}" if total else f" {done:,}" if done else ""
-            line = f"{task}{so_far}{', ' + words if words else ''}"
             self.console.print(line, markup=False, soft_wrap=True)
         self._task = task
 

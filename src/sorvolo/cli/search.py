@@ -22,6 +22,7 @@ from sorvolo.cli.options import (
     Telemetry,
     wanted_classes,
 )
+from sorvolo.cli.pdf import Pdf, write_pdfs
 from sorvolo.cli.printing import (
     TO_CHECK,
     Console,
@@ -83,6 +84,7 @@ def search_command(
     telemetry: Telemetry = None,
     camera: Camera = "",
     give_up: GiveUp = 30.0,
+    pdf: Pdf = False,
     as_json: AsJson = False,
 ) -> None:
     """Measure what a search would have found: "had a person lain here, would we have seen them?"
@@ -127,40 +129,45 @@ def search_command(
             tuple(refly or ()),
             dji_drone,
         )
-        if through_trees:
-            _look_through_trees(place, outputs, plants, as_json=as_json)
-            return
         if site:
             if flight:
                 raise SettingsError(
                     "--flight names flights that the map has; flights that are mapped now are measured"
                 )
             _map_all(inputs, place, settings, outputs, telemetry, camera, give_up)
-        measuring = search_site(place.folder, settings, outputs)
-        with ProgressReport(Console(stderr=True)) as progress, measuring:
-            for update in measuring:
-                progress.show(
-                    f"searching planted pictures of {update.flight},",
-                    update.done,
-                    update.total,
-                    f"{update.found} of {update.planted} found" if update.planted else "",
-                )
-            report = measuring.result()
+        if through_trees:
+            report = _look_through_trees(place, outputs, plants)
+        else:
+            measuring = search_site(place.folder, settings, outputs)
+            with ProgressReport(Console(stderr=True)) as progress, measuring:
+                for update in measuring:
+                    progress.show(
+                        f"searching planted pictures of {update.flight},",
+                        update.done,
+                        update.total,
+                        f"{update.found} of {update.planted} found" if update.planted else "",
+                    )
+                report = measuring.result()
     if as_json:
         print_json({"folder": str(outputs.folder), **report})
+    elif through_trees:
+        _show_under_trees(report, outputs.folder, Console())
     else:
         _show(report, outputs.folder, outputs.refly, Console())
+    if pdf:
+        page = "under_trees.html" if through_trees else "search.html"
+        write_pdfs([outputs.folder / page], Console(stderr=as_json))
     if not report["headline"]["complete"]:
         raise typer.Exit(TO_CHECK)
 
 
 def _look_through_trees(
-    place: "OpenedSite", outputs: "SearchOutputs", plants: int, *, as_json: bool
-) -> None:
+    place: "OpenedSite", outputs: "SearchOutputs", plants: int
+) -> dict[str, Any]:
     from sorvolo.missions.search.through_trees import search_under_trees
 
     flight = outputs.flights[0] if outputs.flights else ""
-    report: Mapping[str, Any] = {}
+    report: dict[str, Any] = {}
     with ProgressReport(Console(stderr=True)) as progress:
         for update in search_under_trees(
             place.folder, outputs.folder, flight=flight, plants=plants
@@ -169,12 +176,7 @@ def _look_through_trees(
                 report = update
             else:
                 progress.show(f"under the trees of {update.flight}: {update.stage},", update.number, update.total)  # fmt: skip
-    if as_json:
-        print_json({"folder": str(outputs.folder), **report})
-    else:
-        _show_under_trees(report, outputs.folder, Console())
-    if not report["headline"]["complete"]:
-        raise typer.Exit(TO_CHECK)
+    return report
 
 
 def _show_under_trees(report: Mapping[str, Any], folder: Path, console: Console) -> None:
@@ -204,11 +206,13 @@ def _map_all(
     """Map the flights; a live one is measured meanwhile."""
     from sorvolo.capture.live.addresses import is_live_address
     from sorvolo.capture.live.reconnect import LiveSettings
+    from sorvolo.capture.source import demand_inputs
     from sorvolo.missions.flight.settings import MapSettings
     from sorvolo.missions.map.flights import map_flights
     from sorvolo.missions.search.prepare import check_area_of, prepare_search
     from sorvolo.missions.search.while_flying import SearchWhileFlying
 
+    demand_inputs(inputs)
     flying, console = None, Console(stderr=True)
     if live := sum(is_live_address(address) for address in inputs):
         if live > 1:

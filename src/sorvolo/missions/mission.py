@@ -1,5 +1,6 @@
 """A mission as an object that one holds: its updates, its result, its end."""
 
+import logging
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -9,6 +10,7 @@ from typing import Any, Generic, ParamSpec, Self, TypeVar
 
 from sorvolo.errors import SettingsError
 
+_LOG = logging.getLogger("sorvolo.missions")
 P = ParamSpec("P")
 U = TypeVar("U")
 R = TypeVar("R")
@@ -31,6 +33,7 @@ class Mission(Iterator[U], Generic[U, R]):
         except StopIteration as end:
             if end.value is not None:  # it came to its end; what failed or was closed gives None
                 self._made.append(end.value)
+                _LOG.info("done")
             raise
         if self._is_cancelled:
             self._work.close()
@@ -69,6 +72,7 @@ def mission(work: Callable[P, Generator[U, None, R]]) -> Callable[P, Mission[U, 
 
     @wraps(work)
     def begin(*args: P.args, **kwargs: P.kwargs) -> Mission[U, R]:
+        _LOG.info("%s begins", work.__name__)  # without addresses, which hold passwords
         return Mission(work(*args, **kwargs))
 
     return begin

@@ -10,6 +10,7 @@ from math import isfinite
 from typing import Any
 
 from sorvolo.capture.live.klv import ITEMS
+from sorvolo.capture.small_files import as_number
 from sorvolo.errors import InputError
 from sorvolo.survey.flight import TELEMETRY_COLUMNS
 
@@ -137,9 +138,9 @@ def hello_from_json(text: str | bytes) -> Hello:
         return Hello(
             str(found["flight"]),
             str(found["codec"]),
-            int(found["width"]),
-            int(found["height"]),
-            float(found.get("fps") or 0.0),
+            int(as_number(found["width"])),
+            int(as_number(found["height"])),
+            as_number(found.get("fps") or 0.0),
             str(found.get("name", ""))[:200],
             str(found.get("sent_by", ""))[:200],
             int(found.get("protocol", 0)),
@@ -177,6 +178,7 @@ def sample_from_json(text: str | bytes) -> MessageSample:
     """The inverse of `MessageSample.to_json`; unknown names are ignored. Raises InputError for anything else."""
     found = _json_object(text, _MOST_TELEMETRY_BYTES, "telemetry")
     try:
+        as_number(found["time_ns"])  # raises; a float is too coarse for it
         time_ns = int(found["time_ns"])
         columns = _numbers(found.get("columns") or {}, TELEMETRY_COLUMNS)
         stated = _numbers(found.get("stated") or {}, _STATED)
@@ -190,7 +192,7 @@ def sample_from_json(text: str | bytes) -> MessageSample:
 
 
 def _numbers(found: Mapping[str, Any], names: Any) -> dict[str, float]:
-    numbers = {name: float(value) for name, value in found.items() if name in names}
+    numbers = {name: as_number(value) for name, value in found.items() if name in names}
     return {name: value for name, value in numbers.items() if isfinite(value)}
 
 

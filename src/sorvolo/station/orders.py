@@ -40,11 +40,15 @@ def writes(mission: str, has_input: bool, options: Mapping[str, Any]) -> bool:
 _CAMERA = r"^(aov=[0-9.]{1,8}|focal_px=[0-9.]{1,10}|[A-Za-z0-9 .+-]+)$"  # a preset's name: no path
 
 
-class InputWish(BaseModel):
+class Wish(BaseModel):
+    """What a request asks for: exactly of the types that it states, so that true is no number."""
+
+    model_config = ConfigDict(strict=True)
+
+
+class InputWish(Wish, extra="forbid"):
     """Where a flight comes from: exactly one of an upload's id, an id of GET /api/inputs, a stream's URL, the name of a
     stream that a drone sends here."""
-
-    model_config = ConfigDict(extra="forbid")
 
     upload: Annotated[str | None, Field(min_length=1, max_length=64)] = None
     input: Annotated[str | None, Field(min_length=1, max_length=64)] = None
@@ -61,10 +65,8 @@ class InputWish(BaseModel):
         return self
 
 
-class MissionOptions(BaseModel):
+class MissionOptions(Wish, extra="forbid"):
     """What may be chosen from outside; everything else is as the command line's defaults."""
-
-    model_config = ConfigDict(extra="forbid")
 
     camera: Annotated[str | None, Field(max_length=80, pattern=_CAMERA)] = None
     camera_file: InputWish | None = None
@@ -88,10 +90,8 @@ class MissionOptions(BaseModel):
     ground_elevation_m: Annotated[float | None, Field(ge=-1000, le=9000)] = None
 
 
-class RunWish(BaseModel):
+class RunWish(Wish, extra="forbid"):
     """A mission to start."""
-
-    model_config = ConfigDict(extra="forbid")
 
     mission: Mission
     site: str = Field(min_length=1, max_length=200)

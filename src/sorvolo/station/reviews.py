@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field, Strict
 
 from sorvolo.errors import SorvoloError, StoreError
 from sorvolo.missions.site.review import review_changes, withdraw_reviews
 from sorvolo.station.collections import FINDINGS, SiteCollections
 from sorvolo.station.events import EventLog, NewEvent
+from sorvolo.station.orders import Wish
 from sorvolo.station.problems import Problem
 from sorvolo.station.security import needs
 from sorvolo.station.settings import StationSettings
@@ -31,7 +32,7 @@ _ELSEWHERE = "sorvolo review"  # who votes by the command line
 _COLUMNS = "kind, id, revision, verdict, label, note, who, at"
 
 
-class ReviewWish(BaseModel):
+class ReviewWish(Wish):
     """A person's vote on an object or a change; "none" withdraws one's own, without any it stays, for a note. `label` is
     the class that it is held for."""
 
@@ -289,20 +290,20 @@ _FOLDER = "drawings"
 
 Longitude = Annotated[float, Field(ge=-180, le=180)]
 Latitude = Annotated[float, Field(ge=-90, le=90)]
-Place = tuple[Longitude, Latitude]
+Place = Annotated[tuple[Longitude, Latitude], Strict(False)]  # JSON knows lists alone
 
 
-class _Point(BaseModel):
+class _Point(Wish):
     type: Literal["Point"]
     coordinates: Place
 
 
-class _Line(BaseModel):
+class _Line(Wish):
     type: Literal["LineString"]
     coordinates: Annotated[list[Place], Field(min_length=2, max_length=_MOST_CORNERS)]
 
 
-class _Polygon(BaseModel):
+class _Polygon(Wish):
     type: Literal["Polygon"]
     coordinates: Annotated[
         list[Annotated[list[Place], Field(min_length=4, max_length=_MOST_CORNERS)]],
@@ -310,9 +311,7 @@ class _Polygon(BaseModel):
     ]
 
 
-class _Properties(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
+class _Properties(Wish, extra="forbid"):
     purpose: Literal["interest", "alert", "waypoint", "measure", "found"]
     name: str = Field("", max_length=80)
     planned: bool = False
@@ -321,7 +320,7 @@ class _Properties(BaseModel):
     at: str = Field("", max_length=40)  # and when
 
 
-class Drawing(BaseModel):
+class Drawing(Wish):
     """One drawing as a GeoJSON feature in WGS84."""
 
     type: Literal["Feature"]
@@ -330,7 +329,7 @@ class Drawing(BaseModel):
     properties: _Properties
 
 
-class DrawingsWish(BaseModel):
+class DrawingsWish(Wish):
     """All drawings of a site as they shall be; `revision` is that of those they were made from, 0 for none."""
 
     revision: int = Field(ge=0, le=2**53)

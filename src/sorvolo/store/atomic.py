@@ -15,6 +15,7 @@ TEMPORARY_PREFIX = ".tmp-"
 """Whatever a killed process left behind starts with this; `remove_leftovers` deletes it."""
 
 _FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS}
+_NO_PLACE = {errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG}
 
 
 @contextmanager
@@ -28,6 +29,10 @@ def atomic_path(path: Path, *, durable: bool = True) -> Iterator[Path]:
     """
     temporary = temporary_beside(path)
     with writing(path):
+        temporary.touch(
+            exist_ok=False
+        )  # a refusal here has a number, which GDAL's and SQLite's words lack
+        temporary.unlink()
         try:
             yield temporary
             if durable:
@@ -52,6 +57,12 @@ def atomic_write_bytes(path: Path, data: bytes, *, durable: bool = True) -> None
             file.write(data)
 
 
+def write_page(path: Path, page: str) -> None:
+    """Replace a page; the PDF that was printed from the one before goes. Raises StoreError as `atomic_write_bytes`."""
+    path.with_suffix(".pdf").unlink(missing_ok=True)
+    atomic_write_bytes(path, page.encode())
+
+
 @contextmanager
 def scratch_folder(parent: Path) -> Iterator[Path]:
     """A temporary folder inside `parent`, on the same disk, gone when the block ends.
@@ -59,7 +70,7 @@ def scratch_folder(parent: Path) -> Iterator[Path]:
     Raises StoreError when the disk is full or the folder cannot be written.
     """
     folder = temporary_beside(parent / "scratch")
-    with writing(folder):
+    with writing(parent):
         folder.mkdir()
         try:
             yield folder
@@ -77,7 +88,8 @@ def writing(path: Path) -> Iterator[None]:
             raise DiskFullError(
                 f"disk full: could not write {path} ({error.strerror}); free some space and run it again"
             ) from error
-        if error.errno in _FORBIDDEN:
+        is_ours = TEMPORARY_PREFIX in str(error.filename)  # a name that nobody gave
+        if is_ours or error.errno in _FORBIDDEN | _NO_PLACE:
             raise StoreError(
                 f"cannot write {path} ({error.strerror}); choose a folder that you may write to"
             ) from error

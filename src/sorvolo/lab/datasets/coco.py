@@ -8,6 +8,7 @@ from math import isfinite
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
+from sorvolo.capture.small_files import as_number
 from sorvolo.errors import InputError
 from sorvolo.lab.datasets.parsed import (
     PICTURE_ENDINGS,
@@ -175,7 +176,7 @@ def _edges(row: Mapping[str, Any]) -> tuple[float, float, float, float] | None:
 
 def _finite(value: Any) -> list[float]:
     try:
-        numbers = [float(number) for number in value]
+        numbers = [as_number(number) for number in value]
     except (TypeError, ValueError, OverflowError):
         return []
     return numbers if all(isfinite(number) for number in numbers) else []

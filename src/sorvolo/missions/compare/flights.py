@@ -11,14 +11,13 @@ from types import MappingProxyType
 from typing import Any
 
 from sorvolo.capture.areas import read_area
-from sorvolo.capture.live.addresses import is_live_address
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.source import LiveSource, Source, opened_sources
 from sorvolo.change.alignment import Caution, FlightPlace
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.compare.run import Again, CompareRun, Pending
 from sorvolo.missions.compare.whole_flight import MANY, OVERLAP
-from sorvolo.missions.flight.detector_protocol import FindsObjects, ObjectDetector, as_detector
+from sorvolo.missions.flight.detector_protocol import FindsObjects, ObjectDetector
 from sorvolo.missions.flight.disk import check_room
 from sorvolo.missions.flight.headline import contradicts_itself
 from sorvolo.missions.flight.known_camera import known_camera
@@ -86,12 +85,7 @@ def compare_flights(
     wanted = None if area is None else read_area(area)
     with Archive.open(site, write=False) as archive:
         _check_map(archive, site, settings)
-    is_live = any(is_live_address(str(each)) for each in inputs)
-    looks = (
-        open_detector(settings.model, is_live=is_live)
-        if detector is None
-        else as_detector(detector)
-    )
+    looks = open_detector(settings.model, detector, inputs)
     check_classes(looks, settings.classes)
     opened = opened_sources(
         inputs,

@@ -9,12 +9,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from sorvolo.capture.live.addresses import is_live_address
+from sorvolo.capture.source import demand_inputs
 from sorvolo.detection.fusing import is_from_above
 from sorvolo.detection.models import installed_models
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.camera import Camera
-from sorvolo.missions.flight.detector_protocol import ObjectDetector, load_detector
+from sorvolo.missions.flight.detector_protocol import (
+    FindsObjects,
+    ObjectDetector,
+    as_detector,
+    load_detector,
+)
 from sorvolo.missions.flight.looked_at import LookedAt, ground_for, looked_at
 from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.flight.settings import WAITING_MB
@@ -44,17 +51,26 @@ _CROP_PX = 256  # longer side of a picture on a page
 _MOST_CROPS = 60  # of one frame, the surest
 
 
-def open_detector(model: str, *, is_live: bool = False) -> ObjectDetector | None:
-    """The detector of this name or file; None for "none", and for "default" where no default model is installed.
+def open_detector(
+    model: str,
+    given: FindsObjects | None = None,
+    inputs: Sequence[Any] = (),
+    *,
+    is_live: bool = False,
+) -> ObjectDetector | None:
+    """The `given` detector, else that of this name or file; None for "none", and for "default" without a default model.
 
-    Beside an `is_live` flight's
-    map it runs at low priority. Raises InputError for any other model that is not there or cannot be used.
+    Beside an `is_live` flight's map, or one among the `inputs`, it runs at low priority. Raises InputError for an input
+    that is not there, before a model takes its time, and for any other model that is not there or cannot be used.
     """
+    demand_inputs(inputs)
+    if given is not None:
+        return as_detector(given)
     if model == NO_MODEL:
         return None
     if model == DEFAULT_MODEL and all(each.name != DEFAULT_MODEL for each in installed_models()):
         return None
-    if is_live:
+    if is_live or any(is_live_address(str(each)) for each in inputs):
         return made_at_low_priority(lambda: load_detector(model))
     return load_detector(model)
 

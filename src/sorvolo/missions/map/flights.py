@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sorvolo.capture.areas import read_area
-from sorvolo.capture.live.addresses import is_live_address
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.source import LiveSource, Source, opened_sources
 from sorvolo.capture.video import VideoSource
@@ -18,7 +17,7 @@ from sorvolo.capture.video_spans import SparseReading
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.missions.flight.base_map import open_base
 from sorvolo.missions.flight.control import open_control
-from sorvolo.missions.flight.detector_protocol import FindsObjects, ObjectDetector, as_detector
+from sorvolo.missions.flight.detector_protocol import FindsObjects, ObjectDetector
 from sorvolo.missions.flight.disk import LiveRoom, check_room
 from sorvolo.missions.flight.headline import OBLIQUE_DEG
 from sorvolo.missions.flight.map_objects import ObjectFinder, open_detector
@@ -109,12 +108,7 @@ def map_flights(
     waypoint_files = [Path(each) for each in listed(refly)]
     check_waypoint_files(waypoint_files, site)
     wanted = None if area is None else read_area(area)
-    is_live = any(is_live_address(str(each)) for each in inputs)
-    looks = (
-        open_detector(settings.model, is_live=is_live)
-        if detector is None
-        else as_detector(detector)
-    )
+    looks = open_detector(settings.model, detector, inputs)
     asked = replace(settings, live_s=0.0, memory_mb=None), wanted, looks
     opened = opened_sources(
         inputs, telemetry, camera, known_flights(site, catalogues), live=live, until=until

@@ -11,7 +11,7 @@ from sorvolo.geometry.arrays import Floats
 from sorvolo.geometry.homography import pose_from_homography
 from sorvolo.geometry.level_ground import footprint, is_on_ground
 from sorvolo.heights.field import above_ground
-from sorvolo.missions.flight.detector_protocol import FindsObjects, ObjectDetector, as_detector
+from sorvolo.missions.flight.detector_protocol import FindsObjects, ObjectDetector
 from sorvolo.missions.flight.map_objects import open_detector, why_not_searched
 from sorvolo.missions.heights.measure import flight_with_heights, read_field
 from sorvolo.missions.search.measure import SearchFrame, planted_classes
@@ -168,11 +168,7 @@ def prepare_search(
     _check_apart(outputs)
     area = None if outputs.area is None else read_area(outputs.area)
     segments = [] if outputs.poa is None else read_segments(outputs.poa)
-    looks = (
-        open_detector(settings.model, is_live=is_live)
-        if detector is None
-        else as_detector(detector)
-    )
+    looks = open_detector(settings.model, detector, is_live=is_live)
     if looks is None:
         raise InputError(f"nothing to measure: {why_not_searched(settings.model)}")
     planted_classes(looks, settings)

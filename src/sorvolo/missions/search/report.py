@@ -37,7 +37,7 @@ from sorvolo.search.recall import (
     segment,
     together,
 )
-from sorvolo.store.atomic import atomic_write_bytes, make_folder
+from sorvolo.store.atomic import atomic_write_bytes, make_folder, write_page
 from sorvolo.store.exports.map_pictures import picture
 from sorvolo.store.exports.plain import feature_collection, geojson_bytes, json_bytes, plain_json
 from sorvolo.store.exports.pod_files import (
@@ -473,7 +473,7 @@ def write_search(
     )
     report = build_search_report(searched, settings, detector, refly, so_far, warnings)
     atomic_write_bytes(outputs.folder / "search.json", json_bytes(report))
-    atomic_write_bytes(outputs.folder / "search.html", search_page(report, pictures).encode())
+    write_page(outputs.folder / "search.html", search_page(report, pictures))
     return report
 
 

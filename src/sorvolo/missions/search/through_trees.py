@@ -28,7 +28,7 @@ from sorvolo.missions.heights.run import (
 )
 from sorvolo.missions.search.measure import SeenFloor
 from sorvolo.paths import AnyPath
-from sorvolo.store.atomic import atomic_write_bytes, make_folder
+from sorvolo.store.atomic import atomic_write_bytes, make_folder, write_page
 from sorvolo.store.exports.places import place_deg
 from sorvolo.store.exports.plain import feature, feature_collection, geojson_bytes, json_bytes
 from sorvolo.store.images import BytesCache, jpeg_from_image
@@ -153,7 +153,7 @@ def search_under_trees(
     atomic_write_bytes(folder / "under_trees.geojson", geojson_bytes(collection))
     atomic_write_bytes(folder / "under_trees.json", json_bytes(report))
     page = under_trees_page(report, _ringed(under, finds), [each.crop_jpeg for each in found])
-    atomic_write_bytes(folder / "under_trees.html", page.encode())
+    write_page(folder / "under_trees.html", page)
     yield report
 
 

@@ -26,7 +26,7 @@ from sorvolo.missions.search.prepare import (
 )
 from sorvolo.missions.search.report import Searched, SoFar, State, remove_figures, write_search
 from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
-from sorvolo.store.atomic import atomic_write_bytes, writing
+from sorvolo.store.atomic import write_page, writing
 from sorvolo.store.pages.search import waiting_page
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import StoredKeyframe, utc_now
@@ -143,8 +143,7 @@ class SearchWhileFlying:
             if old := remove_figures(self._outputs):
                 text = f"waypoints of an earlier search were taken away, as a flight begins: {', '.join(old)}"
                 warnings.warn(text, SorvoloWarning, stacklevel=4)
-            page = waiting_page(is_over=is_over).encode()
-            atomic_write_bytes(self._outputs.folder / "search.html", page, durable=False)
+            write_page(self._outputs.folder / "search.html", waiting_page(is_over=is_over))
 
     @contextmanager
     def _warning(self) -> Iterator[None]:

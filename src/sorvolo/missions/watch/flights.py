@@ -15,7 +15,7 @@ from typing import Any
 from sorvolo.build import build
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.stream import LiveStream
-from sorvolo.capture.source import LiveSource, Source, open_sources
+from sorvolo.capture.source import LiveSource, Source, demand_inputs, open_sources
 from sorvolo.errors import InputError, SettingsError, SorvoloWarning
 from sorvolo.geometry.arrays import ImageGray, PointsM
 from sorvolo.missions.flight.detector_protocol import (
@@ -84,8 +84,10 @@ def watch(
     telemetry = as_text(telemetry)
     camera = as_text(camera)
     until = until or threading.Event()
+    inputs = listed(source)
+    demand_inputs(inputs)
     finder = _checked_detector(detector, settings, outputs)
-    sources = open_sources(listed(source), telemetry, camera, live=live, until=until)
+    sources = open_sources(inputs, telemetry, camera, live=live, until=until)
     with ExitStack() as stack:
         for each in sources:
             if isinstance(each, LiveSource):

@@ -17,6 +17,7 @@ from sorvolo.store.atomic import (
     remove_leftovers,
     sync_file,
     temporary_beside,
+    write_page,
     writing,
 )
 from sorvolo.store.exports.change_files import (
@@ -169,7 +170,7 @@ def _write_flight_files(files: "Archive", owed: OwedFiles) -> None:
     with files.replacing(*(f"flights/{owed.flight_id}/{name}" for name in names)):
         for name, content in contents.items():
             atomic_write_bytes(folder / name, content)
-        for name in owed.leftovers:
+        for name in (*owed.leftovers, "report.pdf"):
             (folder / name).unlink(missing_ok=True)
         take_staged(folder, owed.run_id)
         version = next(
@@ -249,7 +250,8 @@ def write_change_files(files: "Archive", flight_id: str, version: VersionEntry |
     folder = files.flight_folder(flight_id)
     if version is None:
         _remove_list(folder, "changes")
-        (folder / "changes.html").unlink(missing_ok=True)
+        for ending in (".html", ".pdf"):
+            (folder / f"changes{ending}").unlink(missing_ok=True)
         return
     changes = files.catalogue_rows(change_records.load_changes, flight_id)
     site = files.site()
@@ -275,7 +277,7 @@ def write_change_files(files: "Archive", flight_id: str, version: VersionEntry |
         before_words=_words_of(made.get(version.parent_id)),
         after_words=_words_of(version),
     )
-    atomic_write_bytes(folder / "changes.html", page.encode())
+    write_page(folder / "changes.html", page)
 
 
 def write_object_files(files: "Archive", flight_id: str, crops: Mapping[str, bytes]) -> None:
