@@ -317,7 +317,7 @@ def test_certificates_that_cannot_be_used(tmp_path: Path) -> None:
     broken.write_text("nothing")
     with pytest.raises(InputError, match=r"broken\.pem"):
         CotTls(certificate=broken).context()
-    with pytest.raises(InputError, match="missing"):
+    with pytest.raises(SettingsError, match="missing"):
         CotTls(ca=tmp_path / "missing.pem").context()
     with pytest.raises(SettingsError, match="tls://"):
         WatchOutputs(cot="udp://tak.local", cot_tls=CotTls(ca=broken))

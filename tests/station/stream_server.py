@@ -9,8 +9,8 @@ from typing import Any
 
 from websockets.asyncio.server import ServerConnection, serve
 
-from sorvolo.station.camera_door import SocketLink
 from sorvolo.station.ingest import Ingest, IngestLimits
+from sorvolo.station.stream_routes import SocketLink
 
 TOKEN = "a-secret"
 _LIMITS = IngestLimits(sync_s=0.02)

@@ -17,7 +17,6 @@ from live_sender import free_port, sending, udp_url
 from rtsp_server import RtspServer
 from websockets.asyncio.client import connect
 
-from sorvolo.station.camera_door import door_path
 from sorvolo.station.settings import StationSettings
 from waiting import wait_for
 
@@ -263,7 +262,7 @@ def test_pictures_that_no_browser_plays_are_read_by_the_mission_itself(tmp_path:
 def test_the_door_is_for_the_stations_user_alone_and_may_lie_deep(tmp_path: Path) -> None:
     """Longer than a socket's address may be; one that a killed station left is replaced."""
     root = tmp_path / ("deep" * 30)
-    door = door_path(StationSettings(root))
+    door = StationSettings(root).camera_door
     door.parent.mkdir(parents=True)
     door.touch()
     with Served(root, free_floor_gb=0.0):

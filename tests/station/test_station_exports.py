@@ -67,6 +67,20 @@ def test_geopackage_holds_what_the_map_shows(client: TestClient, tmp_path: Path)
     assert {row[1] for row in rows} <= set(categories) and set(categories.values()) == drawn
 
 
+def test_google_earth_is_told_to_load_the_objects_again(client: TestClient, root: Path) -> None:
+    (root / "field" / "objects.kml").write_text("<kml/>")
+    assert "site.kml" in {each["id"] for each in client.get(URL).json()}
+    answer = client.get(f"{URL}/site.kml")
+    namespace = "{http://www.opengis.net/kml/2.2}"
+    link = fromstring(answer.content).find(f".//{namespace}NetworkLink/{namespace}Link")
+    assert link is not None
+    words = {each.tag.removeprefix(namespace): each.text for each in link}
+    assert (words["refreshMode"], float(words["refreshInterval"])) == ("onInterval", 30)
+    for each in (answer, client.get(words["href"])):
+        assert each.status_code == 200
+        assert each.headers["content-type"].startswith("application/vnd.google-earth.kml+xml")
+
+
 def test_a_geopackage_leaves_nothing_behind(
     client: TestClient, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -5,12 +5,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.box import SIMPLE_HEAD
 from rich.markup import escape
-from rich.table import Table
 
 from sorvolo.cli.options import AsJson, CatalogueAddress, OutFile, wanted_classes
-from sorvolo.cli.printing import FAILED, Console, print_json
+from sorvolo.cli.printing import FAILED, Console, new_table, print_json
 from sorvolo.cli.progress import shown_work
 from sorvolo.cli.sites import show_copy
 from sorvolo.survey.wording import counted, counted_list
@@ -113,9 +111,7 @@ def _show(found: Sequence["FoundFlight"], console: Console) -> None:
     if not found:
         console.print("no flight saw this place at that time")
         return
-    table = Table(box=SIMPLE_HEAD, padding=0)
-    for name in ("flown", "site", "flight", "by", "frames", "best frame", "found there"):
-        table.add_column(name, overflow="fold")
+    table = new_table("flown", "site", "flight", "by", "frames", "best frame", "found there")
     for flight in found:
         table.add_row(
             time_words(flight.first_ns)[:19],

@@ -5,12 +5,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
-from rich.box import SIMPLE_HEAD
 from rich.markup import escape
-from rich.table import Table
 
 from sorvolo.cli.options import AsJson, Camera, Model, Resolution
-from sorvolo.cli.printing import FAILED, TO_CHECK, Console, print_json, show_path
+from sorvolo.cli.printing import FAILED, TO_CHECK, Console, new_table, print_json, show_path
 from sorvolo.cli.progress import ProgressReport, shown_work
 from sorvolo.errors import SettingsError
 from sorvolo.survey.wording import counted
@@ -160,10 +158,8 @@ def _show(report: "BatchReport", places: list[Path], root: Path, console: Consol
     rows = report.rows
     if len(rows) > _MOST_ROWS:
         rows = tuple(row for row in rows if row.state != "done")
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for name in ("flight", "folder", "state", "tries", "s", "CPU s", "MB", ""):
-        is_number = name in ("tries", "s", "CPU s", "MB")
-        table.add_column(name, justify="right" if is_number else "left", overflow="fold")
+    numbers = "tries", "s", "CPU s", "MB"
+    table = new_table("flight", "folder", "state", *numbers, "", right=numbers)
     for row in rows[:_MOST_ROWS]:
         state = _state_name(row, row.key in report.known)
         # a flight's path below the folder that was given

@@ -6,9 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
-from rich.box import SIMPLE_HEAD
 from rich.markup import escape
-from rich.table import Table
 
 from sorvolo.cli.options import (
     Again,
@@ -33,6 +31,7 @@ from sorvolo.cli.printing import (
     TO_CHECK,
     Console,
     announce_people,
+    new_table,
     place_heading,
     place_words,
     print_json,
@@ -130,7 +129,10 @@ def compare(
     from sorvolo.missions.compare.flights import compare_flights
     from sorvolo.missions.flight.settings import CompareSettings
     from sorvolo.missions.mission import is_good
+    from sorvolo.store.atomic import make_folder, writing
 
+    if masks is not None:
+        make_folder(masks)
     settings = CompareSettings(
         None if method == "robust" else _thesis(),
         votes=votes,
@@ -161,14 +163,11 @@ def compare(
             results = read_results(comparing, place, coordinates)
         if masks is not None:
             # Leave the masks that the site keeps of these flights in a folder as well, a folder for each flight
-            flights = [result["flight"] for result in results]
-            from sorvolo.store.atomic import writing
-
             with writing(masks):
-                for flight in flights:
-                    made = place.folder / "flights" / flight / "masks"
+                for result in results:
+                    made = place.folder / "flights" / result["flight"] / "masks"
                     if made.is_dir():
-                        shutil.copytree(made, masks / flight, dirs_exist_ok=True)
+                        shutil.copytree(made, masks / result["flight"], dirs_exist_ok=True)
         if as_json:
             print_json({"site": str(place.folder), "flights": results})
         else:
@@ -377,15 +376,11 @@ def _show_changes(
     from sorvolo.geometry.coordinates import Coordinates, place_text
 
     unit = "units" if is_local else "m"
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     place_name = place_heading(is_local, form)
-    for name in ("id", "kind", f"length {unit}", place_name, f"accuracy {unit}", "views", "score"):
-        table.add_column(
-            name,
-            no_wrap=name in ("id", "kind", place_name),
-            overflow="fold",
-            min_width=max(map(len, name.split())),
-        )
+    table = new_table(
+        *("id", "kind", f"length {unit}", place_name, f"accuracy {unit}", "views", "score"),
+        whole=("id", "kind", place_name),
+    )
     for feature, *others in rows[:_MAX_ROWS]:
         change = feature["properties"]
         # the middle of the outline's box: the place that pages, exports and `review` print

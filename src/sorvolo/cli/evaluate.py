@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from sorvolo import __version__
@@ -22,7 +21,7 @@ from sorvolo.cli.options import (
     class_names,
     names,
 )
-from sorvolo.cli.printing import Console, print_json
+from sorvolo.cli.printing import Console, new_table, print_json
 from sorvolo.cli.progress import ProgressReport
 from sorvolo.cli.sites import opened_site
 from sorvolo.survey.wording import counted
@@ -339,9 +338,10 @@ def _add(table: Table, name: str, spread: "Spread") -> None:
 
 
 def _show_scores(console: Console, scores: "SetScores") -> None:
-    table = Table(title=scores.name, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for name in ("class", "labels", "AP", "AP50", "precision", "recall", "from"):
-        table.add_column(name, no_wrap=True, justify="left" if name == "class" else "right")
+    numbers = "labels", "AP", "AP50", "precision", "recall", "from"
+    table = new_table(
+        "class", *numbers, whole=("class", *numbers), right=numbers, title=scores.name
+    )
     for row in scores.classes:
         table.add_row(
             row.label,

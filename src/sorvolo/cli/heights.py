@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from sorvolo.cli.options import Area, AsJson, Flight, OutFile, SiteArgument
 from sorvolo.cli.printing import (
     TO_CHECK,
     Console,
+    facts_table,
     print_json,
     read_json,
     show_notices_and_warnings,
@@ -169,9 +169,6 @@ def show_heights(site: Path, report: Mapping[str, Any], console: Console) -> Non
     from sorvolo.store.site.files import HeightFile
 
     cameras, surface = report["cameras"], report["surface"]
-    table = Table(
-        title=f"Heights of {escape(report['flight'])}", show_header=False, title_justify="left"
-    )
     rows = [
         ("photos", f"{cameras['views']} with {cameras['points']:,} points in space"),
         ("match error", f"{cameras['residual_rms_px']:.2f} px (root mean square)"),
@@ -193,10 +190,7 @@ def show_heights(site: Path, report: Mapping[str, Any], console: Console) -> Non
             f"{report['seconds']['total']:.1f} s, memory at most {report['peak_memory_mb']:,.0f} MB",
         ),
     ]
-    for name, text in rows:
-        if text:
-            table.add_row(name, text)
-    console.print(table)
+    console.print(facts_table(f"Heights of {escape(report['flight'])}", rows))
     show_notices_and_warnings(report, console)
     folder = site / "flights" / report["flight"]
     for name, file in (
@@ -223,24 +217,21 @@ def _judged(found: Mapping[str, Any]) -> str:
 def _show_volume(found: "MeasuredVolume", console: Console) -> None:
     measured = found.volume
     since = f"since {found.earlier}" if found.earlier else "above the ground around the area"
-    table = Table(
-        title=f"Volume of {escape(found.flight)}, {escape(since)}",
-        show_header=False,
-        title_justify="left",
-    )
-    table.add_row("came" if found.earlier else "above", f"{measured.fill_m3:,.1f} m3")
-    table.add_row("taken away" if found.earlier else "below", f"{measured.cut_m3:,.1f} m3")
-    table.add_row(
-        "difference", f"{measured.net_m3:,.1f} m3, accuracy {measured.sigma_m3:,.1f} m3 (1 sigma)"
-    )
-    table.add_row(
-        "area", f"{measured.area_m2:,.1f} m2, {measured.known_share:.0%} of it with heights"
-    )
+    tied = ""
     if found.tied is not None:
         east, north, up = found.tied.shift_m
-        table.add_row(
-            "flights tied",
+        tied = (
             f"moved by {east:.2f}, {north:.2f}, {up:.2f} m (east, north, up); the ground outside the "
-            f"area then differs by {found.tied.spread_m:.2f} m (1 sigma)",
+            f"area then differs by {found.tied.spread_m:.2f} m (1 sigma)"
         )
-    console.print(table)
+    rows = [
+        ("came" if found.earlier else "above", f"{measured.fill_m3:,.1f} m3"),
+        ("taken away" if found.earlier else "below", f"{measured.cut_m3:,.1f} m3"),
+        (
+            "difference",
+            f"{measured.net_m3:,.1f} m3, accuracy {measured.sigma_m3:,.1f} m3 (1 sigma)",
+        ),
+        ("area", f"{measured.area_m2:,.1f} m2, {measured.known_share:.0%} of it with heights"),
+        ("flights tied", tied),
+    ]
+    console.print(facts_table(f"Volume of {escape(found.flight)}, {escape(since)}", rows))

@@ -5,12 +5,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.box import SIMPLE_HEAD
 from rich.markup import escape
-from rich.table import Table
 
 from sorvolo.cli.options import AsJson, OnlyFlight, PlaceFormat, PlaceFormatOption, SiteArgument
-from sorvolo.cli.printing import Console, place_heading, place_words, print_json, site_of
+from sorvolo.cli.printing import Console, new_table, place_heading, place_words, print_json, site_of
 from sorvolo.cli.sites import opened_site
 from sorvolo.errors import SettingsError
 from sorvolo.survey.wording import counted
@@ -80,25 +78,13 @@ def _show_versions(entries: Sequence["HistoryEntry"], console: Console) -> None:
     if not entries:
         console.print("no map yet: sorvolo map makes one")
         return
-    table = Table(box=SIMPLE_HEAD, padding=0)  # 80 letters hold it
-    for name in (
-        "no",
-        "flown",
-        "complete (UTC)",
-        "flight",
-        "by",
-        "tiles",
-        "MB",
-        "changes",
-        "reviewed",
-    ):
-        # folded between words, never within: "2 disappeared", "2026-11-22"
-        table.add_column(
-            name,
-            no_wrap=name in ("no", "flown", "tiles", "MB"),
-            overflow="fold",
-            min_width={"complete (UTC)": 10, "changes": 13, "reviewed": 11, "by": 7}.get(name),
-        )
+    # 80 letters hold it; folded between words, never within: "2 disappeared", "2026-11-22"
+    table = new_table(
+        *("no", "flown", "complete (UTC)", "flight", "by", "tiles", "MB", "changes", "reviewed"),
+        whole=("no", "flown", "tiles", "MB"),
+        widths={"complete (UTC)": 10, "changes": 13, "reviewed": 11, "by": 7},
+        is_tight=True,
+    )
     for entry in entries:
         table.add_row(*_cells(entry))
     console.print(table)
@@ -185,23 +171,14 @@ def _show_changes(
         )
         return
     # 80 letters hold the table, no word is cut
-    table, place = Table(box=SIMPLE_HEAD, padding=0), place_words(site, form)
-    place_name = place_heading(site.is_local, form)
-    for name in (
-        "id",
-        "kind",
-        place_name,
-        f"length {'units' if site.is_local else 'm'}",
-        "score",
-        "first seen (UTC)",
-        "verdict",
-    ):
-        table.add_column(
-            name,
-            no_wrap=name in ("id", "kind", place_name),
-            overflow="fold",
-            min_width={"first seen (UTC)": 10, "verdict": 9}.get(name),
-        )
+    place, place_name = place_words(site, form), place_heading(site.is_local, form)
+    length = f"length {'units' if site.is_local else 'm'}"
+    table = new_table(
+        *("id", "kind", place_name, length, "score", "first seen (UTC)", "verdict"),
+        whole=("id", "kind", place_name),
+        widths={"first seen (UTC)": 10, "verdict": 9},
+        is_tight=True,
+    )
     for change in changes:
         verdict = ""
         if change.verdict is not None:

@@ -5,10 +5,9 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from rich.markup import escape
-from rich.table import Table
 
 from sorvolo.cli.options import AsJson, Camera, Inputs, Telemetry
-from sorvolo.cli.printing import Console, print_json
+from sorvolo.cli.printing import Console, facts_table, print_json
 from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
@@ -39,12 +38,8 @@ def inspect(
         return
     console = Console()
     for inspection in inspections:
-        table = Table(
-            title=f"{inspection.name} ({inspection.kind})", show_header=False, title_justify="left"
-        )
-        for name, text in _rows(inspection):
-            table.add_row(name, escape(text))
-        console.print(table)
+        rows = ((name, escape(text)) for name, text in _rows(inspection))
+        console.print(facts_table(f"{inspection.name} ({inspection.kind})", rows))
         for finding in inspection.findings:
             colour = _COLOURS[finding.level]
             advice = f" [dim]-> {escape(finding.advice)}[/dim]" if finding.advice else ""

@@ -8,7 +8,7 @@ import threading
 import tomllib
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -45,32 +45,16 @@ from sorvolo.store.freed_memory import share_arenas
 if TYPE_CHECKING:
     from sys import UnraisableHookArgs
 
-_COMMANDS: dict[str, Callable[..., None]] = {
-    "inspect": inspect,
-    "plan": plan,
-    "map": map_command,
-    "compare": compare,
-    "watch": watch_command,
-    "search": search_command,
-    "telemetry": telemetry_command,
-    "simulate": simulate,
-    "train": train,
-    "calibrate": calibrate,
-    "demo": demo,
-    "history": history,
-    "review": review,
-    "heights": heights,
-    "serve": serve,
-    "stream": stream,
-    "token": token,
-    "batch": batch,
-    "reproduce": reproduce,
-}
+_COMMANDS = (
+    *(inspect, plan, map_command, compare, watch_command, search_command, telemetry_command),
+    *(simulate, train, calibrate, demo, history, review, heights, serve, stream, token, batch),
+    reproduce,
+)
 _ASKED_AGAIN_S = 0.02  # an end that C code swallowed is asked for again so soon; by choice
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
-for _name, _command in _COMMANDS.items():
-    app.command(_name)(_command)
+for _command in _COMMANDS:
+    app.command(_command.__name__.removesuffix("_command"))(_command)
 app.add_typer(archive_app, name="archive")
 app.add_typer(evaluate_app, name="evaluate")
 app.add_typer(measure_app, name="measure")

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.markup import escape
-from rich.table import Table
 
 from sorvolo.cli.heights import make_and_read, show_heights
 from sorvolo.cli.options import (
@@ -34,6 +33,7 @@ from sorvolo.cli.printing import (
     TO_CHECK,
     Console,
     announce_people,
+    facts_table,
     print_json,
     read_json,
     show_notices_and_warnings,
@@ -224,9 +224,6 @@ def _thesis() -> "MapMethod":
 def show_reports(reports: Sequence[Mapping[str, Any]], site: Path, console: Console) -> None:
     """Print what became of the flights, what to look at first, and where the files are."""
     for report in reports:
-        table = Table(
-            title=f"Flight {escape(report['flight'])}", show_header=False, title_justify="left"
-        )
         frames = report["frames"]
         by_gps, rejected = frames["gps-only"], frames["rejected"]
         rows = [
@@ -242,12 +239,10 @@ def show_reports(reports: Sequence[Mapping[str, Any]], site: Path, console: Cons
         frame_rows = rows + [
             ("", escape(f"{counted(count, 'frame')}: {reason}")) for reason, count in reasons
         ]
-        for name, text in (*frame_rows, *_quality_rows(report)):
-            if text:
-                table.add_row(name, text)
         console.print(escape(report["headline"]["text"]), style="bold")
         announce_people(report, site, console)
-        console.print(table)
+        title = f"Flight {escape(report['flight'])}"
+        console.print(facts_table(title, (*frame_rows, *_quality_rows(report))))
         show_notices_and_warnings(report, console)
     for name, path in _map_files(site).items():
         show_path(name, path, console)

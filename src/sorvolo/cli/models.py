@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
 from sorvolo.cli.options import AsJson
-from sorvolo.cli.printing import FAILED, Console, print_json
+from sorvolo.cli.printing import FAILED, Console, facts_table, new_table, print_json
 from sorvolo.errors import InputError, SettingsError
 
 if TYPE_CHECKING:
@@ -56,9 +55,7 @@ def list_models(
 
 
 def _show_rows(rows: Sequence[Mapping[str, Any]]) -> None:
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for name in ("name", "preset", "classes", "light", "numbers", "MB", "file"):
-        table.add_column(name, overflow="fold")
+    table = new_table("name", "preset", "classes", "light", "numbers", "MB", "file")
     for row in rows:
         table.add_row(
             escape(row["name"]),
@@ -100,26 +97,12 @@ def show(
     if as_json:
         print_json(facts)
         return
-    table = Table(title=escape(info.name), show_header=False, title_justify="left")
-    table.add_column()
-    table.add_column(overflow="fold")
-    for name in (
-        "preset",
-        "version",
-        "precision",
-        "licence",
-        "trained_on",
-        "created",
-        "path",
-        "sha256",
-    ):
-        table.add_row(name.replace("_", " "), escape(str(facts[name])))
-    table.add_row("light", _light(facts))
+    told = "preset", "version", "precision", "licence", "trained_on", "created", "path", "sha256"
+    rows = [(name.replace("_", " "), escape(str(facts[name]))) for name in told]
+    rows.append(("light", _light(facts)))
     if info.second_only:
-        table.add_row(
-            "use",
-            "looks again at what other models report; it cannot search whole pictures (--model)",
-        )
+        use = "looks again at what other models report; it cannot search whole pictures (--model)"
+        rows.append(("use", use))
     for each in info.classes:
         least_px, most_px = info.best_px[each]
         reported = (
@@ -127,13 +110,13 @@ def show(
         )
         sizes = f"found well from {least_px:g} to {most_px:g} px"
         words = f"{reported} from score {info.thresholds[each]:.2f} on; {sizes}"
-        table.add_row(escape(each), words)
-    table.add_row("scores", _meaning(info))
+        rows.append((escape(each), words))
+    rows.append(("scores", _meaning(info)))
     for key, value in card.items():
         if key not in facts and key not in (_MEASURED, _MEASURED_BY):
-            table.add_row(escape(key.replace("_", " ")), escape(_in_words(value)))
+            rows.append((escape(key.replace("_", " ")), escape(_in_words(value))))
     console = Console()
-    console.print(table)
+    console.print(facts_table(escape(info.name), rows))
     if measured := _measured(card.get(_MEASURED), str(card.get(_MEASURED_BY, ""))):
         console.print(measured)
 
@@ -231,11 +214,8 @@ def _in_words(value: Any) -> str:
 def _measured(sets: Any, by: str) -> Table | None:
     """The card's measurements, a row for each class of each set; None where it has none of the usual form."""
     title = f"measured on pictures held out{f', by {escape(by)}' if by else ''}"
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=title, title_justify="left")
-    for name in ("set", "class", "labels", "AP50 %", "AP %"):
-        table.add_column(
-            name, justify="left" if name in ("set", "class") else "right", overflow="fold"
-        )
+    numbers = "labels", "AP50 %", "AP %"
+    table = new_table("set", "class", *numbers, right=numbers, title=title)
     for name, classes in sets.items() if isinstance(sets, Mapping) else ():
         for label, row in classes.items() if isinstance(classes, Mapping) else ():
             if isinstance(row, Mapping):

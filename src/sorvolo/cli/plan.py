@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
-from rich.table import Table
 
 from sorvolo.cli.options import Area, AsJson, Camera, DjiDrone, FlightHeight, Model, size_px
-from sorvolo.cli.printing import Console, print_json
+from sorvolo.cli.printing import Console, facts_table, print_json
 from sorvolo.errors import SettingsError
 
 if TYPE_CHECKING:
@@ -121,9 +120,8 @@ def _show(
     hidden: float | None,
 ) -> None:
     console = Console()
-    table = Table("", "", title="Flight plan", show_header=False, title_justify="left")
     camera = answers.camera.camera
-    camera_rows = [
+    rows = [
         ("camera", answers.camera.origin),
         (
             "picture size",
@@ -131,7 +129,6 @@ def _show(
         ),
         ("angle of view", "{:.1f} x {:.1f} deg".format(*answers.angle_of_view_deg)),
     ]
-    rows = []
     for name, highest_m in answers.maximum_heights_m.items():
         by_resolution = (
             f"{highest_m:,.2f} m by resolution alone, {answers.required_px_per_m[name]:.2f} px/m"
@@ -159,7 +156,7 @@ def _show(
         f"at least {answers.minimum_frame_rate_hz:.3g} a second for {settings.forward_overlap:.0%} overlap at "
         f"{settings.speed_m_s:g} m/s: one every {answers.photo_spacing_m:.1f} m"
     )
-    rate_rows = [
+    rows += [
         ("ground resolution", f"{100 * answers.ground_sampling_m:.2f} cm a pixel"),
         ("a picture covers", "{:.1f} x {:.1f} m".format(*answers.footprint_m)),
         ("picture rate", rate),
@@ -170,21 +167,16 @@ def _show(
     ]
     if hidden is not None:
         free = f"{answers.views * (1 - hidden):.0f} of them between crowns that hide {hidden:.0%}"
-        rate_rows.append(("a spot is in", f"{answers.views:.0f} pictures, {free}"))
-    for row in (*camera_rows, *rows, *rate_rows):
-        table.add_row(*row)
+        rows.append(("a spot is in", f"{answers.views:.0f} pictures, {free}"))
     if flight is not None:
-        table.add_row(
-            "passes", f"{len(flight.passes_m)}, at {flight.strip_bearing_deg:.0f} deg and back"
-        )
-        table.add_row("photos", f"{flight.photo_count:,}")
-        minutes = flight.duration_s / 60
-        table.add_row(
-            "path", f"{flight.distance_m:,.0f} m, {minutes:.1f} min without take-off and return"
-        )
-    for path in out:
-        table.add_row("written", str(path))
-    console.print(table)
+        path = f"{flight.distance_m:,.0f} m, {flight.duration_s / 60:.1f} min without take-off and return"
+        rows += [
+            ("passes", f"{len(flight.passes_m)}, at {flight.strip_bearing_deg:.0f} deg and back"),
+            ("photos", f"{flight.photo_count:,}"),
+            ("path", path),
+        ]
+    rows += [("written", str(each)) for each in out]
+    console.print(facts_table("Flight plan", rows))
     for warning in _warnings(answers, settings):
         console.print(f"[yellow]warning[/yellow]  {warning}")
 

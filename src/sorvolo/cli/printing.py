@@ -1,13 +1,16 @@
 """What several commands print and read: exit codes, files, notices, warnings, places."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import rich.console
 import typer
+from rich.box import SIMPLE_HEAD
 from rich.markup import escape
+from rich.table import Table
 
 from sorvolo.cli.options import PlaceFormat
 from sorvolo.errors import StoreError
@@ -31,6 +34,40 @@ class Console(rich.console.Console):
 
     def __init__(self, *, stderr: bool = False) -> None:
         super().__init__(stderr=stderr, highlight=False)
+
+
+def new_table(
+    *names: str,
+    whole: Container[str] = (),
+    right: Container[str] = (),
+    widths: Mapping[str, int] = MappingProxyType({}),
+    is_tight: bool = False,
+    title: str | None = None,
+) -> Table:
+    """A table with columns of these names: `whole` ones are never folded, `right` ones hold numbers, and each is as wide
+    as its `widths`, or as the longest word of its name. A tight one spares blanks."""
+    padding = 0 if is_tight else (0, 1, 0, 0)
+    table = Table(box=SIMPLE_HEAD, padding=padding, title=title, title_justify="left")
+    for name in names:
+        table.add_column(
+            name,
+            no_wrap=name in whole,
+            overflow="fold",
+            min_width=widths.get(name, max(map(len, name.split()), default=0)),
+            justify="right" if name in right else "left",
+        )
+    return table
+
+
+def facts_table(title: str, rows: Iterable[tuple[str, str]]) -> Table:
+    """Names and what is known of each; those without a text are left out."""
+    table = Table(title=title, show_header=False, title_justify="left")
+    table.add_column()
+    table.add_column(overflow="fold")
+    for name, text in rows:
+        if text:
+            table.add_row(name, text)
+    return table
 
 
 def announce_person(words: str, console: Console) -> None:

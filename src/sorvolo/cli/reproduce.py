@@ -17,7 +17,6 @@ from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
     from sorvolo.lab.thesis.rows import Row
-    from sorvolo.lab.thesis.settings import ReproductionSettings, SimulatedSize
 
 _DEFAULT_OUT = Path("reproduction")
 
@@ -67,7 +66,8 @@ def reproduce(
 
     Example, without the dataset: sorvolo reproduce --simulated --videos 1
     """
-    from sorvolo.lab.thesis.report import PAGE
+    from sorvolo.lab.thesis.report import PAGE, write_reproduction
+    from sorvolo.lab.thesis.run import reproduce as reproduced
     from sorvolo.lab.thesis.settings import ReproductionSettings, SimulatedSize
     from sorvolo.lab.thesis.settings import quick as quick_sizes
     from sorvolo.lab.training.settings import TrainSettings
@@ -94,49 +94,25 @@ def reproduce(
                         step.frames_total,
                     )
     assert dataset is not None
-    rows = _rows(dataset, out, settings, {"okutama": okutama, "npu": npu}, is_whole=not simulated)
-    document = _written(out, rows, dataset, settings, simulation if simulated else None)
+    rows: list[Row] = []
+    console = Console(stderr=True)
+    with ProgressReport(console) as progress:
+        progress.show("reproducing, row")
+        for update in reproduced(
+            dataset, out, settings, okutama=okutama, npu=npu, is_whole=not simulated
+        ):
+            rows.append(update.row)
+            progress.show("reproducing, row", update.done, update.total, update.row.id)
+            if update.row.missing:
+                words = f"missing  {update.row.id}: {update.row.missing}"
+                console.print(words, style="yellow", markup=False, soft_wrap=True)
+    document = write_reproduction(out, rows, dataset, settings, simulation if simulated else None)
     if as_json:
         print_json(document)
     else:
         _show(document, out / PAGE)
     if document["missing"]:
         raise typer.Exit(TO_CHECK)
-
-
-def _rows(
-    place: Path,
-    out: Path,
-    settings: "ReproductionSettings",
-    others: "dict[str, Path | None]",
-    *,
-    is_whole: bool,
-) -> "list[Row]":
-    from sorvolo.lab.thesis.run import reproduce as reproduced
-
-    console = Console(stderr=True)
-    rows = []
-    with ProgressReport(console) as progress:
-        progress.show("reproducing, row")
-        for update in reproduced(place, out, settings, **others, is_whole=is_whole):
-            rows.append(update.row)
-            progress.show("reproducing, row", update.done, update.total, update.row.id)
-            if update.row.missing:
-                words = f"missing  {update.row.id}: {update.row.missing}"
-                console.print(words, style="yellow", markup=False, soft_wrap=True)
-    return rows
-
-
-def _written(
-    out: Path,
-    rows: "list[Row]",
-    place: Path,
-    settings: "ReproductionSettings",
-    size: "SimulatedSize | None",
-) -> dict[str, Any]:
-    from sorvolo.lab.thesis.report import write_reproduction
-
-    return write_reproduction(out, rows, place, settings, size)
 
 
 def _show(document: dict[str, Any], page: Path) -> None:

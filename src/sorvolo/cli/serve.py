@@ -11,16 +11,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.box import SIMPLE_HEAD
-from rich.table import Table
 
 from sorvolo.cli.options import AsJson, Authority, Cot, CotCertificate
-from sorvolo.cli.printing import Console
+from sorvolo.cli.printing import Console, new_table, print_json
 from sorvolo.cli.sites import show_copy
 from sorvolo.errors import InputError, SettingsError
 
 if TYPE_CHECKING:
     from sorvolo.station.settings import StationSettings
+    from sorvolo.station.tokens import TokenEntry
 
 _NEEDED = ("fastapi", "uvicorn", "websockets", "titiler.core", "prometheus_client", "paho.mqtt")
 
@@ -211,13 +210,8 @@ def token(
             made = make_token(state, name, role, days)
             typer.echo(json.dumps({"name": name, "role": role, "token": made}) if as_json else made)
         else:
-            _show_tokens(
-                [
-                    (known.name, known.role.lower(), known.made_at, known.expires_at)
-                    for known in list_tokens(state)
-                ],
-                as_json=as_json,
-            )
+            known = list_tokens(state)
+            print_json(known) if as_json else _show_tokens(known)
     finally:
         state.close()
 
@@ -250,23 +244,13 @@ def _announce(settings: "StationSettings", *, opens: bool) -> None:
         webbrowser.open(settings.address)
 
 
-def _show_tokens(rows: list[tuple[str, str, str, str | None]], *, as_json: bool) -> None:
-    if as_json:
-        typer.echo(
-            json.dumps(
-                [dict(zip(("name", "role", "made_at", "expires_at"), row)) for row in rows],
-                indent=1,
-            )
-        )
-        return
-    if not rows:
+def _show_tokens(tokens: "list[TokenEntry]") -> None:
+    if not tokens:
         typer.echo("no tokens: only this machine reaches the station, and needs none")
         return
-    table = Table(box=SIMPLE_HEAD, padding=0)
-    for heading in ("name", "role", "made (UTC)", "expires (UTC)"):
-        table.add_column(heading)
-    for name, role, made_at, expires_at in rows:
-        table.add_row(name, role, made_at[:16], (expires_at or "never")[:16])
+    table = new_table("name", "role", "made (UTC)", "expires (UTC)")
+    for each in tokens:
+        table.add_row(each.name, each.role, each.made_at[:16], (each.expires_at or "never")[:16])
     Console().print(table)
 
 

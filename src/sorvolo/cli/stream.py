@@ -2,11 +2,8 @@
 
 import hashlib
 import os
-import signal
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,6 +14,7 @@ from sorvolo.cli.options import AsJson, Authority, Camera, Telemetry
 from sorvolo.cli.printing import Console, print_json
 from sorvolo.cli.progress import ProgressReport
 from sorvolo.cli.serve import demand_extra
+from sorvolo.cli.sites import SignalStop
 from sorvolo.errors import SettingsError
 from sorvolo.survey.wording import counted
 
@@ -98,8 +96,9 @@ def stream(
         give_up_s=forever if give_up is None else give_up,
         authority=ca,
     )
-    stop = threading.Event()
-    with _stopped_by_signals(stop):
+    stopping = SignalStop(is_running=True)
+    stop = stopping.until
+    with stopping.on_signals():
         live = LiveSettings(give_up_s=30.0 if give_up is None else give_up)
         footage = open_footage(source, telemetry or None, camera or None, live, stop)
         stream_name = name or footage.name
@@ -238,20 +237,3 @@ def _flight_key(to: str, stream_name: str, source: str) -> str:
     found = path.stat() if path.is_file() else None
     content = f"{found.st_size} {found.st_mtime_ns}" if found is not None else ""
     return hashlib.sha256(f"{to} {stream_name} {source} {content}".encode()).hexdigest()[:16]
-
-
-@contextmanager
-def _stopped_by_signals(stop: threading.Event) -> Iterator[None]:
-    """The first Ctrl-C or SIGTERM ends the flight and lets what waits be sent; a second one ends at once."""
-
-    def note(*_: Any) -> None:
-        if stop.is_set():
-            raise KeyboardInterrupt
-        stop.set()
-
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

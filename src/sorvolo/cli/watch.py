@@ -6,9 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.box import SIMPLE_HEAD
 from rich.markup import escape
-from rich.table import Table
 
 from sorvolo.cli.options import (
     AlertCommand,
@@ -38,6 +36,7 @@ from sorvolo.cli.printing import (
     TO_CHECK,
     Console,
     announce_person,
+    new_table,
     place_heading,
     print_json,
     read_json,
@@ -237,19 +236,12 @@ def _show_tracks(
     from sorvolo.geometry.coordinates import Coordinates, place_text
 
     has_cuts = len({track.get("segment") for track in tracks}) > 1
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     in_picture = "segment: x, y px" if has_cuts else "x, y px"
     place_name = place_heading(False, form) if on_ground else in_picture
-    for name in (
-        "id",
-        "class",
-        "score",
-        place_name,
-        f"accuracy {'m' if on_ground else 'px'}",
-        "views",
-        "moves",
-    ):
-        table.add_column(name, no_wrap=name in ("id", place_name), overflow="fold")
+    accuracy = f"accuracy {'m' if on_ground else 'px'}"
+    table = new_table(
+        *("id", "class", "score", place_name, accuracy, "views", "moves"), whole=("id", place_name)
+    )
     for track in tracks[:_MAX_ROWS]:
         if on_ground:
             place = place_text(track["latitude"], track["longitude"], Coordinates(form))

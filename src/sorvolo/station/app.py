@@ -21,7 +21,6 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from sorvolo import __version__
 from sorvolo.errors import SettingsError
-from sorvolo.station.camera_door import CameraDoor, door_path
 from sorvolo.station.collections import Findings, SiteCollections
 from sorvolo.station.crops import FlightVideos, crop_routes, video_routes
 from sorvolo.station.events import EventLog, event_routes
@@ -53,7 +52,7 @@ from sorvolo.station.settings import (
 from sorvolo.station.site_deletion import SiteDeletion, site_deletion_routes
 from sorvolo.station.sites import SiteShelf, readable, site_detail
 from sorvolo.station.state import RootLock, StationState
-from sorvolo.station.stream_routes import announcing, stream_routes
+from sorvolo.station.stream_routes import CameraDoor, announcing, stream_routes
 from sorvolo.station.tiles import WebTiles, wmts_routes
 from sorvolo.station.tokens import Role, has_tokens
 from sorvolo.station.uploads import Uploads, upload_routes
@@ -151,7 +150,7 @@ def station_app(
     """
     station = Station.open(settings)
     outward = Outward(receivers, station.events, station.ingest, settings.state_folder)
-    door = CameraDoor(door_path(settings), station.ingest)
+    door = CameraDoor(settings.camera_door, station.ingest)
     deletion = SiteDeletion(
         station.shelf,
         station.runs,

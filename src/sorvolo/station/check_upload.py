@@ -240,11 +240,16 @@ def _check_picture(path: Path) -> None:
         )
 
 
+def limit_process(cpu_s: int) -> None:
+    """Bound this process's memory and processor time for good; it leaves no core file."""
+    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES, _MEMORY_BYTES))
+    resource.setrlimit(resource.RLIMIT_CPU, (cpu_s, cpu_s))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
 def main(part: str, target: str, most_bytes: str, keep_free_bytes: str) -> None:
     """Print one JSON object: what is wrong, or what the upload holds."""
-    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES, _MEMORY_BYTES))
-    resource.setrlimit(resource.RLIMIT_CPU, (_CPU_S, _CPU_S))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    limit_process(_CPU_S)
     try:
         facts = look(Path(part), Path(target), int(most_bytes), int(keep_free_bytes))
         answer: dict[str, Any] = {"error": None, "facts": facts}

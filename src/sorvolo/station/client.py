@@ -18,8 +18,16 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidSta
 from sorvolo import __version__
 from sorvolo.capture.live.reconnect import Backoff
 from sorvolo.errors import InputError, SettingsError
+from sorvolo.missions.watch.cot_sender import trusting
 from sorvolo.station.footage import Footage, Format, Remains
-from sorvolo.station.messages import Hello, Kind, Message, check_stream, hello_from_json
+from sorvolo.station.messages import (
+    REFUSED_CODE,
+    Hello,
+    Kind,
+    Message,
+    check_stream,
+    hello_from_json,
+)
 from sorvolo.station.spool import Spool
 
 _TURN_S = 0.02  # how long the sender rests where there is nothing to send
@@ -32,10 +40,6 @@ _MOST_WAY_S = (
 _CATCH_UP = 0.5  # seconds of an outage that are made up for in a second
 _DELAYS_KEPT = 100_000  # acknowledgements: an hour of video at 25 pictures a second
 _SAME_FLIGHT_NS = 600_000_000_000  # a client that was away for longer comes with another flight
-_REFUSED_CODE = 4400
-"""The WebSocket close code of a station that will not have the stream, whatever is tried again."""
-
-
 _PING_S = 5.0  # a link that answers no ping for so long is opened anew
 
 
@@ -262,7 +266,7 @@ class StreamClient:
         if isinstance(error, InvalidURI):
             raise InputError(f"{self._url}: no address of a station ({error})") from error
         close = error.rcvd if isinstance(error, ConnectionClosed) else None
-        if close is not None and close.code == _REFUSED_CODE:
+        if close is not None and close.code == REFUSED_CODE:
             raise InputError(f"the station refuses the stream: {close.reason}") from error
         if isinstance(error, ssl.SSLCertVerificationError):
             raise InputError(
@@ -366,13 +370,7 @@ class StreamClient:
     def _context(self) -> ssl.SSLContext | None:
         if not self._url.startswith("wss:"):
             return None
-        authority = self._settings.authority
-        try:
-            return ssl.create_default_context(cafile=None if authority is None else str(authority))
-        except (OSError, ssl.SSLError) as error:
-            raise SettingsError(
-                f"--ca {authority}: no usable certificate ({error}); give a PEM file"
-            ) from error
+        return trusting(self._settings.authority, "--ca")
 
     async def _show(self, show: Callable[[StreamReport], None]) -> None:
         while True:

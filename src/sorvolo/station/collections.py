@@ -21,7 +21,7 @@ from sorvolo.station.state import StationState
 from sorvolo.store.exports.change_files import changes_geojson
 from sorvolo.store.exports.detection_files import CROPS, TRACKS
 from sorvolo.store.exports.ground_files import COVERAGE
-from sorvolo.store.exports.places import longitude_latitude
+from sorvolo.store.exports.places import place_deg
 from sorvolo.store.exports.plain import feature, features_name
 from sorvolo.store.nofollow import read_below
 from sorvolo.store.site.archive import Archive
@@ -376,10 +376,7 @@ def _lonlat(geometry: Any, site: Site) -> Any:
 
     def turned(coordinates: Any) -> Any:
         if coordinates and isinstance(coordinates[0], int | float):
-            longitudes, latitudes = longitude_latitude(
-                np.array([coordinates[:2]], np.float64), site
-            )
-            return [float(longitudes[0]), float(latitudes[0])]
+            return [*place_deg(np.array(coordinates[:2], np.float64), site)]
         return [turned(each) for each in coordinates]
 
     return {**geometry, "coordinates": turned(geometry["coordinates"])}
@@ -389,11 +386,8 @@ def _camera_on_earth(values: Mapping[str, Any], site: Site) -> dict[str, Any]:
     east, north = values.get("camera_east"), values.get("camera_north")
     if east is None or north is None:
         return {}
-    longitudes, latitudes = longitude_latitude(np.array([[east, north]], np.float64), site)
-    return {
-        "camera_longitude_deg": float(longitudes[0]),
-        "camera_latitude_deg": float(latitudes[0]),
-    }
+    longitude, latitude = place_deg(np.array([east, north], np.float64), site)
+    return {"camera_longitude_deg": longitude, "camera_latitude_deg": latitude}
 
 
 def _content(archive: Archive) -> object:

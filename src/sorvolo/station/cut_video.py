@@ -1,7 +1,6 @@
 """A process that cuts a piece out of one frame of a video, within limits of memory and time."""
 
 import json
-import resource
 import sys
 
 import av
@@ -10,9 +9,9 @@ import numpy as np
 
 from sorvolo.capture.video_stream import ONE_FILE
 from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.station.check_upload import limit_process
 from sorvolo.store.images import jpeg_from_image
 
-_MEMORY_BYTES = 3 << 30  # as for an upload's check
 _CPU_S = 25  # within the 30 s that the station waits
 _MOST_FRAMES = 2000  # decoded after the nearest key frame: some pictures apart in what drones write
 
@@ -37,9 +36,7 @@ def frame_of(path: str, number: int) -> ImageRGB:
 
 def main() -> None:
     """Read an order from stdin, write a JPEG to stdout."""
-    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES, _MEMORY_BYTES))
-    resource.setrlimit(resource.RLIMIT_CPU, (_CPU_S, _CPU_S))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    limit_process(_CPU_S)
     order = json.load(sys.stdin)
     image, side = frame_of(order["path"], int(order["frame"])), int(order["side_px"])
     height, width = image.shape[:2]

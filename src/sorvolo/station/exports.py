@@ -29,10 +29,11 @@ from titiler.core.utils import render_image
 from sorvolo.missions.heights.measure import measure_profile
 from sorvolo.station.collections import SEARCH_FOLDER, TITLES, SiteCollections
 from sorvolo.station.problems import Problem, problem_answer
-from sorvolo.station.security import needs
+from sorvolo.station.security import address, needs
 from sorvolo.station.sites import SiteShelf
 from sorvolo.station.tokens import Role
 from sorvolo.store.exports.geopackage import LAYER_STYLES, qml_of, write_geopackage
+from sorvolo.store.exports.places import network_link
 from sorvolo.store.nofollow import open_below
 from sorvolo.store.site.archive import Archive
 
@@ -216,7 +217,12 @@ _OF_FLIGHT: Mapping[str, str] = {
     "heights.tif": "surface heights, GeoTIFF",
     "terrain.tif": "bare ground, GeoTIFF",
 }
-_GEOPACKAGE = "site.gpkg"
+_GEOPACKAGE, _LINK = "site.gpkg", "site.kml"
+_KML = "application/vnd.google-earth.kml+xml"  # Google Earth takes a link's answer as no other
+_MADE = {
+    _GEOPACKAGE: "Objects, changes, frames and coverage, GeoPackage",
+    _LINK: "Objects, loaded again every 30 s, KML network link",
+}
 _MOST_PROFILE_PLACES, _MOST_PROFILE_POINTS = 50, 2000
 
 
@@ -245,18 +251,23 @@ def export_routes(shelf: SiteShelf, collections: SiteCollections) -> APIRouter:
             if (size := _size(archive, each)) is not None
         ]
         if archive.has_site:
-            package = ExportFile(
-                _GEOPACKAGE, "", "Objects, changes, frames and coverage, GeoPackage"
-            )
-            rows.insert(min(2, len(rows)), _row(site, package, None))
+            rows[2:2] = [
+                _row(site, ExportFile(name, "", title), None)
+                for name, title in _MADE.items()
+                if name != _LINK or not archive.site().is_local
+            ]
         return rows
 
     @router.get("/exports/{export_id}", response_class=FileResponse)
-    def one(site: str, export_id: str) -> Response:
+    def one(request: Request, site: str, export_id: str) -> Response:
         """One of them, to be kept; ranges are answered, so that GDAL reads of a GeoTIFF what it needs."""
         archive = shelf.open(site)
         if export_id == _GEOPACKAGE:
             return _geopackage(site, archive, collections)
+        if export_id == _LINK:
+            objects = address(request, f"/api/sites/{site}/exports/objects.kml")
+            link, named = network_link(site, objects), _as_file(f"{_plain_name(site)}.kml")
+            return Response(link, media_type=_KML, headers=named)
         found = next((each for each in export_files(archive) if each.id == export_id), None)
         if found is None or _size(archive, found) is None:
             raise Problem(
@@ -266,7 +277,7 @@ def export_routes(shelf: SiteShelf, collections: SiteCollections) -> APIRouter:
         archive.require_sound(found.path)
         return FileResponse(
             archive.folder / found.path,
-            media_type="application/octet-stream",
+            media_type=_KML if found.id.endswith(".kml") else "application/octet-stream",
             headers=_as_file(f"{_plain_name(site)}-{found.id}"),
         )
 
@@ -331,10 +342,9 @@ def _geopackage(site: str, archive: Archive, collections: SiteCollections) -> Re
     layers = {name: collections.get(site, name).features for name in TITLES}
     styles = {name: qml_of(style) for name, style in LAYER_STYLES.items()}
     with tempfile.TemporaryDirectory(prefix="sorvolo-") as folder:
-        write_geopackage(Path(folder) / _GEOPACKAGE, layers, styles)
-        made = (
-            Path(folder) / _GEOPACKAGE
-        ).read_bytes()  # another time other bytes: whole, no ranges
+        path = Path(folder) / _GEOPACKAGE
+        write_geopackage(path, layers, styles)
+        made = path.read_bytes()  # another time other bytes: whole, no ranges
     headers = _as_file(f"{_plain_name(site)}.gpkg")
     return Response(made, media_type="application/octet-stream", headers=headers)
 

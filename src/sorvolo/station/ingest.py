@@ -14,6 +14,8 @@ from sorvolo.capture.live.growing import ENDED_SUFFIX
 from sorvolo.errors import InputError, StoreError
 from sorvolo.missions.worker import BOXES, MOTION
 from sorvolo.station.messages import (
+    BUSY_CODE,
+    REFUSED_CODE,
     Hello,
     Kind,
     Message,
@@ -31,9 +33,6 @@ from sorvolo.station.state import shortage
 from sorvolo.station.transport_stream import FlightFile
 from sorvolo.station.video import VideoHub
 from sorvolo.store.atomic import atomic_write_bytes
-
-REFUSED_CODE, BUSY_CODE = 4400, 4503
-"""WebSocket close codes: trying again is no use; try again later."""
 
 _SHOWN_AS = {
     BOXES: "boxes",

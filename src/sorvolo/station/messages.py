@@ -17,6 +17,9 @@ from sorvolo.survey.flight import TELEMETRY_COLUMNS
 PROTOCOL = 1
 """The version of the messages; both sides state theirs."""
 
+REFUSED_CODE, BUSY_CODE = 4400, 4503
+"""WebSocket close codes: trying again is no use; try again later."""
+
 CODECS = ("h264", "hevc")
 """The pictures that a stream may carry: what a transport stream holds and a browser plays."""
 

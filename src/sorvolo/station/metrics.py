@@ -7,7 +7,6 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,7 @@ from sorvolo.station.ingest import Ingest
 from sorvolo.station.relays import RelayFigures
 from sorvolo.station.security import needs
 from sorvolo.station.settings import StationSettings
+from sorvolo.station.state import utc_now
 from sorvolo.station.tokens import Holder, Role
 
 # upper limits of the counted times, about threefold each, around the targets of tiles and pages
@@ -168,13 +168,8 @@ class JsonLines(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """The line."""
-        at = (
-            datetime.fromtimestamp(record.created, UTC)
-            .isoformat(timespec="milliseconds")
-            .replace("+00:00", "Z")
-        )
         line: dict[str, Any] = {
-            "time": at,
+            "time": utc_now(),
             "level": record.levelname.lower(),
             "logger": record.name,
             "message": record.getMessage(),

@@ -7,13 +7,14 @@ from urllib.parse import quote, urlencode
 
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import JSONResponse
+from shapely.geometry import box, mapping
 
 from sorvolo.station.collections import TITLES, Collection, SiteCollections
 from sorvolo.station.exports import cogs_of, tilejson_address
 from sorvolo.station.found import Feature
 from sorvolo.station.problems import Problem
 from sorvolo.station.reviews import Reviews
-from sorvolo.station.security import needs
+from sorvolo.station.security import address, needs
 from sorvolo.station.sites import SiteShelf, bounds_lonlat
 from sorvolo.station.tokens import Role
 from sorvolo.store.site.archive import Archive
@@ -38,7 +39,7 @@ class GeoJsonResponse(JSONResponse):
 
 def landing_links(request: Request, site: str) -> list[dict[str, str]]:
     """The links of a site's landing page; whole addresses, as in all answers here: QGIS reads no others."""
-    base, api = _base(request, site), f"{request.base_url}openapi.json"
+    base, api = _base(request, site), address(request, "/openapi.json")
     return [
         _link(base, "self", "application/json", "This site"),
         _link(api, "service-desc", "application/vnd.oai.openapi+json;version=3.0", "The API"),
@@ -115,7 +116,7 @@ def feature_routes(collections: SiteCollections, reviews: Reviews) -> APIRouter:
 
 def _base(request: Request, site: str) -> str:
     """The whole address of a site, under the name and scheme by which the client asked."""
-    return f"{request.base_url}api/sites/{quote(site, safe=':')}"
+    return address(request, f"/api/sites/{site}")
 
 
 def _about(name: str, collection: Collection, base: str) -> dict[str, Any]:
@@ -149,7 +150,7 @@ def _link(href: str, rel: str, kind: str, title: str) -> dict[str, str]:
 
 def _page(request: Request, features: Sequence[Feature], limit: int, offset: int) -> dict[str, Any]:
     shown = features[offset : offset + limit]
-    path = f"{str(request.base_url).rstrip('/')}{quote(request.url.path, safe='/:')}"
+    path = address(request, request.url.path)
     links = [
         _link(
             f"{path}?{request.url.query}" if request.url.query else path,
@@ -376,7 +377,7 @@ def stac_routes(shelf: SiteShelf) -> APIRouter:
                 "stac_extensions": [_PROJECTION],
                 "id": f"{site}-{version}",
                 "collection": site,
-                "geometry": _ring(bbox),
+                "geometry": bbox and mapping(box(*bbox)),
                 "bbox": bbox,
                 "properties": {
                     "datetime": _time(found),
@@ -407,7 +408,7 @@ def _assets(
     tiles = f"/api/sites/{site}/tiles/{version.id}/{{z}}/{{x}}/{{y}}.webp"
     assets: dict[str, Any] = {
         "tiles": {
-            "href": _absolute(request, tiles),
+            "href": address(request, tiles),
             "type": "image/webp",
             "title": "XYZ tiles",
             "roles": ["visual"],
@@ -417,7 +418,7 @@ def _assets(
         belongs = is_newest if cog.id == "mosaic" else cog.id.partition(":")[2] == version.flight_id
         if belongs:
             assets[f"{cog.id}-tiles"] = {
-                "href": _absolute(request, tilejson_address(site, cog)),
+                "href": address(request, tilejson_address(site, cog)),
                 "type": "application/json",
                 "title": f"{cog.title}, TileJSON",
                 "roles": ["tiles"],
@@ -425,7 +426,7 @@ def _assets(
             name = cog.file.rpartition("/")[2]
             file = name if cog.id == "mosaic" else f"{version.flight_id}-{name}"
             assets[cog.id] = {
-                "href": _absolute(request, f"/api/sites/{site}/exports/{file}"),
+                "href": address(request, f"/api/sites/{site}/exports/{file}"),
                 "type": "image/tiff; application=geotiff; profile=cloud-optimized",
                 "title": cog.title,
                 "roles": ["data"],
@@ -440,24 +441,6 @@ def _bbox(archive: Archive, version: int | None) -> list[float] | None:
     return bounds_lonlat(list(archive.tiles(version)), archive.site_grid())
 
 
-def _ring(bbox: Sequence[float] | None) -> Mapping[str, Any] | None:
-    if bbox is None:
-        return None
-    west, south, east, north = bbox
-    return {
-        "type": "Polygon",
-        "coordinates": [
-            [
-                [west, south],
-                [east, south],
-                [east, north],
-                [west, north],
-                [west, south],
-            ]
-        ],
-    }
-
-
 def _time(version: VersionEntry) -> str:
     return version.flown_utc or version.created_utc
 
@@ -465,10 +448,4 @@ def _time(version: VersionEntry) -> str:
 def _link_stac(
     request: Request, rel: str, href: str, kind: str = "application/json"
 ) -> dict[str, str]:
-    return {"rel": rel, "href": _absolute(request, href), "type": kind}
-
-
-def _absolute(request: Request, path: str) -> str:
-    """A whole address: a catalogue is walked, and its assets are opened, by programs that know no other."""
-    base = request.app.state.station.settings.public_origin or str(request.base_url)
-    return f"{base.rstrip('/')}{quote(path, safe='/:{}')}"
+    return {"rel": rel, "href": address(request, href), "type": kind}

@@ -79,9 +79,7 @@ class MissionOptions(Wish, extra="forbid"):
     ] = []
     overlap: Annotated[float, Field(gt=0, lt=1)] = 0.7
     m_per_px: Annotated[float | None, Field(ge=1e-3, le=100)] = None
-    views_per_second: Annotated[float, Field(ge=0.05, le=60)] = 5.0
-    votes: Annotated[int, Field(ge=1, le=8)] = 3
-    voters: Annotated[int, Field(ge=1, le=8)] = 5
+    votes: Annotated[int, Field(ge=1, le=6)] = 3
     updates_map: bool = True
     least_score: Annotated[float | None, Field(ge=0, le=1)] = None
     frames_per_second: Annotated[float | None, Field(ge=0.01, le=240)] = None

@@ -217,32 +217,24 @@ class CotRelay(ThreadOwner):
         self._placed_s[run] = time.monotonic()
         view = view_of_frame(data)
         if view is not None:
-            self._sender.send(
-                cot_drone(
-                    view,
-                    uid=f"sorvolo.drone.{run}",
-                    callsign=f"drone {event.get('site') or run}",
-                    now_ns=time.time_ns(),
-                    stale_s=_DRONE_STALE_S,
-                )
-            )
+            self._sender.send(_drone(view, run, f"drone {event.get('site') or run}"))
 
     def _run(self) -> None:
         while not self._ending.wait(_DRONE_EVERY_S):
             for stream, view in self._drones().items():
-                event = cot_drone(
-                    view,
-                    uid=f"sorvolo.drone.{stream}",
-                    callsign=stream,
-                    now_ns=time.time_ns(),
-                    stale_s=_DRONE_STALE_S,
-                )
                 try:
-                    self._drone_sender.send(event)
+                    self._drone_sender.send(_drone(view, stream, stream))
                 except (
                     OSError
                 ):  # the next position is sent in a second; `send` reports a receiver that is away
                     break
+
+
+def _drone(view: DroneView, name: str, callsign: str) -> bytes:
+    uid = f"sorvolo.drone.{name}"
+    return cot_drone(
+        view, uid=uid, callsign=callsign, now_ns=time.time_ns(), stale_s=_DRONE_STALE_S
+    )
 
 
 def view_of_sample(columns: Mapping[str, float], stated: Mapping[str, float]) -> DroneView | None:

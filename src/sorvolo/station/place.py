@@ -236,7 +236,8 @@ def _near(
     result: dict[str, list[dict[str, Any]]] = {}
     for name, kind in (("changes", "change"), ("objects", "object")):
         collection, verdicts = collections.get(site_id, name), reviews.current(site_id, kind)
-        for each in _touching(collection, ring):
+        for number in sorted(collection.tree.query(ring, predicate="intersects")):
+            each = collection.features[int(number)]
             values = each["properties"]
             result.setdefault(values["flight"], []).append(
                 {
@@ -251,13 +252,6 @@ def _near(
                 }
             )
     return result
-
-
-def _touching(collection: Collection, ring: Any) -> list[Feature]:
-    return [
-        collection.features[int(each)]
-        for each in sorted(collection.tree.query(ring, predicate="intersects"))
-    ]
 
 
 def _review(review: Review | None) -> dict[str, Any] | None:

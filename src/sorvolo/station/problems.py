@@ -16,6 +16,7 @@ from sorvolo.errors import (
     SorvoloError,
     StoreError,
 )
+from sorvolo.station.state import shortage
 
 _TITLES = {
     400: "This does not work as it was asked",
@@ -95,6 +96,14 @@ def status_of(error: SorvoloError) -> int:
     if isinstance(error, NotFoundError | NoHeightsError):
         return 404
     return 409 if isinstance(error, StoreError) else 400
+
+
+def demand_room(root: Path, floor_gb: float, coming_gb: float = 0.0) -> None:
+    """Raise Problem (507) where what is coming would not leave the floor of free space."""
+    if short := shortage(root, floor_gb, coming_gb):
+        raise Problem(
+            507, f"{short}; delete uploads, recordings or flights that you no longer need"
+        )
 
 
 def below(root: Path, words: str) -> str:

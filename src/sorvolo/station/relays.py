@@ -5,7 +5,6 @@ import hmac
 import http.client
 import json
 import logging
-import ssl
 import threading
 import time
 import urllib.error
@@ -22,6 +21,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 
 from sorvolo.capture.live.reconnect import Backoff
 from sorvolo.errors import SettingsError, StoreError
+from sorvolo.missions.watch.cot_sender import trusting
 from sorvolo.station.events import EventLog
 from sorvolo.station.state import ThreadOwner
 from sorvolo.store.atomic import atomic_write_bytes
@@ -311,14 +311,7 @@ class MqttSender:
         if place.user:
             self._client.username_pw_set(place.user, place.password)
         if place.is_secure:
-            try:
-                context = ssl.create_default_context(
-                    cafile=None if authority is None else str(authority)
-                )
-            except (OSError, ssl.SSLError) as error:
-                words = f"--mqtt-ca {authority}: no usable certificate ({error}); give a PEM file"
-                raise SettingsError(words) from error
-            self._client.tls_set_context(context)
+            self._client.tls_set_context(trusting(authority, "--mqtt-ca"))
         self._is_begun = False
 
     def send(self, event: Mapping[str, Any]) -> None:

@@ -160,7 +160,8 @@ class Reviews:
             waiting = [
                 each
                 for each in self.current(site_id, "change").values()
-                if each.id in inside and inside[each.id] != (_as_stored(each), _stored_note(each))
+                if each.id in inside
+                and inside[each.id] != (_as_stored(each), each.note if _as_stored(each) else "")
             ]
             try:
                 for each in waiting:
@@ -279,10 +280,6 @@ def _keep(connection: sqlite3.Connection, key: tuple[str, str], vote: Review) ->
 def _as_stored(review: Review) -> Verdict | None:
     """The verdict that missions take: none while people disagree, or are unsure."""
     return Verdict(review.verdict) if review.verdict in set(Verdict) else None
-
-
-def _stored_note(review: Review) -> str:
-    return "" if _as_stored(review) is None else review.note
 
 
 _MOST_DRAWINGS, _MOST_CORNERS = 500, 500

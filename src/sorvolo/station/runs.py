@@ -24,7 +24,6 @@ from fastapi import APIRouter, Query
 
 from sorvolo.child_process import python_command
 from sorvolo.missions.worker import BOXES, MOTION, TO_CHECK
-from sorvolo.station.camera_door import door_path
 from sorvolo.station.collections import SEARCH_FOLDER
 from sorvolo.station.events import EventLog, NewEvent
 from sorvolo.station.ingest import Ingest
@@ -40,7 +39,7 @@ from sorvolo.station.orders import (
     RunWish,
     writes,
 )
-from sorvolo.station.problems import Problem, below
+from sorvolo.station.problems import Problem, below, demand_room
 from sorvolo.station.security import needs
 from sorvolo.station.settings import RESERVE_FILE, RUNS_FOLDER, STREAMS_FOLDER, StationSettings
 from sorvolo.station.sites import SiteShelf
@@ -162,7 +161,7 @@ class Runs(ThreadOwner):
 
         Raises Problem: 400, 404 for inputs, 409 where the site is being written or too many run, 507 without room.
         """
-        self._demand_room()
+        demand_room(self._settings.root, self._settings.free_floor_gb)
         with self._lock:
             self._demand_turn(wish)
             makes_site = wish.mission in ("map", "watch") or (
@@ -285,12 +284,14 @@ class Runs(ThreadOwner):
             shutil.disk_usage(self._settings.root).free / 1e9,
             self._settings.free_floor_gb,
         )
-        is_low = free_gb < floor_gb
-        if not is_low:
+        short = shortage(self._settings.root, floor_gb)
+        if not (is_low := bool(short)):
             self._reserve.hold()
-        self._note_shortage(shortage(self._settings.root, floor_gb) if is_low else "")
+        self._note_shortage(short)
         if is_low != self._is_low:
-            self._is_low = is_low
+            data = {"is_low": is_low, "free_gb": round(free_gb, 2), "floor_gb": floor_gb}
+            self._events.append(NewEvent("station.disk", data))
+            self._is_low = is_low  # what a full disk did not take is announced at the next look
             _LOG.log(
                 logging.WARNING if is_low else logging.INFO,
                 "disk %s: %.2f GB are free, %.2f GB must stay so",
@@ -298,8 +299,6 @@ class Runs(ThreadOwner):
                 free_gb,
                 floor_gb,
             )
-            data = {"is_low": is_low, "free_gb": round(free_gb, 2), "floor_gb": floor_gb}
-            self._events.append(NewEvent("station.disk", data))
 
     # ---- inside -----------------------------------------------------------------------------------------------
 
@@ -459,12 +458,6 @@ class Runs(ThreadOwner):
             if each.site == wish.site and writes(*own):
                 raise _busy(409, each, f"writes into the site {wish.site!r}")
 
-    def _demand_room(self) -> None:
-        if short := shortage(self._settings.root, self._settings.free_floor_gb):
-            raise Problem(
-                507, f"{short}; delete uploads, recordings or flights that you no longer need"
-            )
-
     def _order(self, wish: RunWish, run_id: str, site: Path, folder: Path) -> RunOrder:
         options = wish.options
         given = {
@@ -476,7 +469,7 @@ class Runs(ThreadOwner):
             )
         }
         results = site / SEARCH_FOLDER if wish.mission == "search" else folder / "results"
-        stream, door = (wish.input.stream if wish.input else None) or "", door_path(self._settings)
+        stream, door = (wish.input.stream if wish.input else None) or "", self._settings.camera_door
         is_camera = (
             wish.input is not None and wish.input.stream_url is not None and door.is_socket()
         )
@@ -490,7 +483,7 @@ class Runs(ThreadOwner):
             folder=str(results.resolve()),
             stream=_stream_of_camera(given["source"], run_id) if is_camera else stream,
             away_s=self._settings.limits.away_s,
-            options=options.model_dump(mode="json") | {"live_s": _LIVE_S},
+            options=options.model_dump() | {"live_s": _LIVE_S, "voters": options.votes + 2},
             door=str(door.resolve()) if is_camera else "",
             streams=str((self._settings.root / STREAMS_FOLDER).resolve()),
             floor_gb=self._settings.free_floor_gb,

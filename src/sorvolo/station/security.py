@@ -9,6 +9,7 @@ from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from http.cookies import CookieError, SimpleCookie
 from typing import Any
+from urllib.parse import quote
 
 from fastapi import Depends
 from starlette.exceptions import HTTPException
@@ -165,6 +166,12 @@ def sent_token(connection: HTTPConnection) -> str:
     except CookieError:
         return ""
     return morsel.value if morsel is not None else ""
+
+
+def address(request: HTTPConnection, path: str) -> str:
+    """The whole address of a path, under the name by which clients ask: QGIS and catalogues know no other."""
+    base = request.app.state.station.settings.public_origin or str(request.base_url)
+    return f"{base.rstrip('/')}{quote(path, safe='/:{}')}"
 
 
 def holder_in(connection: HTTPConnection) -> Holder:

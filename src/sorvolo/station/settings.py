@@ -98,6 +98,11 @@ class StationSettings:
         return self.root / STATE_FOLDER
 
     @property
+    def camera_door(self) -> Path:
+        """The socket of its own cameras, in a folder of its own, which only the station's user may enter."""
+        return self.state_folder / "cameras" / "station.sock"
+
+    @property
     def is_loopback(self) -> bool:
         """Whether only programs of this machine can reach it."""
         return is_loopback(self.host)

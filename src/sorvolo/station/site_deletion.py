@@ -120,27 +120,22 @@ class SiteDeletion:
 
     def _demand_own(self, site_id: str, folder: Path) -> None:
         """Raise Problem (409) for a site of which the folder is not the whole, or more."""
-        if folder == self._shelf.root:
-            raise Problem(
-                409,
-                f"the site {site_id!r} is the folder that the station serves; end it, and delete that",
-            )
         file = catalogue_file(folder)
-        if file is None or file.name != CATALOGUE:
-            raise Problem(
-                409,
-                f"the catalogue of {site_id!r} lies in PostgreSQL; drop its schema, delete its folder",
-            )
-        if (folder / ORIGIN).exists():
-            raise Problem(
-                409,
-                f"{site_id!r} is a working copy of a site in a store, and would come back; delete that",
-            )
-        if (folder / COPYING).exists():
-            raise Problem(
-                409,
-                f"a copy is being made in {site_id!r}; finish it with the same `sorvolo site copy`",
-            )
+        reasons = {
+            "is the folder that the station serves; end it, and delete that": folder
+            == self._shelf.root,
+            "has its catalogue in PostgreSQL; drop its schema, delete its folder": file is None
+            or file.name != CATALOGUE,
+            "is a working copy of a site in a store, and would come back; delete that": (
+                folder / ORIGIN
+            ).exists(),
+            "is being copied; finish that with the same `sorvolo site copy`": (
+                folder / COPYING
+            ).exists(),
+        }
+        for why, is_so in reasons.items():
+            if is_so:
+                raise Problem(409, f"the site {site_id!r} {why}")
 
     def _known(self, site_id: str, folder: Path) -> "_Known":
         """What the site's catalogue holds. Raises Problem (410) where the folder goes meanwhile."""

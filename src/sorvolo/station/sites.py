@@ -144,32 +144,20 @@ def bounds_lonlat(tiles: Sequence[TileIndex], grid: SiteGrid) -> list[float] | N
 
 def site_summary(site_id: str, archive: Archive) -> dict[str, Any]:
     """A site as the list of sites has it."""
-    if not archive.has_site:
-        return {
-            "id": site_id,
-            "name": archive.folder.name,
-            "is_local": False,
-            "center_wgs84": None,
-            "bounds_wgs84": None,
-            "flights": 0,
-            "versions": 0,
-            "updated_at": None,
-            "m_per_px": None,
-        }
-    site = archive.site()
-    complete = archive.versions()
-    bounds = bounds_lonlat(list(archive.live_tiles()), archive.site_grid())
-    center = None if bounds is None else [(bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2]
+    site, complete, bounds = None, archive.versions(), None
+    if archive.has_site:
+        site = archive.site()
+        bounds = bounds_lonlat(list(archive.live_tiles()), archive.site_grid())
     return {
         "id": site_id,
-        "name": site.name,
-        "is_local": site.is_local,
-        "center_wgs84": center,
+        "name": site.name if site else archive.folder.name,
+        "is_local": bool(site and site.is_local),
+        "center_wgs84": bounds and [(bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2],
         "bounds_wgs84": bounds,
         "flights": len({each.flight_id for each in complete}),
         "versions": len(complete),
         "updated_at": complete[-1].created_utc if complete else None,
-        "m_per_px": site.m_per_px,
+        "m_per_px": site and site.m_per_px,
     }
 
 

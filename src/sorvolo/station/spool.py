@@ -12,6 +12,7 @@ from typing import BinaryIO, Literal
 
 from sorvolo.errors import InputError
 from sorvolo.station.messages import Kind, Message, message_from_bytes
+from sorvolo.store.atomic import take_lock
 
 _RECORD = struct.Struct(">IIq")  # length, checksum, when it was taken (UTC, ns)
 _SEGMENT_BYTES = (
@@ -298,17 +299,11 @@ class Spool:
 def _locked(path: Path) -> BinaryIO:
     """The file, locked until it is closed. Raises InputError where another program holds it."""
     file = path.open("ab")
-    try:
-        import fcntl
-    except ImportError:  # no Unix: two clients with one spool are the user's to avoid
-        return file
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
+    if not take_lock(file.fileno()):
         file.close()
         raise InputError(
             f"{path.parent}: another sorvolo stream uses this spool; give this one its own --stream or --spool"
-        ) from error
+        )
     return file
 
 

@@ -130,14 +130,13 @@ def compact_json(value: Any) -> str:
 _RESERVE_BYTES = 8_000_000  # some hundred runs' last states, with SQLite's journal
 
 
-def shortage(folder: Path, floor_gb: float) -> str:
+def shortage(folder: Path, floor_gb: float, coming_gb: float = 0.0) -> str:
     """How little of the folder's disk is free where that is less than the floor; "" where there is room."""
     free_gb = shutil.disk_usage(folder).free / 1e9
-    return (
-        ""
-        if free_gb >= floor_gb
-        else f"{free_gb:.2f} GB are free, and {floor_gb:.2f} GB must stay so"
-    )
+    if free_gb - coming_gb >= floor_gb:
+        return ""
+    coming = f", {coming_gb:.2f} GB of uploads are to come" if coming_gb else ""
+    return f"{free_gb:.2f} GB are free{coming}, and {floor_gb:.2f} GB must stay so"
 
 
 class Reserve:

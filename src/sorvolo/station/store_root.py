@@ -10,6 +10,7 @@ from collections.abc import Generator
 from pathlib import Path
 
 from sorvolo.errors import SorvoloError
+from sorvolo.missions.mission import Mission
 from sorvolo.store.copies.bucket import OvertakenError, sites_at
 from sorvolo.store.copies.object_store import open_objects
 from sorvolo.store.copies.transfer import CopyUpdate
@@ -71,7 +72,7 @@ class StoreRoot:
         while not is_last:
             is_last = until.wait(_EVERY_S)
             try:
-                faults = _ended(self.step())
+                faults = Mission(self.step()).result()
             except SorvoloError as error:
                 faults = {self._objects.name: str(error)}
             for name, fault in faults.items():
@@ -104,11 +105,3 @@ def _mark(folder: Path) -> tuple[int, int]:
         return 0, 0
     log = file.with_name(f"{file.name}-wal")
     return file.stat().st_mtime_ns, log.stat().st_mtime_ns if log.exists() else 0
-
-
-def _ended(work: Generator[CopyUpdate, None, dict[str, str]]) -> dict[str, str]:
-    while True:
-        try:
-            next(work)
-        except StopIteration as end:
-            return end.value

@@ -1,17 +1,24 @@
-"""The routes of streams: a drone's own connection, what is known of each stream, and its pictures for browsers."""
+"""How streams come in and go out: a drone's connection, the socket of the station's own cameras, pictures for browsers."""
 
 import asyncio
+import logging
+import os
+import socket
 import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query, WebSocket
 from starlette.websockets import WebSocketDisconnect, WebSocketState
+from websockets.asyncio.server import Server, ServerConnection, unix_serve
+from websockets.exceptions import ConnectionClosed
 
 from sorvolo.errors import InputError
 from sorvolo.station.events import EventLog, NewEvent
-from sorvolo.station.ingest import REFUSED_CODE, Announce, Ingest, LinkClosed
+from sorvolo.station.ingest import Announce, Ingest, LinkClosed
+from sorvolo.station.messages import REFUSED_CODE
 from sorvolo.station.runs import Runs
 from sorvolo.station.security import needs
 from sorvolo.station.tokens import Role
@@ -55,7 +62,7 @@ def stream_routes(ingest: Ingest, runs: Runs) -> APIRouter:
     ) -> None:
         """A drone's connection: binary messages as station/messages.py has them, acknowledged by number."""
         await websocket.accept()
-        await ingest.serve(stream, _SocketLink(websocket))
+        await ingest.serve(stream, _WebSocketLink(websocket))
 
     @router.websocket("/api/streams/{stream}/video")
     async def show(
@@ -115,7 +122,7 @@ async def _send(websocket: WebSocket, viewer: Viewer) -> None:
         pass
 
 
-class _SocketLink:
+class _WebSocketLink:
     """A drone's WebSocket as `ingest.Link`."""
 
     def __init__(self, websocket: WebSocket) -> None:
@@ -145,3 +152,98 @@ class _SocketLink:
                 await self._websocket.close(code, reason)
             except (WebSocketDisconnect, RuntimeError) as error:
                 raise LinkClosed from error
+
+
+_MOST_MESSAGE_BYTES = 16_000_000  # a key frame of 4K has one or two million; by choice
+_MOST_PATH_BYTES = 100  # that the address of a socket surely holds
+_LOG = logging.getLogger("sorvolo.station.cameras")
+
+
+class CameraDoor:
+    """Takes the streams of the station's own cameras as `Ingest` takes those of drones; asks for no token."""
+
+    def __init__(self, path: Path, ingest: Ingest) -> None:
+        self._path, self._ingest = path, ingest
+        self._server: Server | None = None
+
+    async def open(self) -> None:
+        """Listen from now on. Where the disk holds no sockets missions read cameras by themselves, without video."""
+        try:
+            listening = _listening(self._path)
+        except OSError as error:
+            _LOG.warning(
+                "no socket can be made in %s (%s): cameras' video is not shown",
+                self._path.parent,
+                error,
+            )
+            return
+        self._server = await unix_serve(
+            self._take,
+            sock=listening,
+            compression=None,
+            max_size=_MOST_MESSAGE_BYTES,
+            close_timeout=2.0,
+        )
+
+    async def close(self) -> None:
+        """Listen no more; who sends waits for the next station."""
+        if self._server is not None:
+            self._server.close()
+            await self._server.wait_closed()
+            self._path.unlink(missing_ok=True)
+
+    async def _take(self, connection: ServerConnection) -> None:
+        stream = (
+            connection.request.path.rpartition("/")[2] if connection.request is not None else ""
+        )
+        await self._ingest.serve(stream, SocketLink(connection))
+
+
+class SocketLink:
+    """A `websockets` connection as `ingest.Link`."""
+
+    def __init__(self, connection: ServerConnection) -> None:
+        self._connection = connection
+
+    async def receive(self) -> bytes:
+        """See `Link`."""
+        try:
+            found = await self._connection.recv(decode=False)
+        except ConnectionClosed as error:
+            raise LinkClosed from error
+        return bytes(found)
+
+    async def send(self, text: str) -> None:
+        """See `Link`."""
+        try:
+            await self._connection.send(text)
+        except ConnectionClosed as error:
+            raise LinkClosed from error
+
+    async def close(self, code: int, reason: str) -> None:
+        """See `Link`."""
+        closing = asyncio.ensure_future(self._connection.close(code, reason))
+        try:
+            while True:  # the sender's answer stands behind what it sent before
+                await self._connection.recv(decode=False)
+        except ConnectionClosed:
+            await closing
+
+
+def _listening(path: Path) -> socket.socket:
+    """A socket that listens at a path of any length. Raises OSError."""
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    path.parent.chmod(0o700)
+    path.unlink(missing_ok=True)  # of a station that was killed
+    folder = os.open(path.parent, os.O_RDONLY)
+    listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        is_short = len(os.fsencode(path)) <= _MOST_PATH_BYTES
+        listening.bind(str(path) if is_short else f"/proc/self/fd/{folder}/{path.name}")
+        listening.listen(16)
+        return listening
+    except OSError:
+        listening.close()
+        raise
+    finally:
+        os.close(folder)

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from io import BytesIO
 from pathlib import Path
-from urllib.parse import quote
 from xml.sax.saxutils import escape, quoteattr
 
 import cv2
@@ -25,7 +24,7 @@ from sorvolo.errors import SorvoloError
 from sorvolo.geometry.arrays import Floats, Floats32, ImageRGBA
 from sorvolo.geometry.grid import Grid, SiteGrid, TileIndex
 from sorvolo.station.problems import Problem
-from sorvolo.station.security import needs
+from sorvolo.station.security import address, needs
 from sorvolo.station.sites import SiteShelf, bounds_lonlat
 from sorvolo.station.tokens import Role
 from sorvolo.store.images import BytesCache
@@ -481,8 +480,7 @@ def wmts_routes(shelf: SiteShelf) -> APIRouter:
     @router.get("/WMTSCapabilities.xml", response_class=XmlResponse)
     def capabilities(request: Request, site: str) -> XmlResponse:
         """Layers of a WMTS: every version of the map, and the growing one (`live`)."""
-        base = f"{str(request.base_url).rstrip('/')}/api/sites/{quote(site)}"
-        return XmlResponse(document(shelf.open(site), base))
+        return XmlResponse(document(shelf.open(site), address(request, f"/api/sites/{site}")))
 
     return router
 

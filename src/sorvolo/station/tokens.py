@@ -9,11 +9,11 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from enum import IntEnum
 
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.station.state import StationState, utc_now
+from sorvolo.station.state import StationState, utc_after, utc_now
 
 _PREFIX = "sorvolo"
 _NO_HASH = "0" * 64
@@ -67,11 +67,6 @@ def make_token(state: StationState, name: str, role: str, days: float | None = N
     if days is not None and not 0 < days < 36_500:
         raise SettingsError(f"--days {days}: a number above 0 was needed")
     token_id, secret = secrets.token_hex(6), secrets.token_urlsafe(32)
-    expires = (
-        None
-        if days is None
-        else (datetime.now(UTC) + timedelta(days=days)).isoformat(timespec="seconds")
-    )
     try:
         with state.changing() as connection:
             connection.execute(
@@ -82,7 +77,7 @@ def make_token(state: StationState, name: str, role: str, days: float | None = N
                     role.lower(),
                     _hash(secret),
                     utc_now(),
-                    expires and expires.replace("+00:00", "Z"),
+                    None if days is None else utc_after(86_400 * days),
                 ),
             )
     except sqlite3.IntegrityError as error:

@@ -22,7 +22,7 @@ from starlette.requests import ClientDisconnect
 
 from sorvolo.child_process import python_command
 from sorvolo.station.events import EventLog, NewEvent
-from sorvolo.station.problems import Problem
+from sorvolo.station.problems import Problem, demand_room
 from sorvolo.station.security import needs
 from sorvolo.station.settings import StationSettings
 from sorvolo.station.state import utc_now
@@ -134,7 +134,7 @@ class Uploads:
             )
         here = self.all()
         announced = sum(each.bytes - self.offset(each) for each in here if self._comes(each))
-        self.demand_room(length + announced)
+        self._demand_room(length + announced)
         most = self._settings.limits.most_uploads
         if len(here) >= most:
             raise Problem(
@@ -231,16 +231,8 @@ class Uploads:
         except Problem:
             return upload_id
 
-    def demand_room(self, more_bytes: int) -> None:
-        """Raise Problem (507) where this many bytes more would not leave the floor of free space."""
-        free = shutil.disk_usage(self._settings.root).free
-        if free - more_bytes < self._settings.free_floor_gb * 1e9:
-            coming = f", {more_bytes / 1e9:.1f} GB of uploads are to come" if more_bytes else ""
-            raise Problem(
-                507,
-                f"{free / 1e9:.1f} GB are free{coming}, and {self._settings.free_floor_gb:.1f} GB must stay so; delete "
-                "uploads, recordings or flights that you no longer need",
-            )
+    def _demand_room(self, more_bytes: int = 0) -> None:
+        demand_room(self._settings.root, self._settings.free_floor_gb, more_bytes / 1e9)
 
     def close(self) -> None:
         """Stop checking; what was not checked is when the station starts again."""
@@ -250,7 +242,7 @@ class Uploads:
     # ---- inside -----------------------------------------------------------------------------------------------
 
     async def _append(self, upload: Upload, offset: int, chunks: AsyncIterator[bytes]) -> int:
-        self.demand_room(0)  # of each request: many small ones would else fill the disk
+        self._demand_room()  # of each request: many small ones would else fill the disk
         here, looked = offset, offset
         with writing(self._folder / upload.id):
             async with await anyio.open_file(self._folder / upload.id / _PART, "r+b") as file:
@@ -261,7 +253,7 @@ class Uploads:
                             413, f"more came than the {upload.bytes} bytes that were announced"
                         )
                     if here - looked > _LOOK_EVERY_BYTES:
-                        self.demand_room(0)
+                        self._demand_room()
                         looked = here
                     await file.write(chunk)
                     here += len(chunk)

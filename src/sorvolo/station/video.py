@@ -49,11 +49,6 @@ class VideoHub:
         """How many watch."""
         return len(self._viewers)
 
-    @property
-    def dropped(self) -> int:
-        """How many pictures slow viewers did not get, of those that watch now."""
-        return sum(each.dropped for each in self._viewers)
-
     def begin(self, hello: Hello) -> None:
         """A drone came, or came back."""
         if self._hello is None or (self._hello.flight, self._hello.codec) != (

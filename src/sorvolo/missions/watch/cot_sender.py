@@ -36,6 +36,16 @@ class CotPlace:
         return f"{self.transport}://{self.host}:{self.port}"
 
 
+def trusting(authority: Path | None, option: str) -> ssl.SSLContext:
+    """TLS that trusts the authority in a PEM file, else the system's. Raises SettingsError, naming the option."""
+    try:
+        return ssl.create_default_context(cafile=authority)
+    except (OSError, ssl.SSLError, ValueError) as error:
+        raise SettingsError(
+            f"{option} {authority}: no usable certificate ({error}); give a PEM file"
+        ) from error
+
+
 @dataclass(frozen=True)
 class CotTls:
     """What a TLS connection needs besides the system's authorities: PEM files of the server's authority (`ca`), and of
@@ -45,18 +55,16 @@ class CotTls:
     certificate: Path | None = None
 
     def context(self) -> ssl.SSLContext:
-        """Ready to connect: the server's certificate and its name are checked. Raises InputError for unusable files."""
+        """Ready to connect: the server's certificate and its name are checked. Raises InputError or SettingsError for unusable files."""
+        made = trusting(self.ca, "--cot-ca")
+        if self.certificate is None:
+            return made
         try:
-            made = ssl.create_default_context(cafile=None if self.ca is None else str(self.ca))
-            if self.certificate is not None:
-                made.load_cert_chain(str(self.certificate), password=lambda: "")
+            made.load_cert_chain(str(self.certificate), password=lambda: "")
         except (OSError, ssl.SSLError, ValueError) as error:
-            named = " and ".join(
-                str(each) for each in (self.ca, self.certificate) if each is not None
-            )
             raise InputError(
-                f"{named}: no usable certificate ({error}); give PEM files, --cot-cert with the certificate and its "
-                "key, the key without a password (openssl pkcs12 -in FILE.p12 -out FILE.pem -nodes)"
+                f"--cot-cert {self.certificate}: no usable certificate ({error}); give a PEM file with it and its key, "
+                "the key without a password (openssl pkcs12 -in FILE.p12 -out FILE.pem -nodes)"
             ) from error
         return made
 

@@ -116,6 +116,14 @@ def kml_bytes(title: str, placemarks: Sequence[Placemark]) -> bytes:
         return str(document.kml()).encode()
 
 
+def network_link(title: str, address: str, every_s: int = 30) -> bytes:
+    """KML that has Google Earth load the KML at an address again and again."""
+    with kml_from_one(printable(title)) as document:
+        link = document.newnetworklink(name=printable(title)).link
+        link.href, link.refreshmode, link.refreshinterval = address, "onInterval", every_s
+        return str(document.kml()).encode()
+
+
 def gpx_bytes(title: str, placemarks: Sequence[Placemark]) -> bytes:
     """The places as GPX 1.1 waypoints."""
     document = gpxpy.gpx.GPX()
