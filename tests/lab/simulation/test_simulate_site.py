@@ -19,7 +19,7 @@ from sorvolo.capture.telemetry import read_telemetry
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.geodesy import Projection
 from sorvolo.geometry.level_ground import ground_from_pixels
-from sorvolo.lab.simulation.flight import simulate_flight, simulate_flights
+from sorvolo.lab.simulation.flight import SimulatedFlight, simulate_flights
 from sorvolo.lab.simulation.presets import preset, preset_names
 from sorvolo.lab.simulation.rendering import render_labels
 from sorvolo.lab.simulation.settings import (
@@ -62,6 +62,12 @@ def site(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("simulation") / "site"
     run(folder, SMALL)
     return folder
+
+
+@pytest.fixture(scope="module")
+def flights() -> list[SimulatedFlight]:
+    """The same flights, from memory."""
+    return list(simulate_flights(SMALL))
 
 
 WRITE_A_VIDEO = """
@@ -142,8 +148,8 @@ def test_the_video_holds_every_frame_at_its_time(site):
     assert np.allclose(times, np.array(expected) / 5, atol=1e-9)
 
 
-def test_every_format_gives_the_same_place(site):
-    flight = next(simulate_flights(SMALL))
+def test_every_format_gives_the_same_place(site, flights):
+    flight = flights[0]
     for name in (
         "flight1.csv",
         "other/flight1.srt",
@@ -182,9 +188,9 @@ def test_bad_checksums_are_written_and_found(site):
     )  # samples or sentences
 
 
-def test_the_ground_picture_agrees_with_the_frames(site):
+def test_the_ground_picture_agrees_with_the_frames(site, flights):
     """The GeoTIFF at a frame's ground point shows, in UTM, what the frame shows there."""
-    flight = simulate_flight(SMALL)
+    flight = flights[0]
     index = 5
     y, x = np.mgrid[0:240, 0:320]
     pixels = np.column_stack([x.ravel(), y.ravel()]).astype(np.float64)
@@ -217,8 +223,7 @@ def test_the_ground_picture_agrees_with_the_frames(site):
     assert agreement(cv2.remap(picture, columns + 3, rows, cv2.INTER_LINEAR)) < 0.85
 
 
-def test_boxes_hold_objects_and_masks_hold_changes(site):
-    flights = list(simulate_flights(SMALL))
+def test_boxes_hold_objects_and_masks_hold_changes(site, flights):
     boxes = json.loads((site / "truth/flight2/boxes.json").read_text())
     assert [category["name"] for category in boxes["categories"]] == [
         "person",
