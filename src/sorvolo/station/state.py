@@ -135,7 +135,7 @@ def shortage(folder: Path, floor_gb: float, coming_gb: float = 0.0) -> str:
     free_gb = shutil.disk_usage(folder).free / 1e9
     if free_gb - coming_gb >= floor_gb:
         return ""
-    coming = f", {coming_gb:.2f} GB of uploads are to come" if coming_gb else ""
+    coming = f", {coming_gb:.1f} GB of uploads are to come" if coming_gb else ""
     return f"{free_gb:.2f} GB are free{coming}, and {floor_gb:.2f} GB must stay so"
 
 
