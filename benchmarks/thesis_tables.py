@@ -46,7 +46,7 @@ def main() -> None:
     options = parser.parse_args()
     seeds = seeds_or_drawn("thesis_tables", options.seeds, 1)
     size, steps = SimulatedSize(options.length), options.train_steps
-    training = TrainSettings(rpn="standard", steps=steps, patience=0) if steps else None
+    training = TrainSettings("thesis", steps=steps, batch=4, patience=0) if steps else None
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as scratch:
         work = options.work or Path(scratch)

@@ -35,10 +35,6 @@ def test_notebook_runs(
         pytest.skip(f"the notebook {name} needs {', '.join(missing)}")
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.chdir(tmp_path)
-    if (
-        name == "tune_detector"
-    ):  # the first twenty of the pictures settle the model's norms, not a hundred
-        monkeypatch.setattr("sorvolo.lab.training.start._SETTLING_PX", 20 * 256 * 256)
     notebook = json.loads((NOTEBOOKS / f"{name}.ipynb").read_text(encoding="utf-8"))
     variables: dict[str, object] = {"__name__": "__main__"}
     for number, cell in enumerate(notebook["cells"]):

@@ -1,7 +1,7 @@
 """`sorvolo reproduce`: the experiments of the thesis's chapter 4, on the UMCD dataset or a simulated one."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.box import SIMPLE_HEAD
@@ -11,7 +11,6 @@ from rich.table import Table
 from sorvolo.cli.options import AsJson, OutFolder
 from sorvolo.cli.printing import TO_CHECK, Console, print_json
 from sorvolo.cli.progress import ProgressReport
-from sorvolo.cli.train import PresetOption
 from sorvolo.errors import SettingsError
 from sorvolo.survey.wording import counted
 
@@ -38,10 +37,6 @@ Npu = Annotated[
     Path | None, typer.Option(help="The NPU Drone-Map dataset's folder, for Table 4.1.")
 ]
 TrainSteps = Annotated[int, typer.Option(help="Steps of each network of Table 4.6; 0: train none.")]
-NetworkSchedule = Annotated[
-    Literal["joint", "four-steps"],
-    typer.Option(help="How Table 4.6 is trained: joint, or the thesis's four steps."),
-]
 
 
 def reproduce(
@@ -52,9 +47,7 @@ def reproduce(
     videos: VideoCount = None,
     okutama: Okutama = None,
     npu: Npu = None,
-    train_steps: TrainSteps = 400,
-    preset: PresetOption = "fast",
-    schedule: NetworkSchedule = "joint",
+    train_steps: TrainSteps = 100,
     as_json: AsJson = False,
 ) -> None:
     """Repeat the thesis's experiments of chapter 4: Tables 4.1, 4.3 to 4.6 and the figures, beside the printed ones.
@@ -74,7 +67,7 @@ def reproduce(
 
     training = None
     if train_steps:
-        training = TrainSettings(preset, "standard", schedule, steps=train_steps, patience=0)
+        training = TrainSettings("thesis", steps=train_steps, batch=4, patience=0)
     settings = ReproductionSettings(videos, training=training)
     simulation = SimulatedSize()
     if quick:

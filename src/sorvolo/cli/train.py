@@ -32,7 +32,7 @@ if TYPE_CHECKING:  # torch is an extra, and slow to import: only this command ne
 
 PresetOption = Annotated[
     Literal["fast", "thesis"],
-    typer.Option(help="fast: any computer. thesis: ResNet-50 with the nine modules."),
+    typer.Option(help="fast: the packaged network. thesis: ResNet-50 with the nine modules."),
 ]
 CheckedOn = Annotated[
     str, typer.Option(help="A labelled set to check on, or the share of videos to hold out.")
@@ -40,7 +40,7 @@ CheckedOn = Annotated[
 StartingWeights = Annotated[
     str,
     typer.Option(
-        help="Start from ImageNet (auto, or the file of its weights), nothing (none), or a model: name or .onnx."
+        help="Model to tune: its name or .onnx file. auto: the packaged one; none: nothing. thesis: ImageNet."
     ),
 ]
 
@@ -55,8 +55,8 @@ def train(
     val: CheckedOn = "0.15",
     weights: StartingWeights = "auto",
     steps: Annotated[int, typer.Option(help="Number of batches.")] = 8000,
-    batch: Annotated[int, typer.Option(help="Samples per batch.")] = 4,
-    side: Annotated[int, typer.Option(help="Side of the samples cut from the pictures, px.")] = 416,
+    batch: Annotated[int, typer.Option(help="Samples per batch.")] = 8,
+    side: Annotated[int, typer.Option(help="Side of the samples cut from the pictures, px.")] = 384,
     seed: Seed = 1,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the run in --out.")] = False,
     classes: LabelClasses = None,
@@ -71,7 +71,7 @@ def train(
 
     Example: sorvolo train my-labels --out my-model
 
-    Example, the packaged model tuned to your own pictures: sorvolo train my-labels --out tuned --weights default
+    Example, a thermal camera: sorvolo train my-labels --out tuned --weights thermal
 
     Example: sorvolo train a b --val c
 
@@ -81,7 +81,6 @@ def train(
 
     settings = TrainSettings(
         preset,
-        rpn="extended" if preset == "thesis" else "extended-residual",
         weights=weights,
         steps=steps,
         batch=batch,
@@ -156,9 +155,9 @@ def _show(updates: "Iterator[TrainingUpdate]", stop: SignalStop) -> None:
 def _losses(update: "TrainingUpdate") -> str:
     losses = update.losses
     assert losses is not None
-    parts = (losses.proposal_score, losses.proposal_box, losses.region_score, losses.region_box)
+    parts = ", ".join(f"{name} {value:.2f}" for name, value in losses.losses.items())
     left = f", {_duration(update.left_s)} left" if math.isfinite(update.left_s) else ""
-    return f"loss {losses.loss:.3f} ({' '.join(f'{part:.2f}' for part in parts)}), {update.steps_per_s:.2f} it/s{left}"
+    return f"loss {losses.loss:.3f} ({parts}), {update.steps_per_s:.2f} it/s{left}"
 
 
 def _duration(seconds: float) -> str:

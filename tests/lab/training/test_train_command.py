@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
@@ -80,7 +81,7 @@ def test_the_command_learns_and_writes_a_model_that_runs(data: Path, tmp_path: P
     report = json.loads((out / "training.json").read_text())
     assert report["held_out"]["ap50"] > 0.2  # chance finds nothing
     first, last = (
-        [row["region_score"] for row in report["losses"][part]]
+        [row["losses"]["score"] for row in report["losses"][part]]
         for part in (slice(5), slice(-5, None))
     )
     assert sum(last) < 0.5 * sum(first)
@@ -103,9 +104,20 @@ def test_the_command_learns_and_writes_a_model_that_runs(data: Path, tmp_path: P
     assert len(detector.detect(picture, least_score=0.02))
 
 
+@pytest.mark.long
+def test_the_thesis_network_is_trained_in_four_steps(data: Path, tmp_path: Path) -> None:
+    settings = _settings(preset="thesis", rpn="standard", steps=4)
+    updates = list(_train(data, tmp_path / "out", settings))
+    phases = [each.words[:3] for each in updates if each.losses is not None]
+    assert phases == ["1/4", "2/4", "3/4", "4/4"]
+    report = json.loads((tmp_path / "out" / "training.json").read_text())
+    assert report["held_out"] is not None and report["export"]["unmatched"] == 0
+    assert Detector.load(tmp_path / "out" / "model.onnx").info.preset == "thesis"
+
+
 @pytest.mark.long  # the same of a checkpoint alone is tested beside it
 def test_a_run_that_was_stopped_ends_as_one_that_was_not(data: Path, tmp_path: Path) -> None:
-    settings = _settings(rpn="standard")
+    settings = _settings()
     whole = [each for each in _train(data, tmp_path / "whole", settings) if each.losses is not None]
     stopped = _train(data, tmp_path / "stopped", settings)
     for update in stopped:
@@ -166,21 +178,20 @@ def test_ctrl_c_waits_for_the_step_and_leaves_a_checkpoint(
     assert read_checkpoint(content, "checkpoint").state["step"] == last
 
 
-@pytest.mark.parametrize("schedule", ["joint", "four-steps"])
 def test_checkpoints_come_between_checks_too(
-    data: Path, tmp_path: Path, schedule: str, monkeypatch: pytest.MonkeyPatch
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sorvolo.lab.training.detector._SAVE_S", 0.0)  # else a minute
-    settings = _settings(schedule=schedule, rpn="standard", steps=400)
+    settings = _settings(steps=400)
     for update in (run := _train(data, tmp_path / "out", settings)):
-        if update.step == 2:  # long before the first check, of four steps in the first
+        if update.step == 2:  # long before the first check
             break
     content = (tmp_path / "out" / "checkpoint.pt").read_bytes()
     assert read_checkpoint(content, "checkpoint").state["step"] == 2
     run.close()  # type: ignore[attr-defined]
     with pytest.raises(SettingsError, match="already holds a run; resume continues it"):
         next(_train(data, tmp_path / "out", settings))
-    other = _settings(schedule=schedule, rpn="standard", steps=400, seed=2)
+    other = _settings(steps=400, seed=2)
     with pytest.raises(
         SettingsError, match=r"cannot continue with other settings: .*seed was 1, is 2"
     ):
@@ -335,7 +346,9 @@ def test_bad_input_is_reported(
     assert "side_px must be a multiple of 32, got 100" in words(place, "--side", "100")
     assert "steps must lie in 1" in words(place, "--steps", "0")
     assert "holds no checkpoint.pt to go on from" in words(place, "--resume")
-    assert "no weights at" in words(place, "--weights", "gone.pth")
+    assert "there is no model 'gone'" in words(place, "--weights", "gone")
+    thesis = ("--preset", "thesis", "--weights", "gone.tgz")
+    assert "no weights at gone.tgz" in words(place, *thesis)
     assert "THEIRS=OURS" in words(place, "--classes", "=car")
     assert "ignore: 'Bicycle' is no name in the labels; there are: car" in words(
         place, "--ignore", "Bicycle"
@@ -375,8 +388,11 @@ def test_pictures_without_any_object_teach_nothing(tmp_path: Path) -> None:
 
 
 def test_a_model_that_finds_nothing_is_warned_of(
-    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    data = labelled_squares(tmp_path / "squares", 4, 5)
+    for path in (data / "images").glob("*.png"):  # labels that do not fit their pictures
+        cv2.imwrite(str(path), np.zeros((96, 128, 3), np.uint8))
     options = [
         "--weights",
         "none",
@@ -413,7 +429,7 @@ def test_names_in_the_report_are_text() -> None:
         "seconds": 3.0,
         "device": "cpu",
         "notices": ["<script>"],
-        "losses": [],
+        "losses": [{"step": k, "losses": {"<i>": 1.0 / k}} for k in (1, 2)],
         "checks": [{"step": k, "ap50": 0.1 * k, "classes": {"<i>": None}} for k in (1, 2)],
         "best_step": 2,
         "sets": [
@@ -440,4 +456,4 @@ def test_names_in_the_report_are_text() -> None:
     assert (
         "<i>" not in page and "<script>" not in page and "<s>" not in page and "&lt;i&gt;" in page
     )
-    assert "then its checks no longer got better" in page and page.count("<polyline") == 1
+    assert "then its checks no longer got better" in page and page.count("<polyline") == 2

@@ -8,50 +8,44 @@ stay as they are; 4. the classifier's own layers on the same (Ren et al. 2015, 3
 import time
 from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from sorvolo.lab.training.faster_rcnn import FasterRCNN, Proposed
-from sorvolo.lab.training.joint import (
-    Answer,
-    Progress,
-    collate,
-    draw_regions,
-    match_boxes,
-    sample,
-)
-from sorvolo.lab.training.regions import offsets_from_boxes
+from sorvolo.lab.thesis.faster_rcnn import FasterRCNN, Proposed, offsets_from_boxes, propose
+from sorvolo.lab.training.boxes import area, iou_matrix, shared_area
+from sorvolo.lab.training.learning import Answer, collate
+from sorvolo.lab.training.progress import Progress
 from sorvolo.lab.training.samples import TrainingSample
 
 STEP_NAMES = ("1/4 proposals", "2/4 classifier", "3/4 proposals refined", "4/4 classifier refined")
+LOSS_NAMES = ("proposals: score", "proposals: box", "classifier: score", "classifier: box")
 
-
-@dataclass(frozen=True)
-class FourStepSettings:
-    """How long and how fast it learns; rate and momentum are the thesis's."""
-
-    steps: int = 8000  # batches of all four steps together, a quarter each
-    rate: float = 1e-4  # of stochastic gradient descent
-    momentum: float = 0.9
-    anchors: int = 256  # per picture for the proposals, half of them positives at most (Ren et al. 2015, 3.1.3)
-    regions: int = 128  # per picture for the classifier, a quarter of them positives at most
-    proposed: int = 300  # regions per picture out of which those are drawn
+_RATE, _MOMENTUM = 1e-4, 0.9  # of stochastic gradient descent, the thesis's
+_ANCHORS = (
+    256  # per picture for the proposals, half of them positives at most (Ren et al. 2015, 3.1.3)
+)
+_REGIONS, _POSITIVE = (
+    128,
+    0.25,
+)  # per picture for the classifier, and the share of positives at most
+_PROPOSED = 300  # regions per picture out of which those are drawn
+_IGNORED_SHARE = (
+    0.5  # an anchor or region that is by this much in an ignored region teaches nothing
+)
 
 
 class FourStepTraining:
     """A model on its way through the four steps. Only `learn` changes it; `average` is the model itself."""
 
-    def __init__(
-        self, model: FasterRCNN, settings: FourStepSettings, seed: int, device: str = "cpu"
-    ) -> None:
-        self.model, self.settings, self.device = model.to(device), settings, device
+    def __init__(self, model: FasterRCNN, steps: int, seed: int, device: str = "cpu") -> None:
+        self.model = model.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.steps, self.device = steps, device
         self.step = 0
         self.generator = torch.Generator().manual_seed(seed)
-        self._imagenet: dict[str, Any] | None = deepcopy(_shared(model).state_dict())
+        self._imagenet: dict[str, Any] | None = deepcopy(model.backbone.state_dict())
         self._proposer: nn.ModuleList | None = None
         self._enter(0)
         self._started_s = time.monotonic()
@@ -60,11 +54,6 @@ class FourStepTraining:
     def average(self) -> FasterRCNN:
         """The model that is kept in the end: the thesis takes no mean of weights."""
         return self.model
-
-    @property
-    def stage(self) -> int:
-        """Which of the four steps the last batch belonged to, 0 to 3."""
-        return self._stage
 
     @property
     def phase(self) -> str:
@@ -78,28 +67,25 @@ class FourStepTraining:
 
     def learn(self, batch: Sequence[TrainingSample]) -> Progress:
         """One batch of samples of one size; a loss that its step does not minimise is zero."""
-        stage = min(3, self.step * 4 // self.settings.steps)
+        stage = min(3, self.step * 4 // self.steps)
         if stage != self._stage:
             self._enter(stage)
         self._prepare()
         images, answers = collate(batch, self.device)
         with torch.set_grad_enabled(stage < 2):
-            levels = self.model.features(images)
-        zero = torch.zeros((), device=self.device)
-        parts = [zero, zero, zero, zero]
+            features = self.model.backbone(images)
         if stage in (0, 2):
-            parts[:2] = proposal_loss(
-                self.model.proposals(levels), answers, self.generator, sampled=self.settings.anchors
-            )
+            parts = proposal_loss(self.model.proposals(features), answers, self.generator)
         else:
-            parts[2:] = self._region_losses(levels, self._proposed(images, levels), answers)
+            parts = self._region_losses(images, features, answers)
         self.optimiser.zero_grad(set_to_none=True)
-        sum(parts, zero).backward()  # type: ignore[no-untyped-call]
+        (parts[0] + parts[1]).backward()  # type: ignore[no-untyped-call]
         self.optimiser.step()
         self.step += 1
-        first, second, third, fourth = (float(part.detach()) for part in parts)
-        seconds = time.monotonic() - self._started_s
-        return Progress(self.step, first, second, third, fourth, seconds, self.settings.steps)
+        losses = dict.fromkeys(LOSS_NAMES, 0.0)
+        for name, part in zip(LOSS_NAMES[stage % 2 * 2 :], parts):
+            losses[name] = float(part.detach())
+        return Progress(self.step, losses, time.monotonic() - self._started_s, self.steps)
 
     def state(self) -> dict[str, object]:
         """All that is needed to go on: tensors, numbers and text only."""
@@ -131,7 +117,7 @@ class FourStepTraining:
         if stage == 1:
             self._proposer = _proposer_of(self.model)
             assert self._imagenet is not None
-            _shared(self.model).load_state_dict(self._imagenet)
+            self.model.backbone.load_state_dict(self._imagenet)
         self._imagenet = self._imagenet if stage == 0 else None
         self._proposer = self._proposer if stage == 1 else None
         self._stage = stage
@@ -141,14 +127,12 @@ class FourStepTraining:
         weights = [
             each for part in self._learning() for each in part.parameters() if each.requires_grad
         ]
-        self.optimiser = torch.optim.SGD(
-            weights, lr=self.settings.rate, momentum=self.settings.momentum
-        )
+        self.optimiser = torch.optim.SGD(weights, lr=_RATE, momentum=_MOMENTUM)
 
     def _learning(self) -> tuple[nn.Module, ...]:
         model = self.model
         own = model.proposals if self._stage in (0, 2) else model.head
-        return (model.backbone, model.neck, own) if self._stage < 2 else (own,)
+        return (model.backbone, own) if self._stage < 2 else (own,)
 
     def _prepare(self) -> None:
         """Batch norms of what is fixed keep their statistics."""
@@ -156,43 +140,88 @@ class FourStepTraining:
         for part in self._learning():
             part.train()
 
-    @torch.no_grad()
-    def _proposed(self, images: Tensor, levels: list[Tensor]) -> Proposed:
-        if self._proposer is None:
-            return self.model.proposals(levels)
-        backbone, neck, proposals = self._proposer
-        return proposals(neck(backbone(images.float())))
-
     def _region_losses(
-        self, levels: list[Tensor], proposed: Proposed, answers: Sequence[Answer]
+        self, images: Tensor, features: Tensor, answers: Sequence[Answer]
     ) -> tuple[Tensor, Tensor]:
         """Eq. 4.2 for the classifier: both sums over the number of regions drawn."""
-        drawn = draw_regions(
-            self.model,
-            levels,
-            proposed,
-            answers,
-            self.generator,
-            before=2000,
-            after=self.settings.proposed,
-            count=self.settings.regions,
-            most_positive=0.25,
-        )
-        score, box = drawn.losses(self.model, levels, answers, overlap=False)
-        return score / max(1, drawn.count), box / max(1, drawn.count)
-
-
-def _shared(model: FasterRCNN) -> nn.ModuleList:
-    return nn.ModuleList([model.backbone, model.neck])
+        # some of the proposed regions and the true boxes, of which positives overlap a true one by half
+        regions, matches = [], []
+        with torch.no_grad():
+            if self._proposer is None:
+                proposed = self.model.proposals(features)
+            else:
+                backbone, proposals = self._proposer
+                proposed = proposals(backbone(images))
+            for index, answer in enumerate(answers):
+                found = propose(proposed, index, (images.shape[2], images.shape[3]), _PROPOSED)
+                found = torch.cat([found, answer.boxes])
+                target = match_boxes(found, answer, over=0.5, under=0.5)
+                chosen = sample(target, _REGIONS, _POSITIVE, self.generator)
+                regions.append(found[chosen])
+                matches.append(target[chosen])
+        counts = [len(each) for each in regions]
+        batch = torch.repeat_interleave(torch.tensor(counts)).to(features.device)
+        scores, offsets = self.model.classify(features, torch.cat(regions), batch)
+        parts = zip(scores.split(counts), offsets.split(counts), regions, matches, answers)
+        losses = [region_loss(*each) for each in parts]
+        score, box = (torch.stack(each).sum() for each in zip(*losses))
+        return score / max(1, sum(counts)), box / max(1, sum(counts))
 
 
 def _proposer_of(model: FasterRCNN) -> nn.ModuleList:
-    parts = nn.ModuleList([model.backbone, model.neck, model.proposals])
+    parts = nn.ModuleList([model.backbone, model.proposals])
     return deepcopy(parts).eval().requires_grad_(False)
 
 
+def match_boxes(boxes: Tensor, answer: Answer, *, over: float, under: float) -> Tensor:
+    """(K,) what boxes (K, 4) stand for: the row of the answer's boxes, -1 background, -2 neither.
+
+    Boxes that overlap a true one by `over` are positives, by less than `under` background.
+    """
+    target = torch.full((len(boxes),), -1, dtype=torch.int64, device=boxes.device)
+    if len(answer.boxes):
+        best, row = iou_matrix(boxes, answer.boxes).max(1)
+        target[best >= under] = -2
+        target = torch.where(best >= over, row, target)
+    if len(answer.ignored):
+        inside = shared_area(boxes, answer.ignored).amax(1) > _IGNORED_SHARE * area(boxes)
+        target = torch.where(inside & (target == -1), -2, target)
+    return target
+
+
+def sample(target: Tensor, count: int, most_positive: float, generator: torch.Generator) -> Tensor:
+    """(S,) indices of at most `count` boxes, positives among them up to their share, the rest background."""
+    positive = (target >= 0).nonzero()[:, 0]
+    negative = (target == -1).nonzero()[:, 0]
+    positive = positive[
+        torch.randperm(len(positive), generator=generator)[: int(count * most_positive)]
+    ]
+    negative = negative[torch.randperm(len(negative), generator=generator)[: count - len(positive)]]
+    return torch.cat([positive, negative])
+
+
+def region_loss(
+    scores: Tensor, offsets: Tensor, regions: Tensor, target: Tensor, answer: Answer
+) -> tuple[Tensor, Tensor]:
+    """Eq. 4.2 summed over one picture's regions: log loss over classes and background, smooth L1 of the positives' boxes.
+
+    Scores (R, C + 1), offsets (R, 4), regions (R, 4), `target` (R,) of these very regions. A class without labels in
+    this picture is left out of its softmax.
+    """
+    positive = target >= 0
+    wanted = torch.full_like(target, scores.shape[1] - 1)
+    wanted[positive] = answer.labels[target[positive]]
+    allowed = torch.cat([answer.known, answer.known.new_ones(1)])
+    masked = scores.masked_fill(~allowed[None], -1e4)
+    goal = offsets_from_boxes(answer.boxes[target[positive]], regions[positive])
+    return (
+        functional.cross_entropy(masked, wanted, reduction="sum"),
+        functional.smooth_l1_loss(offsets[positive], goal, reduction="sum", beta=1.0),
+    )
+
+
 def proposal_loss(
-    proposed: Proposed, answers: Sequence[Answer], generator: torch.Generator, *, sampled: int = 256
+    proposed: Proposed, answers: Sequence[Answer], generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
     """Eq. 4.2 for the proposals: log loss over sampled anchors and smooth L1 over the positives among them.
 
@@ -201,18 +230,16 @@ def proposal_loss(
     """
     score_losses, box_losses = [], []
     for index, answer in enumerate(answers):
-        match = match_boxes(proposed.anchors, answer, over=0.7, under=0.3, best_too=False)
-        chosen = sample(match, sampled, 0.5, generator)
-        wanted = match.positive[chosen].to(proposed.scores.dtype)
+        target = match_boxes(proposed.anchors, answer, over=0.7, under=0.3)
+        chosen = sample(target, _ANCHORS, 0.5, generator)
+        wanted = (target[chosen] >= 0).to(proposed.scores.dtype)
         score_losses.append(
             functional.binary_cross_entropy_with_logits(proposed.scores[index][chosen], wanted)
         )
-        rows = chosen[match.positive[chosen]]
-        offsets = proposed.offsets[index][rows]
-        if len(rows):
-            goal = offsets_from_boxes(answer.boxes[match.target[rows]], proposed.anchors[rows])
-            missed = functional.smooth_l1_loss(offsets, goal, reduction="sum", beta=1 / 9)
-        else:
-            missed = offsets.sum() * 0
-        box_losses.append(missed / sampled)
+        rows = chosen[target[chosen] >= 0]
+        goal = offsets_from_boxes(answer.boxes[target[rows]], proposed.anchors[rows])
+        missed = functional.smooth_l1_loss(
+            proposed.offsets[index][rows], goal, reduction="sum", beta=1 / 9
+        )
+        box_losses.append(missed / _ANCHORS)
     return torch.stack(score_losses).mean(), torch.stack(box_losses).mean()

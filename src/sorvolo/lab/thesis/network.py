@@ -3,27 +3,17 @@
 docs/thesis.md describes how the table was read.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from sorvolo.lab.training.backbones import ResNet50, convolution, resnet_stage
-from sorvolo.lab.training.faster_rcnn import (
-    RATIOS,
-    AnchorSettings,
-    FasterRCNN,
-    ProposalNetwork,
-    Reach,
-    Stem,
-)
-from sorvolo.lab.training.regions import StageHead
+from sorvolo.lab.thesis.faster_rcnn import FasterRCNN, ProposalNetwork, StageHead
+from sorvolo.lab.thesis.resnet import ResNet50, convolution, load_imagenet, resnet_stage
 
-_REGIONS = 75  # for six frames a second on two cores; crowds need more (docs/train.md)
-_ANCHORS = (
-    AnchorSettings((16, 32, 64, 128, 256), RATIOS),
-)  # of Faster R-CNN, an octave finer on either side
+_STANDARD_WIDTH = 512  # of the standard proposal network's 3x3 convolution (Ren et al. 2015)
 _TABLE_3_2 = (  # of each layer, its branches: filters, kernel
     *[((64, 1), (96, 3), (64, 5))] * 3,
     *[((192, 1), (192, 7), (192, 7))] * 4,
@@ -37,18 +27,15 @@ class InceptionA(nn.Module):
     """Layers 1 to 3: 1x1, 3x3 and 5x5 side by side, a 1x1 in front of the larger ones; in layer 3 the pooled input as
     well, for which the table gives no filters."""
 
-    def __init__(
-        self, channels: int, branches: Sequence[tuple[int, int]], scale: float, *, pools: bool
-    ) -> None:
+    def __init__(self, channels: int, branches: Sequence[tuple[int, int]], *, pools: bool) -> None:
         super().__init__()
         self.branches = nn.ModuleList()
         self.channels = 0
-        for filters, kernel in branches:
-            out = _scaled(filters, scale)
+        for out, kernel in branches:
             if kernel == 1:
                 self.branches.append(convolution(channels, out, 1))
             else:
-                inner = _scaled(_REDUCED[kernel], scale)
+                inner = _REDUCED[kernel]
                 self.branches.append(
                     nn.Sequential(convolution(channels, inner, 1), convolution(inner, out, kernel))
                 )
@@ -67,10 +54,10 @@ class InceptionA(nn.Module):
 class InceptionB(nn.Module):
     """Layers 4 to 7: 1x1; 1x7 and 7x1 (branch 7x7_1); 7x1, 1x7 (branch 7x7_2), the 7x7 kernels factorised."""
 
-    def __init__(self, channels: int, branches: Sequence[tuple[int, int]], scale: float) -> None:
+    def __init__(self, channels: int, branches: Sequence[tuple[int, int]]) -> None:
         super().__init__()
-        out = _scaled(branches[0][0], scale)
-        inner = _scaled(128, scale)
+        out = branches[0][0]
+        inner = 128
         self.first = convolution(channels, out, 1)
         self.second = nn.Sequential(
             convolution(channels, inner, 1),
@@ -92,12 +79,12 @@ class InceptionB(nn.Module):
 class InceptionC(nn.Module):
     """Layers 8 and 9: 1x1, and four branches 3x3 as pairs of 1x3 and 3x1, the second pair behind a 3x3."""
 
-    def __init__(self, channels: int, branches: Sequence[tuple[int, int]], scale: float) -> None:
+    def __init__(self, channels: int, branches: Sequence[tuple[int, int]]) -> None:
         super().__init__()
         narrow, out, inner = (
-            _scaled(branches[0][0], scale),
-            _scaled(branches[1][0], scale),
-            _scaled(448, scale),
+            branches[0][0],
+            branches[1][0],
+            448,
         )
         self.first = convolution(channels, narrow, 1)
         self.near = convolution(channels, out, 1)
@@ -118,18 +105,18 @@ class InceptionC(nn.Module):
 
 
 class ExtendedStack(nn.Module):
-    """The nine stacked Inception modules of Table 3.2 and Figure 3.26; `scale` multiplies every width."""
+    """The nine stacked Inception modules of Table 3.2 and Figure 3.26."""
 
-    def __init__(self, channels: int, scale: float = 1.0) -> None:
+    def __init__(self, channels: int) -> None:
         super().__init__()
         layers: list[InceptionA | InceptionB | InceptionC] = []
         for index, branches in enumerate(_TABLE_3_2):
             if index < 3:
-                layers.append(InceptionA(channels, branches, scale, pools=index == _POOLED_LAYER))
+                layers.append(InceptionA(channels, branches, pools=index == _POOLED_LAYER))
             elif index < 7:
-                layers.append(InceptionB(channels, branches, scale))
+                layers.append(InceptionB(channels, branches))
             else:
-                layers.append(InceptionC(channels, branches, scale))
+                layers.append(InceptionC(channels, branches))
             channels = layers[-1].channels
         self.layers = nn.Sequential(*layers)
         self.channels = channels
@@ -140,24 +127,25 @@ class ExtendedStack(nn.Module):
 
 
 def thesis_network(
-    classes: Sequence[str], rpn: Stem = "extended", *, original: bool = False, frozen: bool = True
+    classes: Sequence[str],
+    rpn: Literal["standard", "extended"],
+    imagenet: Mapping[str, Tensor] | None = None,
 ) -> FasterRCNN:
     """The thesis's own (its 3.3.2): ResNet-50 up to res4, proposals through Table 3.2's nine modules, res5 as head.
 
-    `original`: where ResNet's strides sit (`ResNet50`); it follows from the weights that are to be loaded. `frozen`: its
-    batch norms and first layers stay as loaded.
+    With the weights of `imagenet` batch norms and first layers stay as they are loaded; without, everything learns.
     """
-    backbone = ResNet50(original=original, frozen_norms=frozen, thaw_all=not frozen)
-    proposals = ProposalNetwork(
-        backbone.channels, backbone.strides, _ANCHORS, rpn, 512, light=False
-    )
+    frozen = imagenet is not None
+    backbone = ResNet50(frozen=frozen)
     # cut out at the 7x7 that res5's stride would leave of 14x14: a quarter as much to sample, and all of it is used
-    stage = resnet_stage(4, original=original, frozen_norms=frozen, halves=False)
-    head = StageHead(stage, 2048, len(classes))
-    return FasterRCNN(
-        backbone, torch.nn.Identity(), proposals, head, Reach(before=2000, regions=_REGIONS)
-    )
-
-
-def _scaled(width: int, scale: float) -> int:
-    return max(8, round(width * scale))
+    stage = resnet_stage(4, frozen=frozen, halves=False)
+    if imagenet is not None:
+        load_imagenet(backbone, imagenet)
+        load_imagenet(stage, imagenet, "layer4.")
+    if rpn == "extended":
+        nine = ExtendedStack(backbone.channels)
+        proposals = ProposalNetwork(nine, nine.channels, backbone.stride)
+    else:
+        standard = convolution(backbone.channels, _STANDARD_WIDTH, 3)
+        proposals = ProposalNetwork(standard, _STANDARD_WIDTH, backbone.stride)
+    return FasterRCNN(backbone, proposals, StageHead(stage, 2048, len(classes)))

@@ -111,8 +111,8 @@ DIFFERENCES = {
         "pictures.",
     ),
     "table_4_6": (
-        "The thesis trained on a GPU for 2,000 epochs in four steps; here by the preset and the steps that the table "
-        "names, both networks alike. `--preset thesis --schedule four-steps --train-steps N` comes closer.",
+        "The thesis trained on a GPU for 2,000 epochs in four steps; here for as many batches as the table names, a "
+        "quarter for each step. `--train-steps N` comes closer.",
         "The thesis's mAP is a mean of precisions (eqs 4.3, 4.4): it does not count what was missed. AP50 beside it "
         "does.",
         "UMCD's metadata gives no places in the frames; the thesis's labels of 4,088 frames are not public. Without "

@@ -333,9 +333,7 @@ class _Work:
                 "extended" if model == "extended" else "standard"
             )
             file = detectors.train_network(labels, out, replace(wanted, rpn=stem, seed=seed))
-            trained = {
-                name: getattr(wanted, name) for name in ("preset", "steps", "schedule", "side_px")
-            }
+            trained = {"steps": wanted.steps, "side_px": wanted.side_px}
         values = {
             "dataset": labels.name,
             "model": model,

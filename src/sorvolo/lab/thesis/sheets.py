@@ -229,9 +229,7 @@ def _precisions(table: Mapping[str, Any]) -> Sheet:
         (
             f"{each['model']}, here",
             each["dataset"],
-            f"{each['schedule']}, {each['steps']} steps of preset {each['preset']} at {each['side_px']} px"
-            if "steps" in each
-            else "as packaged",
+            f"{each['steps']} steps at {each['side_px']} px" if "steps" in each else "as packaged",
             f"{each['pictures']} of {counted(each['videos'], 'video')}: {each['split']}",
             _percent(each["thesis_map"]),
             _percent(each["ap50"]),

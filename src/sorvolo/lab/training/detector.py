@@ -4,7 +4,7 @@ import math
 import os
 import time
 from collections.abc import Generator, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -14,10 +14,10 @@ from typing import Any
 from sorvolo import __version__
 from sorvolo.capture.photos import read_picture
 from sorvolo.detection.contract import CALIBRATED
-from sorvolo.detection.fusing import scaled_thresholds
+from sorvolo.detection.fusing import in_own_scale, scaled_thresholds
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import ImageRGB
-from sorvolo.lab.training.faster_rcnn import FasterRCNN
+from sorvolo.lab.training.boxes import Finder
 from sorvolo.lab.training.held_out import (
     Checked,
     best_sizes_px,
@@ -26,13 +26,18 @@ from sorvolo.lab.training.held_out import (
     found_sizes_px,
     padded_to,
 )
-from sorvolo.lab.training.joint import Progress
-from sorvolo.lab.training.onnx_export import ExportCheck, ExportedModel, check_export, export_onnx
+from sorvolo.lab.training.onnx_export import (
+    ExportCheck,
+    check_export,
+    export_onnx,
+    round_weights,
+)
 from sorvolo.lab.training.page import training_page
 from sorvolo.lab.training.progress import (
     Check,
     History,
     Learner,
+    Progress,
     checkpoint_bytes,
     load_weights_bytes,
     read_checkpoint,
@@ -40,7 +45,7 @@ from sorvolo.lab.training.progress import (
     seconds_left,
     weights_bytes,
 )
-from sorvolo.lab.training.samples import Augmentation, TrainingSample, batches_from
+from sorvolo.lab.training.samples import TrainingSample, batches_from
 from sorvolo.lab.training.sets import (
     DataOptions,
     TrainingSets,
@@ -48,6 +53,7 @@ from sorvolo.lab.training.sets import (
 )
 from sorvolo.lab.training.settings import TrainSettings
 from sorvolo.lab.training.start import (
+    Start,
     begin_notices,
     device_of,
     kept_notices,
@@ -57,7 +63,6 @@ from sorvolo.lab.training.start import (
     start_learner,
     without_denormals,
 )
-from sorvolo.lab.training.weights import ImageNetWeights
 from sorvolo.paths import AnyPath, Inputs, listed
 from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, writing
 from sorvolo.store.exports.plain import json_bytes, plain_json
@@ -105,7 +110,7 @@ class _Run:
     learner: Learner
     reader: "_Reader"
     device: str
-    start: ImageNetWeights | ExportedModel | None
+    start: Start | None
     notices: tuple[str, ...]  # reported before the first step
     history: History = field(default_factory=History)
 
@@ -113,17 +118,9 @@ class _Run:
     def identity(self) -> dict[str, Any]:
         """What a run must share with the one that it goes on from."""
         settings = {key: value for key, value in asdict(self.settings).items() if key != "patience"}
-        if isinstance(self.start, ExportedModel):
-            begun = f"model with SHA-256 {self.start.sha256[:16]}"
-        else:
-            begun = (
-                "none"
-                if self.start is None
-                else f"ImageNet{', original strides' if self.start.original else ''}"
-            )
         return {
             **settings,
-            "weights": begun,
+            "weights": self.start.identity if self.start else "none",
             "classes": list(self.sets.classes),
             "data": self.sets.fingerprint,
         }
@@ -159,29 +156,17 @@ def _train(
     device: str,
     resume: bool,
 ) -> Iterator[TrainingUpdate]:
-    start = load_start(settings.weights, settings.preset)
+    start = load_start(settings)
     steps = settings.steps
     yield TrainingUpdate(0, steps, "reading the labels")
     sets = training_sets(places, options, seed=settings.seed)
     notices = sets.notices
-    if isinstance(start, ExportedModel):
+    if start is not None:
         notices += tuple(begin_notices(start, sets.classes))
     yield TrainingUpdate(0, steps, f"preparing the network ({settings.preset})", notices=notices)
     reader = _Reader(sets)
     with without_denormals():
-        with closing(_batches(sets, reader, settings)) as first:
-            learner = start_learner(
-                settings.preset,
-                sets.classes,
-                settings.rpn,
-                settings.schedule,
-                start,
-                first,
-                steps=steps,
-                batch=settings.batch,
-                seed=settings.seed,
-                device=device,
-            )
+        learner = start_learner(settings, sets.classes, start, device)
         run = _Run(out, settings, sets, learner, reader, device, start, notices)
         if resume:
             checkpoint = read_checkpoint((out / CHECKPOINT).read_bytes(), str(out / CHECKPOINT))
@@ -251,7 +236,7 @@ def _batches(
         sets.shares,
         sets.classes,
         reader,
-        Augmentation(side_px=settings.side_px),
+        side=settings.side_px,
         seed=settings.seed,
         batch=settings.batch,
         start=start,
@@ -299,7 +284,7 @@ def _learn(run: _Run) -> Iterator[TrainingUpdate]:
 
 
 def _is_check_due(run: _Run) -> bool:
-    """At even distances and in the end; of the four steps only in the last: before, the parts do not fit together."""
+    """At even distances and in the end, once the network's parts fit together."""
     step, steps = run.learner.step, run.settings.steps
     if not run.sets.held_out or not run.learner.is_whole:
         return False
@@ -321,7 +306,7 @@ def _save(run: _Run) -> None:
     )
 
 
-def _look(run: _Run, model: FasterRCNN, most: int) -> Checked:
+def _look(run: _Run, model: Finder, most: int) -> Checked:
     return check_model(
         model, run.sets.classes, run.sets.held_out, run.reader, device=run.device, most=most
     )
@@ -332,11 +317,12 @@ def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
     are new."""
     model, classes, history = run.learner.average, run.sets.classes, run.history
     best, held_out = history.best, run.sets.held_out
-    before = run.start if isinstance(run.start, ExportedModel) else None
+    before = run.start.info if run.start else None
     if best is not None:
         load_weights_bytes(model, (run.out / BEST).read_bytes(), str(run.out / BEST))
+    round_weights(model)
     checked = _look(run, model, _MOST_CHECKED_LAST) if held_out else Checked({}, {})
-    thresholds = checked.thresholds(classes, before.thresholds if before else {})
+    thresholds = checked.thresholds(classes, in_own_scale(before) if before else {})
     scores = {name: each.score for name, each in thresholds.items()}
     calibration = checked.calibration(classes, before.calibration if before else {})
     scaled = scaled_thresholds(scores, calibration)
@@ -349,9 +335,8 @@ def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
     )
     kept: dict[str, Any] = {}
     if before:
-        was = before.info
-        licence += f"; {before.origin} before: {was.licence or 'not stated'}"
-        trained_on += f"; {before.origin} before: {was.trained_on or 'not stated'}"
+        licence += f"; the model {before.name} before: {before.licence or 'not stated'}"
+        trained_on += f"; the model {before.name} before: {before.trained_on or 'not stated'}"
         kept = {
             "on_request": list(kept_on_request(before, classes, checked.too_few(classes))),
             "thermal_by": kept_thermal_by(before, classes, thermal=thermal),
@@ -365,7 +350,7 @@ def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
         "thresholds": scaled,
         "calibration": {name: asdict(each) for name, each in calibration.items()},
         "best_px": best_sizes_px(
-            checked, scores, learnt, classes, before.info.best_px if before else {}
+            checked, scores, learnt, classes, before.best_px if before else {}
         ),
         "licence": licence,
         "trained_on": trained_on,
@@ -381,8 +366,8 @@ def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
         if len(shown) < _EXPORT_PICTURES:
             with suppress(InputError):
                 part = run.reader(picture.path)[:_EXPORT_PX, :_EXPORT_PX]
-                shown.append(padded_to(part, run.learner.model.stride))
-    agreement = check_export(model.cpu(), exported, shown)
+                shown.append(padded_to(part, model.stride))
+    agreement = check_export(model, exported, shown)
     atomic_write_bytes(run.out / MODEL, exported)
     at_step = run.learner.step if best is None else best.step
     check = check_of(checked, at_step) if held_out else None
@@ -397,7 +382,6 @@ def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
         "settings": asdict(run.settings),
         "device": run.device,
         "weights": "none" if run.start is None else run.start.origin,
-        "not_carried_on": list(before.left) if before else [],
         "sets": run.sets.described(),
         "notices": [*run.notices, *notices],
         "step": step,

@@ -21,7 +21,7 @@ from sorvolo.lab.evaluation.detection_metrics import (
     match_pictures,
     reporting_threshold,
 )
-from sorvolo.lab.training.faster_rcnn import FasterRCNN
+from sorvolo.lab.training.boxes import Finder
 from sorvolo.lab.training.progress import Check
 from sorvolo.mosaic.selection import evenly
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
@@ -201,7 +201,7 @@ def check_of(checked: Checked, step: int) -> Check:
 
 
 def check_model(
-    model: FasterRCNN,
+    model: Finder,
     classes: Sequence[str],
     held_out: Sequence[LabelledSet],
     read: Callable[[str], ImageRGB],
@@ -238,7 +238,7 @@ _FILL = 114  # grey, as around samples
 
 @torch.no_grad()
 def see(
-    model: FasterRCNN, classes: Sequence[str], picture: ImageRGB, device: str = "cpu"
+    model: Finder, classes: Sequence[str], picture: ImageRGB, device: str = "cpu"
 ) -> Detections:
     """What the network finds in one picture (H, W, 3), padded to its stride; above 1280 px in a smaller copy."""
     model.eval()

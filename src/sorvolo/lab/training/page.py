@@ -8,12 +8,6 @@ from sorvolo.store.pages.plots import Axes, Line, PlotLabel, Scale, colour_class
 from sorvolo.store.pages.words import at, known, render, seconds_words
 
 _WIDE_PX, _LOW_PX, _MARGIN_PX = 720.0, 250.0, 46.0
-_LOSSES = {
-    "proposal_score": "proposals: score",
-    "proposal_box": "proposals: box",
-    "region_score": "classifier: score",
-    "region_box": "classifier: box",
-}
 _Lines = Mapping[str, Sequence[tuple[float, float]]]
 
 
@@ -61,8 +55,10 @@ def _summary(report: Mapping[str, Any]) -> str:
 
 
 def _losses(report: Mapping[str, Any]) -> dict[str, Any] | None:
-    rows = report["losses"]
-    lines = {words: [(row["step"], row[key]) for row in rows] for key, words in _LOSSES.items()}
+    lines: dict[str, list[tuple[float, float]]] = {}
+    for row in report["losses"]:
+        for name, value in row["losses"].items():
+            lines.setdefault(name, []).append((row["step"], value))
     return _plot("Losses over steps", lines)
 
 

@@ -1,4 +1,4 @@
-"""How a training goes: what every schedule can do, its losses over time, and what is left."""
+"""How a training goes: what every learner can do, its losses over time, and what is left."""
 
 import json
 import pickle
@@ -13,19 +13,38 @@ import safetensors.torch
 import torch
 
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.lab.training.faster_rcnn import FasterRCNN
-from sorvolo.lab.training.joint import LossRow, Progress
+from sorvolo.lab.training.boxes import Finder
 from sorvolo.lab.training.samples import TrainingSample
 
 
-class Learner(Protocol):
-    """A model on its way, by one schedule or another; only `learn` changes it."""
+@dataclass(frozen=True)
+class LossRow:
+    """The losses of `step` by name, or their means over the steps since the row before; seconds of learning so far."""
 
-    model: FasterRCNN
+    step: int
+    losses: Mapping[str, float]
+    seconds: float
+
+    @property
+    def loss(self) -> float:
+        """Their sum, which is minimised."""
+        return sum(self.losses.values())
+
+
+@dataclass(frozen=True)
+class Progress(LossRow):
+    """Where training stands after a step of `steps`; the losses are this step's, the seconds this run's."""
+
+    steps: int
+
+
+class Learner(Protocol):
+    """A model on its way; only `learn` changes it."""
+
     step: int
 
     @property
-    def average(self) -> FasterRCNN:
+    def average(self) -> Finder:
         """The model that would be kept if training ended now."""
 
     @property
@@ -66,13 +85,13 @@ class History:
 
     def after(self, done: Progress, seconds: float, *, every: int) -> "History":
         """With one step more; a row is closed after each `every` steps and the last. `seconds` are of all runs."""
-        parts = ("proposal_score", "proposal_box", "region_score", "region_box")
-        losses = [getattr(done, part) for part in parts]
-        pending = (*self.pending, LossRow(done.step, *losses, seconds))  # type: ignore[call-arg]
+        pending = (*self.pending, LossRow(done.step, done.losses, seconds))
         if done.step % every and done.step != done.steps:
             return History(self.rows, self.checks, pending)
-        means = [float(np.mean([getattr(row, part) for row in pending])) for part in parts]
-        row = LossRow(done.step, *means, seconds)  # type: ignore[call-arg]
+        means = {
+            name: float(np.mean([row.losses[name] for row in pending])) for name in done.losses
+        }
+        row = LossRow(done.step, means, seconds)
         return History((*self.rows, row), self.checks)
 
     def checked(self, check: Check) -> "History":
@@ -196,14 +215,14 @@ def restore(learner: Learner, checkpoint: Checkpoint, settings: Mapping[str, Any
     torch.set_rng_state(checkpoint.state["torch_random"])
 
 
-def weights_bytes(model: FasterRCNN) -> bytes:
+def weights_bytes(model: Finder) -> bytes:
     """The network's weights alone, as a safetensors file."""
     return safetensors.torch.save(
         {name: value.cpu().contiguous() for name, value in model.state_dict().items()}
     )
 
 
-def load_weights_bytes(model: FasterRCNN, data: bytes, name: str) -> None:
+def load_weights_bytes(model: Finder, data: bytes, name: str) -> None:
     """Take what `weights_bytes` gave. Raises InputError, naming `name`, when it is damaged or of another network."""
     try:
         model.load_state_dict(safetensors.torch.load(data))

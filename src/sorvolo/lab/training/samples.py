@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -14,6 +14,13 @@ from sorvolo.survey.labels import LabelledPicture, LabelledSet
 
 _LEAST_SEEN = 0.4  # of an object cut by the crop's edge; less of one teaches nothing
 _LEAST_PX = 3.0  # longer side of an object; smaller ones are ignored
+_TURNED = 0.35  # how often a crop is turned by any angle, else by quarters
+_GREY, _HAZE, _BLUR, _NOISE = (
+    0.15,
+    0.1,
+    0.2,
+    0.2,
+)  # how often each; blur is motion of up to 9 px, or out of focus
 
 
 @dataclass(frozen=True)
@@ -25,18 +32,6 @@ class Share:
     weight: float
     scale: tuple[float, float] = (0.6, 1.6)
     thermal: bool = False
-
-
-@dataclass(frozen=True)
-class Augmentation:
-    """How far samples may differ from their pictures."""
-
-    side_px: int = 416
-    turns: bool = True  # by any angle; else only mirrored
-    blur: float = 0.2  # how often: motion of up to 9 px, or out of focus
-    haze: float = 0.1
-    grey: float = 0.15  # how often colours are taken away
-    noise: float = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,11 +50,10 @@ def cut_sample(
     picture: LabelledPicture,
     share: Share,
     classes: Sequence[str],
-    augmentation: Augmentation,
+    side: int,
     rng: np.random.Generator,
 ) -> TrainingSample:
-    """One random crop of a picture (H, W, 3) with what is labelled in it."""
-    side = augmentation.side_px
+    """One random crop of a picture (H, W, 3), `side` px wide and high, with what is labelled in it."""
     own = share.labelled.classes
     rename = np.array([classes.index(name) if name in classes else -1 for name in own], np.int64)
     labels = rename[picture.labels] if len(picture.labels) else np.zeros(0, np.int64)
@@ -81,9 +75,7 @@ def cut_sample(
         centre[axis] = np.clip(
             centre[axis], min(reach, length / 2), max(length - reach, length / 2)
         )
-    angle = 0.0
-    if augmentation.turns:
-        angle = rng.uniform(0, 2 * np.pi) if rng.random() < 0.35 else rng.integers(4) * np.pi / 2
+    angle = rng.uniform(0, 2 * np.pi) if rng.random() < _TURNED else rng.integers(4) * np.pi / 2
     mirror = 1.0 if rng.random() < 0.5 else -1.0
     c, s = scale * np.cos(angle), scale * np.sin(angle)
     turn = np.array([[c * mirror, -s], [s * mirror, c]])
@@ -101,7 +93,6 @@ def cut_sample(
     ignored = np.vstack([ignored[in_sight > 0], spoilt])
     boxes, labels = boxes[keep], labels[keep]
     known = np.array([name not in share.labelled.unlabelled for name in classes])
-    out = _weathered(out, augmentation, rng, thermal=share.thermal)
     return TrainingSample(out, boxes, labels, ignored, known)
 
 
@@ -143,9 +134,7 @@ def boxes_in_crop(boxes: Floats, crop_from_picture: Matrix3, side: int) -> tuple
     return cut, sides.prod(1) / np.maximum((2 * half).prod(1), 1e-6)
 
 
-def _weathered(
-    image: ImageRGB, how: Augmentation, rng: np.random.Generator, *, thermal: bool
-) -> ImageRGB:
+def _weathered(image: ImageRGB, rng: np.random.Generator, *, thermal: bool) -> ImageRGB:
     """Light, colour, polarity, blur, haze and noise."""
     x = image.astype(np.float32)
     if thermal:
@@ -153,13 +142,13 @@ def _weathered(
             x = 255 - x  # black hot
     else:
         x *= rng.uniform(0.85, 1.18, 3).astype(np.float32) ** (rng.random() < 0.5)
-        if rng.random() < how.grey:
+        if rng.random() < _GREY:
             x[:] = x.mean(2, keepdims=True)
     x = (x - x.mean()) * rng.uniform(0.6, 1.35) + x.mean() + rng.uniform(-35, 35)
-    if rng.random() < how.haze:
+    if rng.random() < _HAZE:
         share = rng.uniform(0.1, 0.5)
         x = x * (1 - share) + share * rng.uniform(160, 240)
-    if rng.random() < how.blur:
+    if rng.random() < _BLUR:
         if rng.random() < 0.5:
             length = int(rng.integers(3, 10))
             kernel = np.zeros((length, length), np.float32)
@@ -171,7 +160,7 @@ def _weathered(
             x = np.asarray(cv2.filter2D(x, -1, kernel / max(float(kernel.sum()), 1e-3)), np.float32)
         else:
             x = np.asarray(cv2.GaussianBlur(x, (0, 0), rng.uniform(0.4, 1.3)), np.float32)
-    if rng.random() < how.noise:
+    if rng.random() < _NOISE:
         x = x + rng.normal(0, rng.uniform(2, 10), x.shape).astype(np.float32)
     return np.clip(x, 0, 255).astype(np.uint8)
 
@@ -211,8 +200,8 @@ def batches_from(
     shares: Sequence[Share],
     classes: Sequence[str],
     read: Callable[[str], ImageRGB],
-    augmentation: Augmentation,
     *,
+    side: int,
     seed: int,
     batch: int,
     start: int = 0,
@@ -229,7 +218,8 @@ def batches_from(
         share = shares[draw.share]
         picture, image = _readable(share, draw.picture, read)
         rng = np.random.default_rng((seed, 1, draw.number))
-        return cut_sample(image, picture, share, classes, augmentation, rng)
+        sample = cut_sample(image, picture, share, classes, side, rng)
+        return replace(sample, image=_weathered(sample.image, rng, thermal=share.thermal))
 
     executor = ThreadPoolExecutor(threads)
     waiting: deque[Future[TrainingSample]] = deque()

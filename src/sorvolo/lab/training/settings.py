@@ -11,20 +11,18 @@ class TrainSettings:
     """How the detector is trained (`sorvolo train`)."""
 
     preset: Literal["fast", "thesis"] = "fast"
-    rpn: Literal["standard", "extended", "extended-residual"] = "extended-residual"
-    schedule: Literal["joint", "four-steps"] = "joint"
-    weights: str = "auto"  # ImageNet's of the backbone (auto, or a file), none, or a model to tune: its name or file
+    rpn: Literal["standard", "extended"] = "extended"  # of the preset thesis alone
+    weights: str = "auto"  # fast: a model to tune, its name or file, auto the packaged one; thesis: ImageNet's; none
     steps: int = 8000  # batches
-    batch: int = 4  # samples a step
-    side_px: int = 416  # of the square samples
+    batch: int = 8  # samples a step
+    side_px: int = 384  # of the square samples
     seed: int = 1
     patience: int = 8  # checks without a better AP50 before it stops; 0 never does
 
     def __post_init__(self) -> None:
         choices = (
             ("preset", self.preset, ("fast", "thesis")),
-            ("rpn", self.rpn, ("standard", "extended", "extended-residual")),
-            ("schedule", self.schedule, ("joint", "four-steps")),
+            ("rpn", self.rpn, ("standard", "extended")),
         )
         for name, value, known in choices:
             if value not in known:
@@ -38,11 +36,9 @@ class TrainSettings:
         ):
             if not low <= number <= high:
                 raise SettingsError(f"{name} must lie in {low} to {high}, got {number}")
-        if self.schedule == "four-steps" and self.steps < 4:
+        if self.preset == "thesis" and self.steps < 4:
             raise SettingsError(
-                f"the four-step schedule needs at least 4 steps, one of each kind; got {self.steps}"
+                f"the preset thesis needs at least 4 steps, one of each kind; got {self.steps}"
             )
-        if self.preset == "thesis" and self.rpn == "extended-residual":
-            raise SettingsError("the preset thesis has the rpn standard or extended")
         if self.side_px % 32:
             raise SettingsError(f"side_px must be a multiple of 32, got {self.side_px}")
