@@ -10,7 +10,8 @@ import pytest
 torch = pytest.importorskip("torch")
 
 import onnxruntime
-from hypothesis import given, settings
+from hypothesis import given
+from hypothesis import settings as examples
 from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
@@ -37,6 +38,8 @@ from sorvolo.lab.training.learning import Answer
 from sorvolo.lab.training.onnx_export import check_export, export_onnx
 from sorvolo.lab.training.progress import History, checkpoint_bytes, read_checkpoint, restore
 from sorvolo.lab.training.samples import TrainingSample
+from sorvolo.lab.training.settings import TrainSettings
+from sorvolo.lab.training.start import load_start, start_learner
 
 torch.set_num_threads(1)
 
@@ -137,6 +140,13 @@ def test_the_second_step_begins_from_the_first_weights_and_the_first_steps_propo
         assert torch.equal(value, first["backbone"][name])
 
 
+def test_the_preset_thesis_learns_in_four_steps() -> None:
+    settings = TrainSettings("thesis", "standard", weights="none", steps=4)
+    learner = start_learner(settings, ("person", "car"), load_start(settings), "cpu")
+    assert isinstance(learner, FourStepTraining) and learner.phase == "1/4 proposals"
+    assert all(each.requires_grad for each in learner.model.parameters())
+
+
 @pytest.mark.parametrize("is_small", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_the_exported_file_finds_the_same(is_small: bool) -> None:
     torch.manual_seed(1)
@@ -160,7 +170,7 @@ _BOX = st.tuples(st.floats(0, 80), st.floats(0, 80), st.floats(1, 60), st.floats
 )
 
 
-@settings(max_examples=50, deadline=None)
+@examples(max_examples=50, deadline=None)
 @given(st.lists(_BOX, min_size=1, max_size=6), st.lists(_BOX, min_size=1, max_size=6))
 def test_offsets_lead_back_to_their_boxes(
     boxes: list[tuple[float, ...]], anchors: list[tuple[float, ...]]

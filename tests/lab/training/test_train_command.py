@@ -104,17 +104,6 @@ def test_the_command_learns_and_writes_a_model_that_runs(data: Path, tmp_path: P
     assert len(detector.detect(picture, least_score=0.02))
 
 
-@pytest.mark.long
-def test_the_thesis_network_is_trained_in_four_steps(data: Path, tmp_path: Path) -> None:
-    settings = _settings(preset="thesis", rpn="standard", steps=4)
-    updates = list(_train(data, tmp_path / "out", settings))
-    phases = [each.words[:3] for each in updates if each.losses is not None]
-    assert phases == ["1/4", "2/4", "3/4", "4/4"]
-    report = json.loads((tmp_path / "out" / "training.json").read_text())
-    assert report["held_out"] is not None and report["export"]["unmatched"] == 0
-    assert Detector.load(tmp_path / "out" / "model.onnx").info.preset == "thesis"
-
-
 @pytest.mark.long  # the same of a checkpoint alone is tested beside it
 def test_a_run_that_was_stopped_ends_as_one_that_was_not(data: Path, tmp_path: Path) -> None:
     settings = _settings()

@@ -207,7 +207,7 @@ def test_models_that_do_not_fit_are_reported(
     assert "cannot be learnt on from: it holds another network than the preset fast" in printed
     assert "is missing; give a model that this version" in printed
     assert "for the preset thesis --weights takes auto, none" in words(
-        "--weights", str(learnt), "--preset", "thesis"
+        "--weights", str(learnt), "--preset", "thesis", "--steps", "4"
     )
     assert "is in int8 and cannot be learnt on from; give the float32 model" in words(
         "--weights", "default-int8"
