@@ -228,21 +228,6 @@ def test_a_card_s_measurements_are_a_table(
     assert "{" not in printed and "AP50 %" in printed and "pictures held out," not in printed
     row = next(line.split() for line in printed.splitlines() if "sea side" in line)
     assert row == ["sea", "side", "person", "1387", "62.2", "(40.0-77.0)", "26.4"]
-    (folder / "coast.json").write_text(json.dumps(card | {"measured_by": "version 2"}))
-    assert cli.main(["models", "show", "coast"]) == 0
-    printed = capsys.readouterr().out
-    assert "measured on pictures held out, by version 2" in printed and "measured by" not in printed
-
-
-def test_the_packaged_model_states_which_version_was_measured(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert cli.main(["models", "show", "default"]) == 0
-    words = " ".join(capsys.readouterr().out.split())
-    assert (
-        "held out, by version 12, whose networks are the same, of candidates from a score of 0.02 on"
-        in words
-    )
 
 
 def test_what_is_no_model_is_reported_as_what_it_is(

@@ -206,7 +206,7 @@ def test_a_session_that_rests_gives_memory_back_and_sees_as_before(tmp_path: Pat
 def _rested() -> tuple[float, float, bool]:
     """Memory after a look and after a rest, and whether the next look shows the same."""
     session = Session(find_model("default"), "cpu", 1)
-    picture = np.random.default_rng(5).integers(0, 255, (480, 640, 3), np.uint8)
+    picture = np.random.default_rng(5).integers(0, 255, (960, 1280, 3), np.uint8)
     before = session.see(picture)
     full_mb = _resident_mb()
     session.rest()

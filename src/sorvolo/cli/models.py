@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 models_app = typer.Typer(no_args_is_help=True)
 
-_MEASURED, _MEASURED_BY = "measured", "measured_by"
+_MEASURED = "measured"
 """In a card: {set: {class: {labels, AP50, AP}}}, each share with value, low and high; by which version and how, where
 that is not this one."""
 
@@ -113,11 +113,11 @@ def show(
         rows.append((escape(each), words))
     rows.append(("scores", _meaning(info)))
     for key, value in card.items():
-        if key not in facts and key not in (_MEASURED, _MEASURED_BY):
+        if key not in facts and key != _MEASURED:
             rows.append((escape(key.replace("_", " ")), escape(_in_words(value))))
     console = Console()
     console.print(facts_table(escape(info.name), rows))
-    if measured := _measured(card.get(_MEASURED), str(card.get(_MEASURED_BY, ""))):
+    if measured := _measured(card.get(_MEASURED)):
         console.print(measured)
 
 
@@ -211,9 +211,9 @@ def _in_words(value: Any) -> str:
     return str(value)
 
 
-def _measured(sets: Any, by: str) -> Table | None:
+def _measured(sets: Any) -> Table | None:
     """The card's measurements, a row for each class of each set; None where it has none of the usual form."""
-    title = f"measured on pictures held out{f', by {escape(by)}' if by else ''}"
+    title = "measured on pictures held out"
     numbers = "labels", "AP50 %", "AP %"
     table = new_table("set", "class", *numbers, right=numbers, title=title)
     for name, classes in sets.items() if isinstance(sets, Mapping) else ():
