@@ -70,7 +70,15 @@ def anchors(page: Path) -> set[str]:
 @pytest.mark.parametrize("page", USERS, ids=name_of)
 def test_commands_and_options_of_a_page_exist(page: Path) -> None:
     commands = commands_by_name()
-    own = {"--config", "--debug", "--quiet", "--verbose", "--version", "--help", "--install-completion"}
+    own = {
+        "--config",
+        "--debug",
+        "--quiet",
+        "--verbose",
+        "--version",
+        "--help",
+        "--install-completion",
+    }
     known = {option for command in commands.values() for option in options_of(command)}
     known |= own | options_of_other_programs()
     wrong = []
