@@ -426,7 +426,7 @@ def test_files_that_a_commit_still_owed_are_written_by_the_next_opening(folder: 
         ((archive.folder / "preview.png") / "in the way").mkdir(
             parents=True
         )  # as good as a kill: the commit stops here
-        with pytest.raises(OSError, match=r"preview\.png"):
+        with pytest.raises(StoreError, match=r"preview\.png"):
             map_flight(archive, "b", 40, count=3)
         assert [flight.id for flight in archive.flights()] == ["a", "b"]
     (folder / "preview.png" / "in the way").rmdir()

@@ -360,7 +360,7 @@ def test_files_that_a_commit_still_owed_are_written_by_the_next_opening(folder: 
         parents=True
     )  # as good as a kill: the commit stops here
     with Archive.open(folder, write=True) as archive:
-        with pytest.raises(OSError, match=r"changes\.geojson"):
+        with pytest.raises(StoreError, match=r"changes\.geojson"):
             compare(archive, "b", [fake_change(1)])
         assert [each.id for each in archive.changes()] == ["b-1"]
     (folder / "flights/b/changes.geojson/in the way").rmdir()

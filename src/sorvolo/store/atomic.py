@@ -15,7 +15,6 @@ TEMPORARY_PREFIX = ".tmp-"
 """Whatever a killed process left behind starts with this; `remove_leftovers` deletes it."""
 
 _FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS}
-_NO_PLACE = {errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG}
 
 
 @contextmanager
@@ -89,7 +88,7 @@ def writing(path: Path) -> Iterator[None]:
                 f"disk full: could not write {path} ({error.strerror}); free some space and run it again"
             ) from error
         is_ours = TEMPORARY_PREFIX in str(error.filename)  # a name that nobody gave
-        if is_ours or error.errno in _FORBIDDEN | _NO_PLACE:
+        if is_ours or error.errno in _FORBIDDEN:
             raise StoreError(
                 f"cannot write {path} ({error.strerror}); choose a folder that you may write to"
             ) from error
