@@ -208,7 +208,7 @@ def test_telemetry_of_another_path_at_the_same_time(
     telemetry = tmp_path / "reversed.nmea"
     telemetry.write_text(_nmea(filmed, reverse))
     camera = ("--camera", filmed / "camera.xml")
-    alone = mapped(tmp_path / "alone", film, "--telemetry", telemetry, *camera)
+    alone = mapped(tmp_path / "alone", film, "--telemetry", telemetry, *camera, code=3)
     assert any("telemetry of this flight" in words for words in alone["warnings"])
     right = mapped(tmp_path / "site", film, *camera)
     assert not right["warnings"]
