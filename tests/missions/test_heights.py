@@ -2,15 +2,18 @@
 
 import json
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import copclib
 import numpy as np
 import pytest
 import rasterio
 import rasterio.windows
 from fake_changes import fake_change
+from pyproj import CRS
 
 from real_data import real_data
 from small_flights import simulate_into
@@ -39,6 +42,7 @@ from sorvolo.missions.heights.run import make_heights
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.map.ground import shape_of
 from sorvolo.missions.search.prepare import heights_for
+from sorvolo.missions.site.history import export_version
 from sorvolo.mosaic.graph_report import GraphReport
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.files import HeightFile
@@ -245,6 +249,44 @@ def test_volumes_profiles_and_contours_are_measured(
     )
     features = json.loads(out.read_text())["features"]
     assert features and all(each["properties"]["height_m"] % 0.125 == 0 for each in features)
+
+
+def test_heights_as_points_open_in_another_reader(with_heights: Path, tmp_path: Path) -> None:
+    """LAZ by `history --export`: its head by LAS 1.4's own table, its points by another decoder than wrote them."""
+    out, folder = tmp_path / "points.laz", next(with_heights.glob("flights/*/heights.tif")).parent
+    assert main(["history", str(with_heights), "--export", str(out)]) == 0
+    data = out.read_bytes()
+    assert (data[:4], data[24:26], data[104] & 0x3F) == (b"LASF", b"\x01\x04", 7)
+    assert data[6] & 0x10, "the CRS is stated as WKT"
+    points = copclib.LazReader(str(out)).GetPoints()
+    with rasterio.open(folder / "heights.tif") as heights:
+        wkt = data[data.index(b"PROJCS") :].partition(b"\0")[0].decode()
+        assert CRS.from_wkt(wkt).to_epsg() == heights.crs.to_epsg()
+        places = np.column_stack([points.x, points.y])
+        up_m, sigma_m = np.array(list(heights.sample(places))).T
+        assert len(places) == np.isfinite(heights.read(1)).sum()
+    np.testing.assert_allclose(np.array(points.z), up_m, atol=0.001)
+    with rasterio.open(folder / "terrain.tif") as ground:
+        above_m = up_m - np.array([each[0] for each in ground.sample(places)])
+    classes = np.array(points.classification)
+    assert set(classes) == {1, 2} and above_m[classes == 1].min() > 0
+    assert np.array_equal(classes == 1, above_m > 2 * sigma_m)
+    with rasterio.open(with_heights / "mosaic.tif") as map_:
+        rgba = np.array(list(map_.sample(places)))
+    seen = rgba[:, 3] > 0
+    colours = np.column_stack([points.red, points.green, points.blue])
+    assert seen.mean() > 0.5 and (colours[seen] == rgba[seen, :3].astype(int) * 257).mean() > 0.99
+
+
+def test_points_need_heights_and_the_extra(
+    with_heights: Path, mapped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(InputError, match="sorvolo heights"):
+        export_version(mapped, None, tmp_path / "points.laz")
+    monkeypatch.setitem(sys.modules, "lazrs", None)
+    with pytest.raises(InputError, match=r"sorvolo\[laz\]"):
+        export_version(with_heights, None, tmp_path / "points.laz")
+    assert not list(tmp_path.iterdir())
 
 
 def test_measuring_names_what_is_missing(with_heights: Path, tmp_path: Path) -> None:

@@ -29,7 +29,9 @@ def history(
     ] = None,
     export: Annotated[
         Path | None,
-        typer.Option(help="Write the map as it was: FILE.tif, .png, .kmz, .mbtiles or .pdf."),
+        typer.Option(
+            help="Write the map as it was: FILE.tif, .png, .kmz, .mbtiles or .pdf; or its heights: .laz."
+        ),
     ] = None,
     coordinates: PlaceFormatOption = "latlon",
     as_json: AsJson = False,
@@ -45,7 +47,7 @@ def history(
 
     if at is not None and export is None:
         raise SettingsError(
-            "--at chooses the map to write: give --export FILE.tif (or .png, .kmz, .mbtiles, .pdf) as well"
+            "--at chooses the map to write: give --export FILE.tif (or .png, .kmz, .mbtiles, .pdf, .laz) as well"
         )
     with opened_site(site) as place:
         folder = str(place.folder)

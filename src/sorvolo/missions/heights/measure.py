@@ -2,15 +2,17 @@
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sorvolo.capture.areas import read_area
 from sorvolo.errors import InputError, NoHeightsError, SettingsError
 from sorvolo.geometry.coordinates import lonlat_from_text
-from sorvolo.heights.field import HeightField, along
+from sorvolo.heights.field import HeightField, along, standing
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.volumes import Tie, Volume, above_rim, between, contours, tie
 from sorvolo.missions.heights.run import height_grid, newest_flight, run_of
@@ -18,12 +20,14 @@ from sorvolo.paths import AnyPath
 from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.store.exports.places import longitude_latitude
 from sorvolo.store.exports.plain import feature, feature_collection, geojson_bytes
-from sorvolo.store.rasters.height_model import read_height_cog
+from sorvolo.store.rasters.height_model import PointCloud, read_height_cog
 from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.catalogue import VersionEntry
 from sorvolo.store.site.files import DamagedError, HeightFile
 from sorvolo.survey.flight import Site
 
 _MOST_BYTES = 16_000_000  # of heights.json, which has kilobytes; by choice
+_PART_CELLS = 1024  # a side of what a point cloud is written by: bounds the memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +115,38 @@ def write_contours(site: AnyPath, path: AnyPath, interval_m: float, *, flight: s
             Path(path), geojson_bytes(feature_collection("contours", features, is_local=False))
         )
         return len(features)
+
+
+def coloured_heights(archive: Archive, version: VersionEntry) -> Iterator[PointCloud]:
+    """The surface of a version's flight, part by part, each cell in the colour that the version has there.
+
+    Raises NoHeightsError without heights of the version's own mapping run.
+    """
+    flight_id = version.flight_id
+    surface, ground = (
+        read_field(archive, flight_id, name) for name in (HeightFile.SURFACE, HeightFile.GROUND)
+    )
+    if run_of(archive.keyframes(flight_id)) != str(version.run_id):
+        raise NoHeightsError(
+            f"version {version.id} is of an earlier map of flight {flight_id}, and its heights of the newest one: "
+            "choose a later version (sorvolo history lists them)"
+        )
+    lattice, colours = surface.lattice, archive.tiles(version.id)
+    grid, cells = archive.site_grid().grid, height_grid(archive.site(), lattice.cell_m).grid
+    stands, _ = standing(surface, ground)
+    for x0, y0, x1, y1 in lattice.windows(_PART_CELLS):
+        rows, columns = np.nonzero(np.isfinite(surface.up_m[y0:y1, x0:x1]))
+        at = rows + y0, columns + x0
+        places_m = cells.projected_from_grid(np.column_stack(at[::-1]) + np.array(lattice.first))
+        pixels = np.rint(grid.grid_from_projected(places_m)).astype(int)
+        tiles, which = np.unique(pixels // grid.tile_px, axis=0, return_inverse=True)
+        rgb = np.zeros((len(pixels), 3), np.uint8)
+        for number, (column, row) in enumerate(tiles.tolist()):
+            if (column, row) in colours:
+                x, y = (pixels[which == number] % grid.tile_px).T
+                rgb[which == number] = colours[column, row][y, x, :3]
+        places_m = np.column_stack([places_m, surface.up_m[at]])
+        yield PointCloud(places_m, surface.sigma_m[at], rgb, stands[at] == 0)
 
 
 def read_field(archive: Archive, flight_id: str, file: HeightFile) -> HeightField:

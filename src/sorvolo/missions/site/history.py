@@ -8,9 +8,11 @@ from pathlib import Path
 
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.findings.importance import between
+from sorvolo.missions.heights.measure import coloured_heights
 from sorvolo.store.exports.map_pictures import write_kmz, write_preview
 from sorvolo.store.exports.plain import moment_of
 from sorvolo.store.rasters.geotiff import write_cog, write_mbtiles_or_pdf
+from sorvolo.store.rasters.height_model import write_laz
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import VersionEntry
 from sorvolo.survey.findings import Verdict
@@ -21,7 +23,8 @@ _STEPS = {
     6: timedelta(seconds=1),
 }  # by digits of a time of day
 _FOR_TABLETS = (".mbtiles", ".pdf")
-_ON_EARTH = (".kmz", *_FOR_TABLETS)  # a map without a place cannot be these
+_HEIGHTS = ".laz"
+_ON_EARTH = (".kmz", *_FOR_TABLETS, _HEIGHTS)  # a map without a place cannot be these
 _ENDINGS = (".tif", ".tiff", ".png", *_ON_EARTH)
 
 
@@ -126,10 +129,10 @@ def export_version(
     site: Path, at: str | None, path: Path, *, compress: str = "deflate"
 ) -> VersionEntry:
     """Write the map as it was at a version or date (see `find_version`; None: now) to a .tif, .png, .kmz, .mbtiles or .pdf
-    file.
+    file, or the heights of its flight in the map's colours to a .laz file.
 
-    Returns the version. Raises SettingsError for another ending, InputError when there was no map or the file's
-    folder does not exist, StoreError on a full disk.
+    Returns the version. Raises SettingsError for another ending, InputError when there was no map, its flight has no
+    heights or the file's folder does not exist, StoreError on a full disk.
     """
     _check_target(path)
     with Archive.open(site, write=False) as archive:
@@ -145,7 +148,7 @@ def _check_target(path: Path) -> None:
     """Raises SettingsError or InputError where no map can be written to the path."""
     if path.suffix.lower() not in _ENDINGS:
         raise SettingsError(
-            f"{path.name}: the map is written as .tif, .png, .kmz, .mbtiles or .pdf; give a name with such an ending"
+            f"{path.name}: the map is written as .tif, .png, .kmz, .mbtiles or .pdf, its heights as .laz; give a name with such an ending"
         )
     if not path.resolve().parent.is_dir():
         raise InputError(
@@ -172,6 +175,9 @@ def _write_map(archive: Archive, version: VersionEntry, path: Path, compress: st
         write_kmz(tiles, archive.site_grid(), site.name, path)
     elif ending in _FOR_TABLETS:
         write_mbtiles_or_pdf(tiles, archive.site_grid(), site.name, path)
+    elif ending == _HEIGHTS:
+        cloud = coloured_heights(archive, version)
+        write_laz(cloud, archive.site_grid().grid, site.height_reference, path)
     else:
         write_cog(
             tiles, archive.site_grid(), path, crs=version.export_crs or None, compress=compress

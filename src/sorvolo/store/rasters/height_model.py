@@ -1,13 +1,14 @@
 """A height model of the ground: a GeoTIFF of heights, asked by place."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import rasterio
 import rasterio.shutil
+from numpy.typing import NDArray
 from pyproj import CRS
 from rasterio.enums import Resampling
 from rasterio.errors import CRSError, RasterioError
@@ -15,8 +16,9 @@ from rasterio.transform import Affine
 from rasterio.windows import Window
 from scipy.ndimage import map_coordinates
 
+from sorvolo.build import VERSION
 from sorvolo.errors import InputError, NoHeightsError, StoreError
-from sorvolo.geometry.arrays import Floats, Floats32
+from sorvolo.geometry.arrays import Floats, Floats32, Mask
 from sorvolo.geometry.crs import WGS84, transformer, vertical_name
 from sorvolo.geometry.grid import Grid
 from sorvolo.geometry.units import FOOT_M, SURVEY_FOOT_M
@@ -233,3 +235,52 @@ def read_height_cog(path: Path, grid: Grid) -> HeightBands:
         raise NoHeightsError(
             f"{path} is no readable GeoTIFF ({error}); run sorvolo heights again"
         ) from error
+
+
+_GROUND, _OTHER = 2, 1  # classes of LAS 1.4: the second is "unclassified"
+_LAZ_STEP_M = 0.001
+_WITH_COLOUR = 7  # the point format of LAS 1.4 without near infrared
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Points (N, 3) of easting, northing, height, m, with their sigma (N,), colour (N, 3), and whether they are ground."""
+
+    points_m: Floats
+    sigma_m: Floats32
+    rgb: NDArray[np.uint8]
+    is_ground: Mask
+
+
+def write_laz(parts: Iterable[PointCloud], grid: Grid, height_reference: str, path: Path) -> None:
+    """Write points in a grid's CRS as LAZ (LAS 1.4, point format 7): their CRS as WKT, sigma as a dimension of its own.
+
+    Raises InputError without the extra `laz`, StoreError on a full disk.
+    """
+    try:
+        import laspy
+        import lazrs
+    except ImportError as error:
+        raise InputError(
+            f"{path.name}: points are written with an extra: pip install 'sorvolo[laz]'; or use heights.tif"
+        ) from error
+    header = laspy.LasHeader(version="1.4", point_format=7)
+    header.add_extra_dim(laspy.ExtraBytesParams("sigma_m", "float32", "1 sigma of the height, m"))
+    wkt = CRS.from_user_input(grid.crs).to_wkt("WKT1_GDAL")  # LAS 1.4 asks for the first form
+    header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt))
+    header.vlrs.append(laspy.VLR("LASF_Spec", 3, "", f"heights: {height_reference}".encode()))
+    header.global_encoding.wkt = True
+    header.generating_software = f"sorvolo {VERSION}"
+    header.scales, header.offsets = np.full(3, _LAZ_STEP_M), np.rint([*grid.origin_m, 0])
+    try:
+        with atomic_path(path) as temporary, laspy.open(temporary, "w", header=header) as sink:
+            for part in parts:
+                points = laspy.ScaleAwarePointRecord.zeros(len(part.points_m), header=header)
+                points.x, points.y, points.z = part.points_m.T
+                points.red, points.green, points.blue = part.rgb.T * np.uint16(257)  # of 16 bits
+                points.classification = np.where(part.is_ground, _GROUND, _OTHER)
+                points.return_number[:] = points.number_of_returns[:] = 1
+                points["sigma_m"] = part.sigma_m
+                sink.write_points(points)
+    except lazrs.LazrsError as error:
+        raise StoreError(f"{path} could not be written ({error}); is the disk full?") from error
