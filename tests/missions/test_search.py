@@ -1,6 +1,7 @@
 """Searches through whole missions: a small flight mapped, things planted into its frames, what a map would report."""
 
 import json
+import re
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import rasterio
 from comparing_detector import Comparing
+from PIL import Image
 
 from sorvolo.capture.areas import read_segments
 from sorvolo.cli.main import main
@@ -265,7 +267,7 @@ def test_a_flight_is_searched_once(site: Path, tmp_path: Path) -> None:
 
 
 def test_plants_serve_another_search_of_the_same_frames_alone() -> None:
-    basis = Basis("1", "model", "frames", "", None, ("person", "car"), 80, 1, "")
+    basis = Basis("1", "model", "frames", "", None, ("person", "car"), 80, 1, "", "")
     assert basis.serves(replace(basis, plants=20, seed=4, area="field"))
     assert basis.serves(replace(basis, classes=("car",)))
     for other in (
@@ -426,3 +428,41 @@ def test_a_look_through_trees_ignores_no_option(
     words = ["search", str(tmp_path), "--through-trees", "--area", "area.kml", "--refly", "a.kml"]
     assert main(words) == 1
     assert capsys.readouterr().err.startswith("error: --area, --refly: --through-trees looks")
+
+
+def _cut_out(path: Path, length_px: int = 90) -> Path:
+    """A person in red, 30 px wide, on a ground that was made transparent."""
+    rgba = np.zeros((60, length_px + 30, 4), np.uint8)
+    rgba[15:45, 15:-15] = (200, 30, 30, 255)
+    Image.fromarray(rgba).save(path)
+    return path
+
+
+def test_a_crew_plants_people_of_its_own(site: Path, tmp_path: Path) -> None:
+    settings = SearchSettings(plants=12, classes=("person",), sun_deg=(215, 48))
+    outputs = {"plant": _cut_out(tmp_path / "ours.png"), "plant_cm": 2.0}
+    report = _report(site, tmp_path / "out", Comparing(site), settings, **outputs)
+    planted = report["flights"][0]["classes"]["person"]
+    assert report["cut_outs"] == ["ours.png"] and planted["found"] >= 0.6 * planted["planted"] > 0
+    assert any("plants are 1 picture of your own people" in each for each in report["warnings"])
+    again = _report(site, tmp_path / "out", Comparing(site), settings, **outputs)
+    assert again["flights"][0]["measured_before"]
+    drawn = _report(site, tmp_path / "out", Comparing(site), settings)
+    assert not drawn["flights"][0]["measured_before"] and drawn["cut_outs"] == []
+
+
+@pytest.mark.parametrize(
+    ("length_px", "cm", "words"),
+    [
+        (90, None, "a picture with transparency states no scale; give plant_cm"),
+        (400, 2.0, "what there is is 8.0 m long"),
+    ],
+)
+def test_a_cut_out_that_cannot_be_planted(
+    site: Path, tmp_path: Path, length_px: int, cm: float | None, words: str
+) -> None:
+    picture = _cut_out(tmp_path / "ours.png", length_px)
+    outputs = SearchOutputs(tmp_path / "out", plant=picture, plant_cm=cm)
+    with pytest.raises(InputError, match=re.escape(words)):
+        search_site(site, SearchSettings(), outputs, Comparing(site)).result()
+    assert not (tmp_path / "out").exists()

@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.geometry.arrays import ImageRGB, ImageRGBA
 
 PHOTO_SUFFIXES = frozenset(
     {".jpg", ".jpeg", ".jpe", ".tif", ".tiff", ".png", ".heic", ".heif", ".hif", ".dng"}
@@ -115,6 +115,21 @@ def decode_photo(data: bytes, name: str, reduction: int = 1) -> ImageRGB:
     except BROKEN_PICTURE as error:
         raise InputError(
             f"{name} is damaged or cut ({reason_in_words(error)}); copy it again"
+        ) from error
+
+
+def cut_out_picture(path: Path) -> ImageRGBA | None:
+    """A picture (H, W, 4) with transparency; None for one without. Raises InputError when it is damaged or too large."""
+    try:
+        with open_picture(path, path.name) as picture:
+            if "A" not in picture.getbands() and "transparency" not in picture.info:
+                return None
+            check_size(path.name, *picture.size, is_jpeg=False)
+            rgba = np.array(picture.convert("RGBA"))
+            return rgba if (rgba[..., 3] < 255).any() else None
+    except BROKEN_PICTURE as error:
+        raise InputError(
+            f"{path} is damaged or cut ({reason_in_words(error)}); copy it again"
         ) from error
 
 

@@ -52,6 +52,19 @@ Segments = Annotated[
 Plants = Annotated[
     int, typer.Option(help="People, and cars, to plant: more take longer and are surer.")
 ]
+Plant = Annotated[
+    list[Path] | None,
+    typer.Option(
+        help="Photos or a video of a person from straight above, or cut-outs with transparency, to plant in place of "
+        "drawn people. Can be repeated."
+    ),
+]
+PlantCm = Annotated[
+    float | None,
+    typer.Option(
+        help="Centimetres of ground that a pixel of --plant covers.", show_default="by its height"
+    ),
+]
 Enough = Annotated[float, typer.Option(help="Ground with a lower probability is a hole.")]
 ThroughTrees = Annotated[
     bool,
@@ -76,6 +89,8 @@ def search_command(
     model: Model = "default",
     classes: Classes = None,
     plants: Plants = 80,
+    plant: Plant = None,
+    plant_cm: PlantCm = None,
     enough: Enough = 0.5,
     through_trees: ThroughTrees = False,
     refly: Refly = None,
@@ -96,6 +111,8 @@ def search_command(
 
     Example: sorvolo search field --area search-area.kml --refly holes.kml
 
+    Example: sorvolo search field --plant our-volunteer/
+
     Example: sorvolo search forest --through-trees
 
     Example: sorvolo search DJI_0042.MP4 --site field --poa segments.geojson
@@ -115,6 +132,7 @@ def search_command(
             "--through-trees looks at one mapped flight; give the map's folder and one --flight"
         )
     measured = {"--area": area, "--poa": poa, "--refly": refly, "--classes": classes}
+    measured |= {"--plant": plant}
     if through_trees and (unused := [name for name, value in measured.items() if value]):
         raise SettingsError(
             f"{', '.join(unused)}: --through-trees looks below all that the flight saw, and measures nothing; leave it out"
@@ -128,6 +146,8 @@ def search_command(
             tuple(flight or ()),
             tuple(refly or ()),
             dji_drone,
+            tuple(plant or ()),
+            plant_cm,
         )
         if site:
             if flight:

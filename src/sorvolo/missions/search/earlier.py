@@ -44,8 +44,8 @@ _FORMAT = 1
 class Basis:
     """By what the plants of a flight were measured.
 
-    `program` (with the libraries that it runs on), `model`, `frames` (their cameras and places), `heights` and `area`
-    are hashes, "" for no heights and no area.
+    `program` (with the libraries that it runs on), `model`, `frames` (their cameras and places), `heights`, `area` and
+    `cut_outs` are hashes, "" for none.
     """
 
     program: str
@@ -57,6 +57,7 @@ class Basis:
     plants: int
     seed: int
     area: str
+    cut_outs: str
 
     @classmethod
     def of(
@@ -80,6 +81,7 @@ class Basis:
             settings.plants,
             settings.seed,
             area,
+            prepared.cut_outs_sha256,
         )
 
     @classmethod

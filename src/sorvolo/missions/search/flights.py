@@ -70,6 +70,7 @@ def search_site(
             {name: tuple(own) for name, own in frames.items()},
             prepared.segments,
             [name for name in frames if name not in looked],
+            prepared.cut_outs,
         )
         return write_search(
             searched, archive.tiles(), archive.site_grid(), settings, outputs, prepared.detector
@@ -93,7 +94,16 @@ def _measured(
         basis = Basis.of(own, prepared, settings, heights=mark)
         earlier = known[name][1] if name in known and known[name][0] == basis else None
         flight = yield from measure_flight(
-            name, own, cells, site, prepared.detector, settings, known_m, above, earlier
+            name,
+            own,
+            cells,
+            site,
+            prepared.detector,
+            settings,
+            known_m,
+            above,
+            earlier,
+            prepared.cut_outs,
         )
         measured.append(flight)
         if earlier is None:

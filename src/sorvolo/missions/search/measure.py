@@ -19,6 +19,7 @@ from sorvolo.missions.flight.setup import sun_over
 from sorvolo.missions.search.settings import SearchSettings
 from sorvolo.search.cells import Cells, cells_of
 from sorvolo.search.conditions import AboveGround, Conditions, FrameLook, gather, look_at
+from sorvolo.search.drawing.cut_outs import CutOut, CutThing
 from sorvolo.search.drawing.objects import Thing
 from sorvolo.search.drawing.planted import FrameLight, frame_light, new_plant, plant
 from sorvolo.search.outcomes import Outcomes, any_of, every_label, found_rows, near_any, rows_of
@@ -200,17 +201,20 @@ def measure_flight(
     keep_off_m: Sequence[Floats],
     above: AboveGround | None = None,
     before: SearchedPlants | None = None,
+    cut_outs: Sequence[CutOut] = (),
 ) -> Generator[SearchProgress, None, MeasuredFlight]:
     """Measure one flight over a site with metres, yielding progress.
 
     `keep_off_m` are places, (2,) each, of what stands on the map already: no plant is put beside it.
     `above` has how high things stand, where the flight has heights. With plants that were searched for `before` nothing
-    is planted, only the cells' conditions are looked at. Raises SettingsError as `planted_classes` does.
+    is planted, only the cells' conditions are looked at. `cut_outs` are planted in place of drawn people. Raises
+    SettingsError as `planted_classes` does, and for cut-outs of another light than the flight's.
     """
     wanted = planted_classes(detector, settings)
     sun, looks = sun_at(frames[len(frames) // 2], site, settings), FlightLooks(above)
     for frame in frames:
         looks.add(frame, sun)
+    own_cut_outs = _of_light(cut_outs, looks.lights[-1], name)
     seen = looks.of_cells(cells, wanted)
     searched = before
     if searched is None:
@@ -226,7 +230,9 @@ def measure_flight(
             rng=seeded(settings.seed),
             usable=usable,
         )
-        searched = yield from _searched(name, looks, rounds, sun, detector, wanted, settings)
+        searched = yield from _searched(
+            name, looks, rounds, sun, detector, wanted, settings, own_cut_outs
+        )
     return looks.measured(name, seen, searched, is_earlier=before is not None)
 
 
@@ -238,6 +244,7 @@ def _searched(
     detector: ObjectDetector,
     wanted: Sequence[str],
     settings: SearchSettings,
+    cut_outs: Sequence[CutOut],
 ) -> Generator[SearchProgress, None, SearchedPlants]:
     """Plant one round after the other into all frames that show some of it, and search these."""
     started_s, frames = time.monotonic(), flight.frames
@@ -245,7 +252,7 @@ def _searched(
     looked = 0
     for places in rounds:
         things = [
-            new_plant(len(gathered) + k, each.label, each.place_m, settings.seed)
+            _planted(len(gathered) + k, each, settings.seed, cut_outs)
             for k, each in enumerate(places)
         ]
         laid: list[LaidSighting] = []
@@ -275,6 +282,26 @@ def _searched(
         reported = reported_plants(laid, placed, boxes_px, labels, least)
         gathered += [(place, k in reported) for k, place in enumerate(places)]
     return SearchedPlants(looked, len(rounds), time.monotonic() - started_s, tuple(gathered))
+
+
+def _planted(number: int, place: PlantPlace, seed: int, cut_outs: Sequence[CutOut]) -> Thing:
+    """What stands at a place: one of the cut-outs, or something drawn."""
+    if cut_outs and place.label == PERSON:
+        return CutThing.new(number, place.place_m, cut_outs, seed)
+    return new_plant(number, place.label, place.place_m, seed)
+
+
+def _of_light(cut_outs: Sequence[CutOut], light: FrameLight, name: str) -> Sequence[CutOut]:
+    """The cut-outs that were taken in such light. Raises SettingsError where all are of another."""
+    own = [each for each in cut_outs if each.is_thermal == light.is_thermal]
+    if cut_outs and not own:
+        kinds = ("thermal", "in colour") if light.is_thermal else ("in colour", "thermal")
+        raise SettingsError(
+            "--plant: the pictures of {} are {}, all cut-outs are {}; cut them out of pictures by the same camera".format(
+                name, *kinds
+            )
+        )
+    return own
 
 
 def planted_classes(detector: ObjectDetector, settings: SearchSettings) -> tuple[str, ...]:
@@ -373,7 +400,7 @@ class GrowingMeasure:
     `add` takes one frame after another, `measured` gives what all of them state together. Plants stand in a field that
     was sown before anybody saw it (`PlantField`), so that all frames of a place show the same; a frame is planted on
     the place that it has when it is added, and its sightings are laid by that. What turns out to be under trees or
-    roofs does not count as planted. `keep_off_m` and `above` as `measure_flight` takes them. A flight that climbs shows
+    roofs does not count as planted. `keep_off_m`, `above` and `cut_outs` as `measure_flight` takes them. A flight that climbs shows
     too many plants at once: a wider field is sown then, and what was measured from below is forgotten.
     """
 
@@ -387,7 +414,9 @@ class GrowingMeasure:
         area_m: Sequence[Sequence[PointsM]] | None,
         keep_off_m: Sequence[Floats],
         above: AboveGround | None,
+        cut_outs: Sequence[CutOut] = (),
     ) -> None:
+        self._cut_outs = cut_outs
         self._name, self._site, self._detector, self._settings = name, site, detector, settings
         self._area_m, self._keep_off_m = area_m, keep_off_m
         self._wanted = planted_classes(detector, settings)
@@ -422,6 +451,7 @@ class GrowingMeasure:
         sun = sun_at(frame, self._site, self._settings)
         image = self._looks.add(frame, sun)
         light = self._looks.lights[-1]
+        self._cut_outs = _of_light(self._cut_outs, light, self._name)
         numbers = self._field.near(outline_m, _REACH_M)
         self._grow(self._field)
         things = [self._things[each] for each in numbers]
@@ -486,5 +516,6 @@ class GrowingMeasure:
     def _grow(self, field: PlantField) -> None:
         """Make the things that stand at the field's new places."""
         for number in range(len(self._things), len(field.places)):
-            place = field.places[number]
-            self._things.append(new_plant(number, place.label, place.place_m, self._settings.seed))
+            self._things.append(
+                _planted(number, field.places[number], self._settings.seed, self._cut_outs)
+            )

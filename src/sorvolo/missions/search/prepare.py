@@ -1,11 +1,15 @@
 """What a search needs before it is measured: read, checked, and refused before it takes any time."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from sorvolo.capture.areas import read_area, read_segments
+from sorvolo.capture.decoding import PHOTO_SUFFIXES, cut_out_picture
+from sorvolo.capture.source import Source, open_sources
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import Floats
 from sorvolo.geometry.homography import pose_from_homography
@@ -13,10 +17,16 @@ from sorvolo.geometry.level_ground import footprint, is_on_ground
 from sorvolo.heights.field import above_ground
 from sorvolo.missions.flight.detector_protocol import FindsObjects, ObjectDetector
 from sorvolo.missions.flight.map_objects import open_detector, why_not_searched
+from sorvolo.missions.flight.sample_frames import sample_frames
+from sorvolo.missions.flight.settings import MapSettings
+from sorvolo.missions.flight.setup import prepare
 from sorvolo.missions.heights.measure import flight_with_heights, read_field
 from sorvolo.missions.search.measure import SearchFrame, planted_classes
 from sorvolo.missions.search.settings import RESULTS, SearchOutputs, SearchSettings
+from sorvolo.registration.lens import at_most
 from sorvolo.search.conditions import AboveGround
+from sorvolo.search.drawing.cut_outs import FEWEST_PICTURES, CutOut, alphas_by_difference
+from sorvolo.search.drawing.planted import frame_light
 from sorvolo.store.atomic import scratch_folder, writing
 from sorvolo.store.exports.waypoints import check_waypoint_files
 from sorvolo.store.site.archive import Archive
@@ -113,17 +123,26 @@ def _placed(stored: StoredKeyframe) -> PlacedFrame | None:
     )
 
 
+_SERIES = 9  # pictures of a person to be cut out by difference: by choice
+_FINEST_M = 0.005  # of a cut-out's pixel: frames of a search are coarser
 _FARTHEST_M = 20_000.0  # of an area from its site: no small drone flies so far
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedSearch:
     """What a search needs beside a site, read and checked: the area, the segments with their probabilities, a
-    detector."""
+    detector, people to be planted."""
 
     area: Area | None
     segments: Sequence[tuple[str, Area, float]]
     detector: ObjectDetector
+    cut_outs: tuple[CutOut, ...] = ()
+
+    @property
+    def cut_outs_sha256(self) -> str:
+        """A hash of the people to be planted; "" without any."""
+        kept = [(each.m_per_px, each.texture.tolist()) for each in self.cut_outs]
+        return content_sha256(kept) if kept else ""
 
 
 def check_area(area: Area | None, site: Site) -> None:
@@ -157,7 +176,7 @@ def prepare_search(
     """Read and check all that a search needs beside a site, before it takes any time.
 
     Beside an `is_live` flight's map the detector runs at low priority.
-    Raises InputError for a broken area or file of segments and for a model that is not there, SettingsError for classes
+    Raises InputError for a broken area or file of segments, for pictures out of which nobody can be cut, and for a model that is not there, SettingsError for classes
     that cannot be measured, for a folder that is a file, and for a file of waypoints that cannot be one, StoreError for
     a folder that cannot be written.
     """
@@ -172,7 +191,65 @@ def prepare_search(
     if looks is None:
         raise InputError(f"nothing to measure: {why_not_searched(settings.model)}")
     planted_classes(looks, settings)
-    return PreparedSearch(area, segments, looks)
+    cut_outs = tuple(each for path in outputs.plant for each in _cut_outs(path, outputs.plant_cm))
+    return PreparedSearch(area, segments, looks, cut_outs)
+
+
+def _cut_outs(path: Path, given_cm: float | None) -> Iterator[CutOut]:
+    """The people that pictures show from straight above: by their transparency, else by what differs from picture to
+    picture. Raises InputError where there are none, or nothing states their scale."""
+    if not path.exists():
+        raise InputError(f"--plant {path}: there is no such file or folder")
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    masked = [
+        (each, rgba)
+        for each in files
+        if each.suffix.lower() in PHOTO_SUFFIXES and (rgba := cut_out_picture(each)) is not None
+    ]
+    found: list[CutOut | None] = []
+    how = "the person has to be opaque, all else transparent"
+    m_per_px = None if given_cm is None else given_cm / 100
+    for file, rgba in masked:
+        if m_per_px is None:
+            raise InputError(
+                f"--plant {file}: a picture with transparency states no scale; give --plant-cm, the centimetres of "
+                "ground that a pixel covers"
+            )
+        found.append(CutOut.of(file.name, rgba[..., :3], rgba[..., 3] / 255, m_per_px, None))
+    if not masked:
+        how = (
+            "an uncovered ground has to be seen in most pictures: hover, look straight down, let the person lie down in "
+            f"{FEWEST_PICTURES} places or more"
+        )
+        for source in open_sources([path]):
+            found += _by_difference(source, m_per_px)
+    people = [each for each in found if each is not None and each.is_of_a_size]
+    if not people:
+        sizes = ", ".join(f"{max(each.size_m):.1f} m" for each in found if each is not None)
+        raise InputError(
+            f"--plant {path}: nobody could be cut out of it{f' (what there is is {sizes} long)' * bool(sizes)}; {how}"
+        )
+    yield from people
+
+
+def _by_difference(source: Source, m_per_px: float | None) -> list[CutOut | None]:
+    if m_per_px is None:
+        height_m = prepare(source, MapSettings(), None, telemetry_named=False).usual_height_m
+        m_per_px = height_m / source.camera.camera.fx_px
+    if not np.isfinite(m_per_px):
+        raise InputError(
+            f"--plant: nothing states how high {source.name} was taken; give --plant-cm, the centimetres of ground that "
+            "a pixel covers"
+        )
+    frames = sample_frames(source, _SERIES)
+    times = max(1.0, _FINEST_M / m_per_px)
+    images = [at_most(each.image, round(max(each.image.shape) / times)) for each in frames]
+    lights = [frame_light(each) for each in images]
+    alphas = alphas_by_difference(images, m_per_px * times)
+    return [
+        CutOut.of(frame.name, image, alpha, m_per_px * times, light)
+        for frame, image, alpha, light in zip(frames, images, alphas, lights)
+    ]
 
 
 def _check_writable(folder: Path) -> None:

@@ -17,6 +17,7 @@ from sorvolo.missions.plan_flight import REFLY_LEAST_M2, REFLY_LOWEST_M, REFLY_M
 from sorvolo.missions.search.measure import MeasuredClass, MeasuredFlight, SearchFrame
 from sorvolo.missions.search.settings import FIGURES, SearchOutputs, SearchSettings
 from sorvolo.search.cells import Cells
+from sorvolo.search.drawing.cut_outs import CutOut
 from sorvolo.search.holes import (
     POD_EDGES,
     REASONS,
@@ -94,6 +95,7 @@ class Searched:
     frames: Mapping[str, tuple[SearchFrame, ...]]
     segments: Sequence[tuple[str, Area, float]]
     unlooked: Sequence[str] = ()
+    cut_outs: tuple[CutOut, ...] = ()
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -215,6 +217,7 @@ def build_search_report(
         "flights": [_flight_row(each) for each in searched.flights],
         "segments": _segment_rows(searched, first),
         "refly": None if refly is None else asdict(refly),
+        "cut_outs": [each.name for each in searched.cut_outs],
         "notices": [asdict(each) for each in detector.notices],
         "warnings": [*warnings, *_warnings(searched, settings, is_over=so_far is None)],
     }
@@ -347,7 +350,14 @@ def _warnings(searched: Searched, settings: SearchSettings, *, is_over: bool) ->
         warnings.append(
             "ground under trees counts as not found at all; --through-trees looks below them"
         )
-    if "person" in searched.labels:
+    if "person" in searched.labels and searched.cut_outs:
+        gsd_m = searched.height_m / searched.camera.fx_px
+        coarse = sum(each.m_per_px > 1.2 * gsd_m for each in searched.cut_outs)
+        warnings.append(
+            f"plants are {counted(len(searched.cut_outs), 'picture')} of your own people: the probability is of such who "
+            f"dress and lie so{'; ' + str(coarse) + ' of the pictures are coarser than the flight, so that it is too low' * bool(coarse)}"
+        )
+    elif "person" in searched.labels:
         warnings.append(
             "plants are drawn people, and the detector finds drawn and real people differently well: compare the "
             "probability between places and flights rather than taking it at its word (docs/search.md)"

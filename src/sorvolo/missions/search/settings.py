@@ -54,7 +54,8 @@ class SearchOutputs:
 
     `area` is what was to be searched (None: what the frames show and enclose), `poa` a file of segments with the
     probability that the missing is in each, `flights` those that are measured (none: all of the site's), `refly` files
-    for waypoints over the holes; a .kmz is for `dji_drone`.
+    for waypoints over the holes; a .kmz is for `dji_drone`. `plant` are pictures of people from straight above, who are
+    planted in place of drawn ones (`search.drawing.cut_outs`); a pixel of them covers `plant_cm` (None: by their height).
     """
 
     folder: Path
@@ -63,8 +64,17 @@ class SearchOutputs:
     flights: tuple[str, ...] = ()
     refly: tuple[Path, ...] = ()
     dji_drone: str = "fly"
+    plant: tuple[Path, ...] = ()
+    plant_cm: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("folder", "area", "poa"):
             object.__setattr__(self, name, as_path(getattr(self, name)))
-        object.__setattr__(self, "refly", tuple(Path(each) for each in listed(self.refly)))
+        for name in ("refly", "plant"):
+            object.__setattr__(
+                self, name, tuple(Path(each) for each in listed(getattr(self, name)))
+            )
+        if self.plant_cm is not None and not 0.02 <= self.plant_cm <= 20:
+            raise SettingsError(
+                f"--plant-cm must lie in 0.02 to 20 (a pixel of the cut-outs), got {self.plant_cm}"
+            )

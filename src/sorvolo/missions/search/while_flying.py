@@ -181,6 +181,7 @@ class SearchWhileFlying:
             area_m=None if area is None else area.polygons_m(site.frame),
             keep_off_m=known_places(archive),
             above=heights_for(archive, flight_id),
+            cut_outs=self._prepared.cut_outs,
         )
         earlier = EarlierFlights(archive, flight_id, self._prepared, self._settings, self._outputs)
         unwritten, again_s = 0, time.monotonic() + self._pace.again_s
@@ -241,6 +242,7 @@ class SearchWhileFlying:
             (*earlier.on(cells), flight),
             {**earlier.frames, flight.name: tuple(measure.frames)},
             self._prepared.segments,
+            cut_outs=self._prepared.cut_outs,
         )
 
         def show(so_far: SoFar) -> None:

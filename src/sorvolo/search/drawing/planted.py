@@ -11,6 +11,7 @@ from sorvolo.geometry.arrays import BoxesPx, Floats, ImageRGB, ImageRGBA, Vector
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.pose import Pose
 from sorvolo.search.drawing.bodies import build_body
+from sorvolo.search.drawing.cut_outs import CutThing
 from sorvolo.search.drawing.objects import (
     GROUND_LEVEL,
     POSES,
@@ -259,7 +260,12 @@ def _looks(
     has_sun = sun is not None and float(sun[2]) > _LEAST_SUN and not light.is_thermal
     towards = sun if has_sun and sun is not None else _OVERHEAD
     sunlight = Light(towards, 1.0 - 0.58 * light.shadow if has_sun else 1.0)
-    body = build_body(thing, sunlight, m_per_px)
+    if isinstance(thing, CutThing):
+        body = thing.body(m_per_px)
+        if light.is_thermal:
+            return body, None
+    else:
+        body = build_body(thing, sunlight, m_per_px)
     if light.is_thermal:
         return warm_body(thing, body, np.random.default_rng([thing.seed, 3])), None
     if not has_sun or light.shadow <= 0.05:
