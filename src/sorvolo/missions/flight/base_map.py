@@ -113,6 +113,7 @@ class FlightBase:
         left_out, residual_m = tie_to_base(
             mapper, found, camera, self.base.m_per_px, is_datum=self.is_datum
         )
+        self._native_m(mapper, camera)  # without GPS its scale was a guess before
         return BaseReport(
             self.base.path.name,
             self.base.m_per_px,
