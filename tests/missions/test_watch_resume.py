@@ -119,6 +119,8 @@ def test_it_goes_on_and_notifies_nobody_twice(
     assert found == ids(alerts, len(found)) and 1 <= len(reported) < len(found)
     shutil.move(whole, tmp_path / "first")
     shutil.move(amid, whole)
+    for name in ("", "annotated", "objects"):  # what was being written
+        (whole / name / ".tmp-1-picture.jpg").write_bytes(b"half")
     alerts.unlink()
     detector.asked = 0
     monkeypatch.setattr(

@@ -104,7 +104,7 @@ def claimed_folder(
                 if cut_off.is_file():
                     numbers = (folder / f"annotated-{number}.mp4" for number in range(1, 10_000))
                     cut_off.rename(next(each for each in numbers if not each.exists()))
-            remove_leftovers([folder])
+            remove_leftovers([folder, *(folder / name for name in _OURS)])  # only folders hold any
             for name in () if goes_on else _OURS:
                 if (folder / name).is_dir():
                     shutil.rmtree(folder / name)
