@@ -4,11 +4,14 @@ import sqlite3
 import struct
 import tempfile
 from pathlib import Path
-from xml.etree.ElementTree import fromstring
+from xml.etree.ElementTree import canonicalize, fromstring, tostring
 
 import pytest
+import rasterio
 import shapely
+from pyogrio import read_dataframe
 from pyproj import CRS
+from rasterio.enums import ColorInterp
 from starlette.testclient import TestClient
 
 from sorvolo.store.exports.geopackage import write_geopackage
@@ -65,6 +68,57 @@ def test_geopackage_holds_what_the_map_shows(client: TestClient, tmp_path: Path)
     categories = {each.get("value"): each.get("symbol") for each in renderer.iter("category")}
     drawn = {each.get("name") for each in renderer.iter("symbol")}
     assert {row[1] for row in rows} <= set(categories) and set(categories.values()) == drawn
+
+
+def test_the_qgis_project_finds_what_lies_beside_it(client: TestClient, tmp_path: Path) -> None:
+    """Saved as the station names them, GDAL opens all that the project names; styles are those of the GeoPackage.
+
+    QGIS itself is not tried: the elements are those that its QgsProject and QgsMapLayer read.
+    """
+    listed = {each["id"] for each in client.get(URL).json()}
+    for each in ("site.qgs", "site.gpkg", "mosaic.tif"):
+        assert each in listed
+        answer = client.get(f"{URL}/{each}")
+        name = answer.headers["content-disposition"].rpartition("''")[2]
+        (tmp_path / name).write_bytes(answer.content)
+    (path,) = tmp_path.glob("*.qgs")
+    project = fromstring(path.read_bytes())
+    assert project.tag == "qgis" and project.get("version", "").startswith("3.")
+    assert project.findtext("properties/Paths/Absolute") == "false"
+    layers = {each.findtext("id"): each for each in project.findall("projectlayers/maplayer")}
+    shown = [each.get("id") for each in project.iter("layer-tree-layer")]
+    assert shown[-1] == "mosaic" and set(shown) == set(layers)  # the map below all others
+    sources = {name: each.findtext("datasource", "") for name, each in layers.items()}
+    assert all(each.startswith("./") for each in sources.values())
+    with rasterio.open(path.parent / sources.pop("mosaic")) as map_:
+        assert project.findtext("projectCrs//authid") == map_.crs.to_string()
+        extent = project.find("mapcanvas/extent")
+        assert extent is not None
+        assert [float(each.text or "") for each in extent] == pytest.approx(map_.bounds)
+        renderer = layers["mosaic"].find("pipe/rasterrenderer")
+        assert renderer is not None and map_.colorinterp[
+            int(renderer.get("alphaBand", "")) - 1
+        ] == (ColorInterp.alpha)
+    assert {"changes", "frames"} <= set(sources)
+    for name, source in sources.items():
+        file, _, layer = source.partition("|layername=")
+        assert layer == name and len(read_dataframe(path.parent / file, layer=layer)) > 0
+    with sqlite3.connect(path.parent / "field.gpkg") as file:
+        styles = dict(file.execute("SELECT f_table_name, styleQML FROM layer_styles").fetchall())
+    for name in sources:
+        drawn = layers[name].find("renderer-v2")
+        assert (drawn is None) == (name not in styles)
+        if drawn is not None:
+            stored = fromstring(styles[name]).find("renderer-v2")
+            assert stored is not None and canonicalize(tostring(drawn)) == (
+                canonicalize(tostring(stored))
+            )
+
+
+def test_a_project_needs_a_map(client: TestClient, root: Path) -> None:
+    (root / "field" / "mosaic.tif").unlink()
+    answer = client.get(f"{URL}/site.qgs")
+    assert answer.status_code == 404 and "map a flight first" in answer.json()["detail"]
 
 
 def test_google_earth_is_told_to_load_the_objects_again(client: TestClient, root: Path) -> None:

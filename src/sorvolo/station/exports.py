@@ -32,7 +32,7 @@ from sorvolo.station.problems import Problem, problem_answer
 from sorvolo.station.security import address, needs
 from sorvolo.station.sites import SiteShelf
 from sorvolo.station.tokens import Role
-from sorvolo.store.exports.geopackage import LAYER_STYLES, qml_of, write_geopackage
+from sorvolo.store.exports.geopackage import LAYER_STYLES, qgs_of, qml_of, write_geopackage
 from sorvolo.store.exports.places import network_link
 from sorvolo.store.nofollow import open_below
 from sorvolo.store.site.archive import Archive
@@ -217,10 +217,11 @@ _OF_FLIGHT: Mapping[str, str] = {
     "heights.tif": "surface heights, GeoTIFF",
     "terrain.tif": "bare ground, GeoTIFF",
 }
-_GEOPACKAGE, _LINK = "site.gpkg", "site.kml"
+_GEOPACKAGE, _PROJECT, _LINK = "site.gpkg", "site.qgs", "site.kml"
 _KML = "application/vnd.google-earth.kml+xml"  # Google Earth takes a link's answer as no other
 _MADE = {
     _GEOPACKAGE: "Objects, changes, frames and coverage, GeoPackage",
+    _PROJECT: "Project for QGIS: GeoPackage and map, to be saved beside it",
     _LINK: "Objects, loaded again every 30 s, KML network link",
 }
 _MOST_PROFILE_PLACES, _MOST_PROFILE_POINTS = 50, 2000
@@ -254,7 +255,7 @@ def export_routes(shelf: SiteShelf, collections: SiteCollections) -> APIRouter:
             rows[2:2] = [
                 _row(site, ExportFile(name, "", title), None)
                 for name, title in _MADE.items()
-                if name != _LINK or not archive.site().is_local
+                if name == _GEOPACKAGE or not archive.site().is_local
             ]
         return rows
 
@@ -264,6 +265,8 @@ def export_routes(shelf: SiteShelf, collections: SiteCollections) -> APIRouter:
         archive = shelf.open(site)
         if export_id == _GEOPACKAGE:
             return _geopackage(site, archive, collections)
+        if export_id == _PROJECT:
+            return _project(site, archive, collections)
         if export_id == _LINK:
             objects = address(request, f"/api/sites/{site}/exports/objects.kml")
             link, named = network_link(site, objects), _as_file(f"{_plain_name(site)}.kml")
@@ -347,6 +350,22 @@ def _geopackage(site: str, archive: Archive, collections: SiteCollections) -> Re
         made = path.read_bytes()  # another time other bytes: whole, no ranges
     headers = _as_file(f"{_plain_name(site)}.gpkg")
     return Response(made, media_type="application/octet-stream", headers=headers)
+
+
+def _project(site: str, archive: Archive, collections: SiteCollections) -> Response:
+    if not archive.has_site or archive.site().is_local or not archive.mosaic_path.is_file():
+        raise Problem(
+            404, "a project for QGIS needs a map with a place on Earth; map a flight first"
+        )
+    archive.require_sound(archive.mosaic_path.name)
+    name = _plain_name(site)
+    layers = [each for each in TITLES if collections.get(site, each).features]
+    with (
+        open_below(archive.folder, archive.mosaic_path.name),  # refuses a link
+        rasterio.open(archive.mosaic_path, driver="GTiff") as map_,
+    ):
+        made = qgs_of(name, layers, f"{name}.gpkg", f"{name}-mosaic.tif", map_)
+    return Response(made, media_type="application/x-qgis", headers=_as_file(f"{name}.qgs"))
 
 
 def _profile(folder: Path, line: str, step_m: float) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Layers of features as a GeoPackage (OGC 12-128r19): one SQLite file that QGIS and others open."""
+"""Layers of features as a GeoPackage (OGC 12-128r19), one SQLite file that QGIS and others open; a project for QGIS."""
 
 import json
 import re
@@ -12,8 +12,10 @@ from importlib.resources import files
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
+from xml.etree.ElementTree import fromstring, tostring
 
 import shapely
+from rasterio import DatasetReader
 from shapely.geometry import shape
 from shapely.geometry.base import BaseGeometry
 
@@ -202,3 +204,32 @@ def qml_of(style: Mapping[str, Any]) -> str:
     """A layer's style as a QML document (QGIS 3)."""
     head = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
     return head + xml_of("layer_style", package="sorvolo.store.exports", **style).decode()
+
+
+def qgs_of(
+    name: str, layers: Sequence[str], geopackage: str, mosaic: str, map_: DatasetReader
+) -> bytes:
+    """A project of QGIS 3: layers of a GeoPackage in their styles over a map, both files beside the project's own.
+
+    Layers without a style are switched off.
+    """
+    project = fromstring(
+        xml_of(
+            "project",
+            package="sorvolo.store.exports",
+            name=name,
+            layers=layers,
+            styled=LAYER_STYLES,
+            geopackage=geopackage,
+            mosaic=mosaic,
+            crs=map_.crs,
+            bounds=map_.bounds,
+            alpha_band=4 if map_.count == 4 else -1,
+        )
+    )
+    for layer in project.iter("maplayer"):
+        style = LAYER_STYLES.get(layer.findtext("id", ""))
+        if style is not None:
+            layer.extend(fromstring(qml_of(style)).findall("renderer-v2"))
+    head = b"<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
+    return head + bytes(tostring(project, encoding="utf-8"))
