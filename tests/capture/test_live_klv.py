@@ -7,12 +7,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from stanag4609.st0601 import decode_uas_local_set
+from stanag4609.st0903 import resolve_vtarget_location
 
 from sorvolo.capture.correction import headings_deg
 from sorvolo.capture.live.klv import (
     ITEMS,
     UNIVERSAL_KEY,
     LocalSet,
+    VmtiTarget,
     checksum,
     encode,
     local_sets,
@@ -308,6 +311,48 @@ def test_the_aircrafts_heading_stays_and_the_camera_is_read_back_as_it_was(tilt_
             *(columns[f"camera_{name}_deg"] for name in ("yaw", "pitch", "roll"))
         )
         assert np.abs(read - rotation).max() < 2e-4  # 0.01 deg
+
+
+def test_detections_are_what_another_decoder_reads_of_st_0903() -> None:
+    """Boxes as numbers of pixels, score, class, and the place within half a step of 85 cm."""
+    sample = CorrectedFrame(
+        *("", 0, _TIME_NS, 0.0, 46.5, 7.5, 500.0, 40.0, 30.0, -60.0, 0.0, 1.0, 60.0, 40.0, "")
+    )
+    person = VmtiTarget(300, "person", 0.873, (100, 50, 110.9, 70), 46.50031, 7.50021)
+    unknown = VmtiTarget(1_000_001, "small object", 0.2, (-5, 0, 3, 480), nan, nan)
+    stated = decode_uas_local_set(
+        packet_of(sample, 90.0, "orthometric", [person, unknown], (640, 480))
+    )
+    centre_deg = stated.get(23).value, stated.get(24).value
+    reach_m = 40 / np.tan(np.radians(60))  # to the north-east of the drone by 30 degrees
+    assert (centre_deg[0] - 46.5) * 111_170 == pytest.approx(
+        reach_m * np.cos(np.radians(30)), abs=0.1
+    )
+    found = stated.get(74).value
+    assert [found.value(tag) for tag in (4, 5, 6, 8, 9)] == [6, 2, 2, 640, 480]
+    first, second = found.targets
+    assert [first.target_id, second.target_id] == [300, 1_000_001]
+    assert [first.value(tag) for tag in (1, 2, 3, 5)] == [
+        60 * 640 + 106,
+        50 * 640 + 101,
+        70 * 640 + 111,
+        87,
+    ]
+    assert [second.value(tag) for tag in (2, 3)] == [1, 479 * 640 + 4], "inside the picture"
+    assert second.value(10) is None, "its place is not known"
+    place = resolve_vtarget_location(
+        first, frame_center_latitude=centre_deg[0], frame_center_longitude=centre_deg[1]
+    )
+    assert place is not None
+    assert (place.latitude, place.longitude) == pytest.approx((46.50031, 7.50021), abs=4e-6)
+    names = {each.ontology_id: each.label for each in found.ontologies}
+    assert [names[each.value(107)[0].ontology_id] for each in found.targets] == [
+        "person",
+        "small object",
+    ]
+    assert one(packet_of(sample, 90.0, "orthometric"))["frame_center_latitude_deg"] == (
+        pytest.approx(centre_deg[0], abs=1e-7)
+    )
 
 
 def _flown(speed_m_s: float) -> tuple[list[float], list[Pose]]:

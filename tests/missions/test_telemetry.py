@@ -15,11 +15,14 @@ from xml.etree import ElementTree
 import av
 import numpy as np
 import pytest
+from stanag4609.st0601 import decode_uas_local_set
+from stanag4609.st0903 import resolve_vtarget_location
 
 from sealing import seal_again, write_again
 from small_flights import simulate_into, small_flight
 from sorvolo.capture.correction import corrected_poses, fitted, path_fit, telemetry_faults
 from sorvolo.capture.live.klv_telemetry import read_klv_file
+from sorvolo.capture.source import opened_sources
 from sorvolo.cli.main import main
 from sorvolo.errors import InputError
 from sorvolo.geometry.pose import Pose, gimbal_angles_from_rotation, site_from_gimbal_rotation
@@ -33,6 +36,7 @@ from sorvolo.missions.telemetry.doctor import (
     mapped_flights,
 )
 from sorvolo.missions.watch.cot_sender import CotPlace
+from sorvolo.store.exports.detection_files import DetectionLines, claimed_folder
 from sorvolo.survey.corrected import AS_THE_MAP, Bias
 from sorvolo.survey.flight import CameraPrior
 
@@ -506,6 +510,66 @@ def test_the_video_gets_corrected_metadata_and_keeps_its_pictures(
     assert across_deg == pytest.approx(float(rows[0]["horizontal_fov_deg"]), abs=0.05)
 
 
+def test_what_a_watch_found_is_in_the_metadata_of_its_frame(
+    corrected: tuple[dict[str, Any], Path], faulty: Path, tmp_path: Path
+) -> None:
+    video, camera = faulty / "flight1" / "flight1.mp4", str(faulty / "camera.xml")
+    rows = list(csv.DictReader((corrected[1] / "out" / "track.csv").read_text().splitlines()))
+    shown = rows[len(rows) // 2]
+    sees = {
+        "frame": shown["name"],
+        "class": "person",
+        "score": 0.8,
+        "box_px": [10, 20, 30, 40],
+        "track": 4,
+        "latitude": float(shown["latitude_deg"]),
+        "longitude": float(shown["longitude_deg"]),
+    }
+    with opened_sources([video], None, camera) as (source,):
+        fingerprint = source.fingerprint
+    for name, mark, box in (
+        ("sound", fingerprint, [10, 20, 30, 40]),
+        ("cut", fingerprint, None),
+        ("other", "another", [10, 20, 30, 40]),
+    ):
+        with claimed_folder(tmp_path / name, "flight1", mark):
+            with DetectionLines(tmp_path / name) as lines:
+                lines.append([sees | {"box_px": box}])
+    (tmp_path / "none").mkdir()
+
+    def correct(name: str) -> dict[str, Any]:
+        return correct_telemetry(
+            corrected[1] / "site",
+            tmp_path / "out",
+            source=video,
+            camera=camera,
+            watched=tmp_path / name,
+        )
+
+    for name, words in (("other", "another flight"), ("none", "no folder"), ("cut", "damaged")):
+        with pytest.raises(InputError, match=words):
+            correct(name)
+    correct("sound")
+    found = []
+    with av.open(str(tmp_path / "out" / "flight1.ts")) as film:
+        for packet in film.demux(data=0):
+            data = bytes(packet)
+            if data and (stated := decode_uas_local_set(data)).get(74):
+                first_s = film.streams.video[0].start_time * film.streams.video[0].time_base
+                found.append((float(packet.pts * packet.time_base - first_s), stated))
+    ((seconds, stated),) = found
+    assert seconds == pytest.approx(float(shown["video_s"]), abs=0.01)
+    (target,) = stated.get(74).value.targets
+    assert (target.target_id, target.value(5)) == (4, 80)
+    assert stated.get(74).value.value(8) == 320
+    place = resolve_vtarget_location(
+        target,
+        frame_center_latitude=stated.get(23).value,
+        frame_center_longitude=stated.get(24).value,
+    )
+    assert place is not None and place.latitude == pytest.approx(sees["latitude"], abs=5e-6)
+
+
 def test_the_metadata_has_the_aircrafts_heading(
     corrected: tuple[dict[str, Any], Path], faulty: Path
 ) -> None:
@@ -736,7 +800,8 @@ def test_files_of_two_flights_do_not_mix(
         (["{video}"], "flight1.mp4 is no map: give the map that this flight is in"),
         (["nowhere"], "no such file or folder: nowhere; give a flight's video"),
         (["{site}", "--site", "{site}"], "is a map, and so is --site"),
-        (["{site}", "--camera", "{camera}"], "--telemetry and --camera belong to a flight"),
+        (["{site}", "--camera", "{camera}"], "--camera and --detections belong to a flight"),
+        (["{site}", "--detections", "x"], "--camera and --detections belong to a flight"),
         (["{site}", "--cot-ca", "x.pem"], "--cot-ca and --cot-cert are for --cot tls://host:port"),
         (["rtsp://camera/live", "--site", "{site}"], "rtsp:// is the address of a live stream"),
         (["{lonely}", "--site", "new"], "no telemetry with positions was found in it or beside it"),

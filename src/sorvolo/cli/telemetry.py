@@ -36,6 +36,12 @@ def telemetry_command(
     flight: Flight = "",
     telemetry: Telemetry = None,
     camera: Camera = "",
+    detections: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of this video's `sorvolo watch`: its detections go into the KLV (VMTI, MISB ST 0903)."
+        ),
+    ] = None,
     out: ResultsFolder = None,
     cot: Cot = "",
     cot_ca: Authority = None,
@@ -58,7 +64,7 @@ def telemetry_command(
     )
     from sorvolo.missions.watch.cot_sender import CotTls, check_host, cot_place
 
-    _check_source(source, site, has_own_options=bool(telemetry or camera))
+    _check_source(source, site, has_own_options=bool(telemetry or camera or detections))
     tls = CotTls(cot_ca, cot_cert)
     if tls != CotTls() and not cot.startswith("tls://"):
         raise SettingsError("--cot-ca and --cot-cert are for --cot tls://host:port")
@@ -80,6 +86,7 @@ def telemetry_command(
             telemetry=telemetry or None,
             camera=camera or None,
             cot=receiver,
+            watched=detections,
         )
     if as_json:
         print_json({"folder": str(target), **report})
@@ -90,7 +97,7 @@ def telemetry_command(
 def _check_source(source: str, site: str, *, has_own_options: bool) -> None:
     """Raise InputError or SettingsError unless `source` is a flight with --site, or a map without.
 
-    `has_own_options` is whether --telemetry or --camera was given.
+    `has_own_options` is whether --telemetry, --camera or --detections was given.
     """
     from sorvolo.store.site.catalogue_place import is_site
 
@@ -116,7 +123,7 @@ def _check_source(source: str, site: str, *, has_own_options: bool) -> None:
         )
     if is_map and has_own_options:
         raise SettingsError(
-            f"{source} is a map, and --telemetry and --camera belong to a flight: give its video or folder of photos "
+            f"{source} is a map, and --telemetry, --camera and --detections belong to a flight: give its video or folder of photos "
             f"with --site {source}"
         )
 

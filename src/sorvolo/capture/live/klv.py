@@ -1,11 +1,12 @@
-"""MISB ST 0601: the UAS Datalink Local Set inside MPEG-TS, from bytes to numbers and back."""
+"""MISB ST 0601: the UAS Datalink Local Set inside MPEG-TS, from bytes to numbers and back; detections in it (ST 0903)."""
 
 import tomllib
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from math import isfinite, nan
+from urllib.parse import quote
 
 from sorvolo.errors import InputError
 
@@ -38,6 +39,10 @@ _STORED = tomllib.loads(
 )
 ITEMS: Mapping[int, Item] = {int(tag): Item(*stored) for tag, stored in _STORED.items()}
 """The tags that are read, by number; those from 200 on are Sorvolo's own, in the flights that a station keeps."""
+
+_VMTI_TAG = 74
+_OFFSET = Item("offset_deg", -19.2, 19.2, 3, is_imapb=True)  # of a target's place: 85 cm a step
+_ONTOLOGY = b"urn:sorvolo:class"  # no public one has "small object"
 
 
 @dataclass(frozen=True)
@@ -97,10 +102,12 @@ def local_sets(data: bytes, counts: Counter[str]) -> Iterator[LocalSet]:
         start = data.find(UNIVERSAL_KEY, after)
 
 
-def encode(time_ns: int, values: Mapping[str, float], version: int = 19) -> bytes:
+def encode(
+    time_ns: int, values: Mapping[str, float], version: int = 19, vmti: bytes = b""
+) -> bytes:
     """The local set that states these numbers, by `Item.name`; the inverse of `local_sets` within half a step.
 
-    A value that is not finite is written as "error" where its tag has a code for it, else left out. Raises InputError
+    `vmti` is what `vmti_set` made, embedded. A value that is not finite is written as "error" where its tag has a code for it, else left out. Raises InputError
     for an unknown name or a value outside its tag's range.
     """
     numbers = {item.name: tag for tag, item in ITEMS.items()}
@@ -111,10 +118,55 @@ def encode(time_ns: int, values: Mapping[str, float], version: int = 19) -> byte
         item = ITEMS[numbers[name]]
         if isfinite(value) or item.is_signed:
             body += _tagged(numbers[name], _bytes_of(item, value))
-    body += _tagged(VERSION_TAG, bytes([version]))
+    body += _tagged(VERSION_TAG, bytes([version])) + (_tagged(_VMTI_TAG, vmti) if vmti else b"")
     length = len(body) + 4
     packet = UNIVERSAL_KEY + _written_length(length) + body + bytes([CHECKSUM_TAG, 2])
     return packet + checksum(packet).to_bytes(2, "big")
+
+
+@dataclass(frozen=True)
+class VmtiTarget:
+    """A detection in a picture; `box_px` is left, top, right, bottom, its place NaN where it is not known."""
+
+    number: int
+    label: str
+    score: float
+    box_px: Sequence[float]
+    latitude_deg: float
+    longitude_deg: float
+
+
+def vmti_set(
+    targets: Sequence[VmtiTarget], size_px: tuple[int, int], centre_deg: tuple[float, float]
+) -> bytes:
+    """The VMTI Local Set (ST 0903.6) of one picture's detections, as ST 0601 embeds it.
+
+    `size_px` is the picture's width and height, `centre_deg` the latitude and longitude of tags 23 and 24, from which
+    places count. Classes stand in an ontology of Sorvolo's own.
+    """
+    labels = sorted({target.label for target in targets})
+    classes = {label: number for number, label in enumerate(labels, 1)}
+    packs = [
+        _written_oid(target.number)
+        + _pixels(target.box_px, size_px)
+        + _tagged(5, bytes([round(100 * target.score)]))
+        + _offset(10, target.latitude_deg - centre_deg[0])
+        + _offset(11, target.longitude_deg - centre_deg[1])
+        + _tagged(107, _series([_tagged(3, _unsigned(classes[target.label]))]))
+        for target in targets
+    ]
+    ontology = [
+        _tagged(1, _unsigned(number))
+        + _tagged(3, _ONTOLOGY)
+        + _tagged(4, _ONTOLOGY + b":" + quote(label).encode())
+        + _tagged(6, label.encode())
+        for label, number in classes.items()
+    ]
+    count = _unsigned(len(targets))
+    items = {3: b"sorvolo", 4: bytes([6]), 5: count, 6: count}
+    items |= {8: _unsigned(size_px[0]), 9: _unsigned(size_px[1])}
+    items |= {101: _series(packs), 103: _series(ontology)}
+    return b"".join(_tagged(tag, value) for tag, value in items.items())
 
 
 def checksum(data: bytes) -> int:
@@ -183,10 +235,43 @@ def _imapb(item: Item, length: int) -> tuple[float, float]:
     return forward, zero - zero // 1 if item.lowest < 0 < item.highest else 0.0
 
 
+def _pixels(box_px: Sequence[float], size_px: tuple[int, int]) -> bytes:
+    """Tags 1 to 3: the numbers of a box's middle, first and last pixel, from 1 on, row by row."""
+    left, top, right, bottom = box_px
+    places = ((left + right) / 2, (top + bottom) / 2), (left, top), (right, bottom)
+    written = b""
+    for tag, place in enumerate(places, 1):
+        column, row = (min(max(int(at), 0), side - 1) for at, side in zip(place, size_px))
+        written += _tagged(tag, _unsigned(row * size_px[0] + column + 1))
+    return written
+
+
+def _offset(tag: int, degrees: float) -> bytes:
+    """A place's offset from the frame's centre; nothing where it is unknown, or beyond the tag's range."""
+    if not abs(degrees) < _OFFSET.highest:
+        return b""
+    half_step = 0.5 / _imapb(_OFFSET, _OFFSET.length)[0]  # ST 1201 cuts, to the south-west
+    return _tagged(tag, _bytes_of(_OFFSET, degrees + half_step))
+
+
+def _series(packs: Sequence[bytes]) -> bytes:
+    return b"".join(_written_length(len(pack)) + pack for pack in packs)
+
+
+def _unsigned(number: int) -> bytes:
+    return number.to_bytes(max(1, -(-number.bit_length() // 8)), "big")
+
+
+def _written_oid(number: int) -> bytes:
+    """A number in BER-OID; the inverse of `_ber_oid`."""
+    groups = [number & 0x7F]
+    while number := number >> 7:
+        groups.insert(0, 0x80 | number & 0x7F)
+    return bytes(groups)
+
+
 def _tagged(tag: int, value: bytes) -> bytes:
-    return (
-        bytes([tag, len(value)] if tag < 128 else [0x80 | tag >> 7, tag & 0x7F, len(value)]) + value
-    )
+    return _written_oid(tag) + _written_length(len(value)) + value
 
 
 def _written_length(length: int) -> bytes:

@@ -4,19 +4,22 @@ from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from math import isfinite, isnan, nan, radians, tan
+from math import cos, isfinite, isnan, nan, radians, sin, tan
 from pathlib import Path
 from statistics import median
+from types import MappingProxyType
 from typing import Any, TypeAlias
 
 import av
+import numpy as np
 
-from sorvolo.capture.live.klv import LocalSet, encode, local_sets
+from sorvolo.capture.live.klv import LocalSet, VmtiTarget, encode, local_sets, vmti_set
 from sorvolo.capture.telemetry.cleaning import clean, notice
 from sorvolo.capture.video_stream import ONE_FILE
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Matrix3
 from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.geometry.pose import gimbal_angles_from_rotation, site_from_gimbal_rotation
 from sorvolo.survey.corrected import CorrectedFrame
 from sorvolo.survey.flight import TELEMETRY_COLUMNS, CameraModel, Notice, Telemetry
@@ -36,6 +39,7 @@ _OWN_TAGS = (
 _FOV_SIGMA = (
     0.03  # of a focal length from the field of view: operators round it, and zooms lag behind it
 )
+_LEAST_DOWN = radians(5)  # of a view whose middle is on the ground; flatter ones meet it far away
 _LEVEL_FROM_CAMERA = site_from_gimbal_rotation(0.0, 0.0, 0.0)
 
 
@@ -244,22 +248,26 @@ def mux_klv(
     samples: Sequence[CorrectedFrame],
     headings_deg: Sequence[float],
     height_reference: str,
+    detections: Mapping[float, Sequence[VmtiTarget]] = MappingProxyType({}),
 ) -> None:
     """Write `target`, an MPEG transport stream with the video's own packets and these samples as MISB ST 0601.
 
     Nothing is encoded anew; metadata streams of the video are left out. `samples` are in order of time, `video_s` from
-    the first frame; `headings_deg` are the aircraft's at each of them, clockwise from north. Raises InputError for a
+    the first frame; `headings_deg` are the aircraft's at each of them, clockwise from north; `detections` are what the
+    frame of a sample at this `video_s` shows (ST 0903). Raises InputError for a
     file that is no video, or whose pictures no transport stream holds.
     """
-    packets = [
-        (sample.video_s, packet_of(sample, heading_deg, height_reference))
-        for sample, heading_deg in zip(samples, headings_deg, strict=True)
-    ]
     try:
         with av.open(f"file:{video}", options=ONE_FILE) as source:
             if not source.streams.video:
                 raise InputError(f"{video}: no pictures in it; KLV is written into videos")
             pictures = source.streams.video[0]
+            size_px = pictures.codec_context.width, pictures.codec_context.height
+            packets = []
+            for sample, heading_deg in zip(samples, headings_deg, strict=True):
+                seen = detections.get(sample.video_s, ())
+                packet = packet_of(sample, heading_deg, height_reference, seen, size_px)
+                packets.append((sample.video_s, packet))
             if pictures.codec_context.name not in _COPIED:
                 raise InputError(
                     f"{video}: pictures in {pictures.codec_context.name} do not go into a transport stream as they are;"
@@ -270,8 +278,14 @@ def mux_klv(
         raise InputError(f"{video}: cannot be copied into a transport stream ({error})") from error
 
 
-def packet_of(sample: CorrectedFrame, heading_deg: float, height_reference: str) -> bytes:
-    """The local set of one sample.
+def packet_of(
+    sample: CorrectedFrame,
+    heading_deg: float,
+    height_reference: str,
+    detections: Sequence[VmtiTarget] = (),
+    size_px: tuple[int, int] = (0, 0),
+) -> bytes:
+    """The local set of one sample, with the detections of its frame of this width and height.
 
     The camera is given as a sensor on a level platform with the aircraft's heading: receivers find the camera's own
     angles from the two together, and show the aircraft by the heading.
@@ -301,7 +315,16 @@ def packet_of(sample: CorrectedFrame, heading_deg: float, height_reference: str)
         }
     elif height_reference == "orthometric":
         values |= {"sensor_true_altitude_m": sample.height_m, "frame_center_elevation_m": ground_m}
-    return encode(sample.time_ns, values)
+    down, yaw = radians(-sample.pitch_deg), radians(sample.yaw_deg)
+    if down < _LEAST_DOWN:
+        return encode(sample.time_ns, values)
+    reach_m = sample.above_ground_m / tan(down)
+    below = LocalFrame(Geodetic(sample.latitude_deg, sample.longitude_deg))
+    found = below.wgs84_from_site(np.array([[reach_m * sin(yaw), reach_m * cos(yaw)]]))
+    centre_deg = float(found[0][0]), float(found[1][0])
+    values |= dict(zip(("frame_center_latitude_deg", "frame_center_longitude_deg"), centre_deg))
+    vmti = vmti_set(detections, size_px, centre_deg) if detections else b""
+    return encode(sample.time_ns, values, vmti=vmti)
 
 
 def _copy(

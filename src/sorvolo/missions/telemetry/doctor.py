@@ -1,12 +1,15 @@
 """`sorvolo telemetry`: a mapped flight's telemetry corrected by its map, and what was wrong with it."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from math import hypot, isfinite, nan
 from pathlib import Path
 from statistics import median
+from types import MappingProxyType
 from typing import Any
+
+import numpy as np
 
 from sorvolo.capture.correction import (
     corrected_poses,
@@ -17,6 +20,7 @@ from sorvolo.capture.correction import (
     telemetry_faults,
 )
 from sorvolo.capture.flight_telemetry import FlightTelemetry
+from sorvolo.capture.live.klv import VmtiTarget
 from sorvolo.capture.live.klv_telemetry import mux_klv
 from sorvolo.capture.source import Source, opened_sources
 from sorvolo.capture.video import VideoSource
@@ -29,6 +33,7 @@ from sorvolo.missions.flight.setup import FlightSetup, prepare
 from sorvolo.missions.watch.cot_sender import CotPlace, CotTls, send_all
 from sorvolo.paths import AnyPath, as_path
 from sorvolo.store.atomic import atomic_path, atomic_write_bytes, make_folder
+from sorvolo.store.exports.detection_files import LINES, find_watched
 from sorvolo.store.exports.places import longitude_latitude
 from sorvolo.store.exports.plain import json_bytes, plain_json
 from sorvolo.store.exports.telemetry_files import (
@@ -52,6 +57,7 @@ _REPORT = "telemetry.json"
 _UNDIAGNOSED = "no diagnosis was made: it takes the flight's own video or photos, with --site"
 _INTERPOLATED = "interpolated"  # a camera by telemetry, corrected by the frames before and after
 _KLV_STEP_S = 0.2  # between samples, five a second; by choice
+_UNTRACKED = 1_000_000  # from here on count detections that belong to no track; by choice
 
 
 @dataclass(frozen=True)
@@ -98,12 +104,14 @@ def correct_telemetry(
     telemetry: str | None = None,
     camera: str | None = None,
     cot: CotReceiver | None = None,
+    watched: AnyPath | None = None,
 ) -> dict[str, Any]:
     """Write a flight's corrected telemetry into `folder`; the report, which telemetry.json holds as well, and
     `cot_sent`, how many events were sent.
 
     Without `flight` it is the site's only one, or that of `source`. With `source`, the flight's video or photos, its
-    own telemetry is compared with the map, and a video is written again as a transport stream with corrected metadata.
+    own telemetry is compared with the map, and a video is written again as a transport stream with corrected metadata,
+    and with the detections of `watched`, the folder of a watch of this video.
     The events of cot.xml, with their own times, are sent to `cot`. Without `source` a folder with a diagnosis is left
     as it is: its events are sent, and `diagnosed_before` is true in the report. Raises InputError for a site without
     GPS, a flight that it has not, a source of another flight or without a fix at any of its frames, a folder that has
@@ -133,12 +141,13 @@ def correct_telemetry(
             name = _flight(archive, flight or opened.name)
             _check_same(archive, name, opened, source)
             _check_folder(folder, name, site)
+            seen = {} if watched is None else _detections(Path(watched), opened)
             mapped = archive.report(name)
             asked = MapSettings(offset_s=_clock(mapped)[1])
             setup = prepare(opened, asked, site, telemetry_named=telemetry is not None)
             solved = _solved(archive, name, _first_ns(setup))
             solved, compared = _compared(setup, solved, mapped)
-            return _written(site, name, folder, solved, compared, mapped, cot)
+            return _written(site, name, folder, solved, compared, mapped, cot, seen)
 
 
 def mapped_flights(site_folder: Path) -> dict[str, str]:
@@ -359,7 +368,9 @@ def _written(
     compared: _Compared | None,
     mapped: Mapping[str, Any],
     cot: CotReceiver | None,
+    seen: Mapping[int, Sequence[VmtiTarget]] = MappingProxyType({}),
 ) -> dict[str, Any]:
+    """Write all files; `seen` are the detections by the index of their frame."""
     frames = [_frame(each, site) for each in solved]
     texts = {
         "geo.txt": geo_txt(frames).encode(),
@@ -384,7 +395,15 @@ def _written(
     video = None if compared is None else _video(compared.setup.source)
     if compared is not None and video is not None:
         with atomic_path(folder / f"{name}.ts") as temporary:
-            mux_klv(video, temporary, *_samples(compared, solved, site), site.height_reference)
+            # between two keyframes the frames follow each other evenly
+            index, seconds = zip(*((each.index, each.seconds) for each in solved))
+            shown = {
+                float(np.interp(number, index, seconds)): targets
+                for number, targets in seen.items()
+                if index[0] <= number <= index[-1]
+            }
+            samples = _samples(compared, solved, site, shown)
+            mux_klv(video, temporary, *samples, site.height_reference, shown)
         files.append(f"{name}.ts")
     report = dict(
         plain_json(
@@ -414,12 +433,41 @@ def _video(source: Source) -> Path | None:
     return source.info.path
 
 
+def _detections(folder: Path, source: Source) -> dict[int, list[VmtiTarget]]:
+    """What a watch of this source found, by the index of the frame. Raises InputError for another folder or source."""
+    if not isinstance(source, VideoSource) or _video(source) is None or any(source.info.turn):
+        raise InputError(
+            f"{source.inputs[0]}: detections go into the KLV of one upright video, and this is photos, chapters or a "
+            "turned video: leave --detections out"
+        )
+    known = find_watched(folder)
+    if known != source.fingerprint:
+        found = "the watch of another flight" if known else "no folder of `sorvolo watch`"
+        raise InputError(
+            f"{folder} is {found}: give the one of {source.inputs[0]}, or make it: sorvolo watch {source.inputs[0]}"
+        )
+    seen: dict[int, list[VmtiTarget]] = {}
+    try:
+        with (folder / LINES).open(encoding="utf-8") as lines:
+            for number, line in enumerate(lines, _UNTRACKED):
+                row = json.loads(line)
+                place = (float(row.get(name, nan)) for name in ("latitude", "longitude"))
+                track, box_px = row["track"] or number, [float(edge) for edge in row["box_px"]]
+                target = VmtiTarget(track, row["class"], float(row["score"]), box_px, *place)
+                seen.setdefault(int(row["frame"]), []).append(target)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(
+            f"{folder / LINES} is gone or damaged ({error!r}); watch the flight again"
+        ) from error
+    return seen
+
+
 def _samples(
-    compared: _Compared, solved: Sequence[_Solved], site: Site
+    compared: _Compared, solved: Sequence[_Solved], site: Site, also_s: Iterable[float]
 ) -> tuple[list[CorrectedFrame], list[float]]:
-    """The corrected camera five times a second, by the telemetry between the solved frames; and the aircraft's
+    """The corrected camera five times a second, and at these moments, by the telemetry between the solved frames; and the aircraft's
     headings, deg."""
-    times_s = even_times_s([each.seconds for each in solved], _KLV_STEP_S)
+    times_s = sorted({*even_times_s([each.seconds for each in solved], _KLV_STEP_S), *also_s})
     poses = _between(times_s, solved, compared)
     first_ns = _first_ns(compared.setup)
     stated_deg = compared.track.body_headings_deg(times_s, compared.applied_s)
