@@ -85,7 +85,8 @@ $(VENV)/.built: pyproject.toml setup.py $(wildcard src/sorvolo/kernels/*.?pp) | 
 	$(BIN)/python -m $(PIP) -e .
 	touch $@
 
-$(VENV)/.training: requirements-test.lock requirements-training.lock requirements-notebooks.lock | $(VENV)/.locked
+$(VENV)/.training: $(addprefix requirements-,$(addsuffix .lock,test notebooks training torch)) | $(VENV)/.locked
 	$(BIN)/python -m $(PIP) -r requirements-test.lock -r requirements-notebooks.lock
 	$(BIN)/python -m $(PIP) -r requirements-training.lock
+	$(BIN)/python -m $(PIP) -r requirements-torch.lock
 	touch $@
