@@ -1,6 +1,6 @@
 """The true orthophoto: each piece of ground seen by a photo that nothing hides it from, on its own height."""
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import cv2
 import numpy as np
@@ -24,9 +24,6 @@ from sorvolo.mosaic.blending import (
 _HIDDEN_CELLS = 3.0  # a height this much above the line of sight, in cells, hides what is behind
 _HIDDEN_MERIT = 0.02  # of a photo that does not see the ground, against one that does
 _BLOCK_TILES = 2  # painted together, to a side: what is painted around them is a smaller share
-_STRIP_BLOCKS = (
-    2  # high, painted to and fro: blocks that follow each other show the same few photos
-)
 
 
 def paint_orthophoto(
@@ -50,8 +47,10 @@ def paint_orthophoto(
         pictures,
     )
     count, side = _BLOCK_TILES, site_grid.grid.tile_px
-    blocks = _to_and_fro(
-        {(row // count, column // count) for column, row in painter.tiles()}, _STRIP_BLOCKS
+    # to and fro: blocks that follow each other show the same few photos
+    blocks = sorted(
+        {(row // count, column // count) for column, row in painter.tiles()},
+        key=lambda block: (block[0], -block[1] if block[0] % 2 else block[1]),
     )
     for number, (down, across) in enumerate(blocks, start=1):
         first = across * count, down * count
@@ -62,16 +61,6 @@ def paint_orthophoto(
             tile = np.ascontiguousarray(rgba[y * side : (y + 1) * side, x * side : (x + 1) * side])
             if tile[..., 3].any():
                 yield (first[0] + x, first[1] + y), tile, number / len(blocks)
-
-
-def _to_and_fro(blocks: Collection[tuple[int, int]], rows: int) -> list[tuple[int, int]]:
-    """Blocks (row, column) strip by strip of so many rows, every other strip backwards."""
-
-    def place(block: tuple[int, int]) -> tuple[int, int, int]:
-        strip = block[0] // rows
-        return strip, -block[1] if strip % 2 else block[1], block[0]
-
-    return sorted(blocks, key=place)
 
 
 def choose_photos(lattice: Lattice, up_m: Floats32, views: Sequence[View]) -> Winners:
