@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass, field, replace
 from math import hypot, isfinite, nan
 from pathlib import Path
 from statistics import median
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -141,7 +140,7 @@ def correct_telemetry(
             name = _flight(archive, flight or opened.name)
             _check_same(archive, name, opened, source)
             _check_folder(folder, name, site)
-            seen = {} if watched is None else _detections(Path(watched), opened)
+            seen = None if watched is None else _detections(Path(watched), opened)
             mapped = archive.report(name)
             asked = MapSettings(offset_s=_clock(mapped)[1])
             setup = prepare(opened, asked, site, telemetry_named=telemetry is not None)
@@ -368,7 +367,7 @@ def _written(
     compared: _Compared | None,
     mapped: Mapping[str, Any],
     cot: CotReceiver | None,
-    seen: Mapping[int, Sequence[VmtiTarget]] = MappingProxyType({}),
+    seen: Mapping[int, Sequence[VmtiTarget]] | None = None,
 ) -> dict[str, Any]:
     """Write all files; `seen` are the detections by the index of their frame."""
     frames = [_frame(each, site) for each in solved]
@@ -391,7 +390,9 @@ def _written(
         (folder / "cot.xml").unlink(missing_ok=True)  # an earlier version's, with invented dates
     for file, text in texts.items():
         atomic_write_bytes(folder / file, text)
-    files = [*texts]
+    files, sentences = [*texts], [_UNDIAGNOSED]
+    if compared is not None:
+        sentences = fault_sentences(compared.faults, compared.names)
     video = None if compared is None else _video(compared.setup.source)
     if compared is not None and video is not None:
         with atomic_path(folder / f"{name}.ts") as temporary:
@@ -399,11 +400,16 @@ def _written(
             index, seconds = zip(*((each.index, each.seconds) for each in solved))
             shown = {
                 float(np.interp(number, index, seconds)): targets
-                for number, targets in seen.items()
+                for number, targets in (seen or {}).items()
                 if index[0] <= number <= index[-1]
             }
             samples = _samples(compared, solved, site, shown)
             mux_klv(video, temporary, *samples, site.height_reference, shown)
+            if seen is not None:
+                taken, found = (sum(map(len, each.values())) for each in (shown, seen))
+                words = f"{taken} of {counted(found, 'detection')} are in {name}.ts as VMTI"
+                rest = "; the frames of the others lie before the map's first or after its last"
+                sentences.append(words + rest * (taken < found))
         files.append(f"{name}.ts")
     report = dict(
         plain_json(
@@ -413,9 +419,7 @@ def _written(
                 "frames": len(frames),
                 "height_reference": site.height_reference,
                 "faults": None if compared is None else asdict(compared.faults),
-                "sentences": [_UNDIAGNOSED]
-                if compared is None
-                else fault_sentences(compared.faults, compared.names),
+                "sentences": sentences,
                 "files": files,
                 "warnings": _warnings(site, mapped, frames),
             }
@@ -452,9 +456,11 @@ def _detections(folder: Path, source: Source) -> dict[int, list[VmtiTarget]]:
             for number, line in enumerate(lines, _UNTRACKED):
                 row = json.loads(line)
                 place = (float(row.get(name, nan)) for name in ("latitude", "longitude"))
-                track, box_px = row["track"] or number, [float(edge) for edge in row["box_px"]]
-                target = VmtiTarget(track, row["class"], float(row["score"]), box_px, *place)
-                seen.setdefault(int(row["frame"]), []).append(target)
+                others, box_px = seen.setdefault(int(row["frame"]), []), map(float, row["box_px"])
+                is_free = row["track"] not in (None, *(each.number for each in others))
+                track = row["track"] if is_free else number  # a number stands once in a frame
+                target = VmtiTarget(track, row["class"], float(row["score"]), [*box_px], *place)
+                others.append(target)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
             f"{folder / LINES} is gone or damaged ({error!r}); watch the flight again"
