@@ -445,6 +445,8 @@ def test_a_crew_plants_people_of_its_own(site: Path, tmp_path: Path) -> None:
     planted = report["flights"][0]["classes"]["person"]
     assert report["cut_outs"] == ["ours.png"] and planted["found"] >= 0.6 * planted["planted"] > 0
     assert any("plants are 1 picture of your own people" in each for each in report["warnings"])
+    sheet = np.asarray(Image.open(tmp_path / "out" / "cut-outs.png"))
+    assert (sheet[..., 3] > 127).sum() == pytest.approx(1.8 * 0.6 * 1e4, rel=0.05)
     again = _report(site, tmp_path / "out", Comparing(site), settings, **outputs)
     assert again["flights"][0]["measured_before"]
     drawn = _report(site, tmp_path / "out", Comparing(site), settings)

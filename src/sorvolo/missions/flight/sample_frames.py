@@ -13,20 +13,20 @@ _SAMPLES = 5  # frames of a flight; by choice
 _LIVE_STEP_S = 0.5  # between the frames of a live flight
 
 
-def sample_frames(source: Source, count: int = _SAMPLES) -> list[Frame]:
+def sample_frames(source: Source) -> list[Frame]:
     """A few frames spread over the flight; of a live one the next few, half a second apart, which ends it."""
     if isinstance(source, VideoSource):
-        return source.sample_frames(count)
+        return source.sample_frames(_SAMPLES)
     if isinstance(source, LiveSource):
         coming = islice(
             source.frames(every(_LIVE_STEP_S if source.kind == "video" else 0.0)), _SAMPLES
         )
         return [frame for frame in coming if isinstance(frame, Frame)]
-    return list(_spread_photos(source, count))
+    return list(_spread_photos(source))
 
 
-def _spread_photos(source: Source, count: int = _SAMPLES) -> Iterator[Frame]:
-    chosen = set(evenly(source.frame_count, count))
+def _spread_photos(source: Source) -> Iterator[Frame]:
+    chosen = set(evenly(source.frame_count, _SAMPLES))
     return (
         frame
         for frame in source.frames(lambda index, _: index in chosen)

@@ -17,12 +17,12 @@ from sorvolo.geometry.level_ground import footprint, is_on_ground
 from sorvolo.heights.field import above_ground
 from sorvolo.missions.flight.detector_protocol import FindsObjects, ObjectDetector
 from sorvolo.missions.flight.map_objects import open_detector, why_not_searched
-from sorvolo.missions.flight.sample_frames import sample_frames
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import prepare
 from sorvolo.missions.heights.measure import flight_with_heights, read_field
 from sorvolo.missions.search.measure import SearchFrame, planted_classes
 from sorvolo.missions.search.settings import RESULTS, SearchOutputs, SearchSettings
+from sorvolo.mosaic.selection import evenly
 from sorvolo.registration.lens import at_most
 from sorvolo.search.conditions import AboveGround
 from sorvolo.search.drawing.cut_outs import FEWEST_PICTURES, CutOut, alphas_by_difference
@@ -35,7 +35,7 @@ from sorvolo.store.site.catalogue_place import is_site
 from sorvolo.store.site.files import HeightFile
 from sorvolo.store.site.journal import content_sha256
 from sorvolo.survey.area import Area
-from sorvolo.survey.flight import Site
+from sorvolo.survey.flight import Frame, Site
 from sorvolo.survey.mosaic import PlacedFrame, Status
 
 
@@ -241,7 +241,9 @@ def _by_difference(source: Source, m_per_px: float | None) -> list[CutOut | None
             f"--plant: nothing states how high {source.name} was taken; give --plant-cm, the centimetres of ground that "
             "a pixel covers"
         )
-    frames = sample_frames(source, _SERIES)
+    chosen = set(evenly(source.frame_count, _SERIES))
+    wanted = source.frames(lambda index, _: index in chosen)
+    frames = [each for each in wanted if isinstance(each, Frame)]
     times = max(1.0, _FINEST_M / m_per_px)
     images = [at_most(each.image, round(max(each.image.shape) / times)) for each in frames]
     lights = [frame_light(each) for each in images]

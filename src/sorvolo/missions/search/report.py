@@ -15,9 +15,9 @@ from sorvolo.geometry.summary import calibration_bins, median_of_known, wilson
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.plan_flight import REFLY_LEAST_M2, REFLY_LOWEST_M, REFLY_MOST_HOLES, fly_again
 from sorvolo.missions.search.measure import MeasuredClass, MeasuredFlight, SearchFrame
-from sorvolo.missions.search.settings import FIGURES, SearchOutputs, SearchSettings
+from sorvolo.missions.search.settings import CUT_OUTS, FIGURES, SearchOutputs, SearchSettings
 from sorvolo.search.cells import Cells
-from sorvolo.search.drawing.cut_outs import CutOut
+from sorvolo.search.drawing.cut_outs import CutOut, sheet_of
 from sorvolo.search.holes import (
     POD_EDGES,
     REASONS,
@@ -51,6 +51,7 @@ from sorvolo.store.exports.pod_files import (
     swollen_polygons,
     write_pod_tif,
 )
+from sorvolo.store.images import png_from_rgba
 from sorvolo.store.pages.search import search_page
 from sorvolo.survey.area import Area, inside_any
 from sorvolo.survey.flight import Site
@@ -354,8 +355,8 @@ def _warnings(searched: Searched, settings: SearchSettings, *, is_over: bool) ->
         gsd_m = searched.height_m / searched.camera.fx_px
         coarse = sum(each.m_per_px > 1.2 * gsd_m for each in searched.cut_outs)
         warnings.append(
-            f"plants are {counted(len(searched.cut_outs), 'picture')} of your own people: the probability is of such who "
-            f"dress and lie so{'; ' + str(coarse) + ' of the pictures are coarser than the flight, so that it is too low' * bool(coarse)}"
+            f"plants are {counted(len(searched.cut_outs), 'picture')} of your own people (look at {CUT_OUTS}): the probability is of such "
+            f"who dress and lie so{'; ' + str(coarse) + ' of the pictures are coarser than the flight, so that it is too low' * bool(coarse)}"
         )
     elif "person" in searched.labels:
         warnings.append(
@@ -481,6 +482,8 @@ def write_search(
             outputs.refly, was_stopped=was_stopped, leaves_earlier=len(seen_before_m) > 0
         )
     )
+    if searched.cut_outs:
+        atomic_write_bytes(outputs.folder / CUT_OUTS, png_from_rgba(sheet_of(searched.cut_outs)))
     report = build_search_report(searched, settings, detector, refly, so_far, warnings)
     atomic_write_bytes(outputs.folder / "search.json", json_bytes(report))
     write_page(outputs.folder / "search.html", search_page(report, pictures))

@@ -6,7 +6,10 @@ from pathlib import Path
 from sorvolo.errors import SettingsError
 from sorvolo.paths import as_path, listed
 
-FIGURES = ("search.html", "search.json", "pod.tif", "pod.geojson")
+CUT_OUTS = "cut-outs.png"
+"""The file of a search's folder that shows the people who were cut out and planted."""
+
+FIGURES = ("search.html", "search.json", "pod.tif", "pod.geojson", CUT_OUTS)
 """The files of a search's folder that hold its figures."""
 
 PLANTS = "plants.geojson"

@@ -103,6 +103,25 @@ class CutThing(Thing):
         return Body((DrawnPatch.spanned(level_m, texture, np.zeros(3)),))
 
 
+def sheet_of(cut_outs: Sequence[CutOut]) -> ImageRGBA:
+    """(H, W, 4) all of them in a row, 1 cm a pixel, clear where nobody is."""
+    shown = [
+        cv2.resize(
+            each.texture,
+            (max(1, round(100 * width)), max(1, round(100 * height))),
+            interpolation=cv2.INTER_AREA,
+        )
+        for each in cut_outs
+        for width, height in [each.size_m]
+    ]
+    side = max(max(each.shape[:2]) for each in shown) + 10
+    sheet: ImageRGBA = np.zeros((side, side * len(shown), 4), np.uint8)
+    for number, each in enumerate(shown):
+        height, width = each.shape[:2]
+        sheet[5 : 5 + height, number * side + 5 : number * side + 5 + width] = each
+    return sheet
+
+
 def alphas_by_difference(images: Sequence[ImageRGB], m_per_px: float) -> list[Floats]:
     """Where each of several pictures (H, W, 3) of the same ground shows the person who is elsewhere in the others.
 
