@@ -85,6 +85,15 @@ def test_the_qgis_project_finds_what_lies_beside_it(client: TestClient, tmp_path
     project = fromstring(path.read_bytes())
     assert project.tag == "qgis" and project.get("version", "").startswith("3.")
     assert project.findtext("properties/Paths/Absolute") == "false"
+    # without this number and each CRS's WKT QGIS 3 reads none: QgsProject, QgsCoordinateReferenceSystem::readXml
+    assert project.findtext("properties/SpatialRefSys/ProjectionsEnabled") == "1"
+    systems = {
+        each.findtext("authid"): CRS.from_wkt(each.findtext("wkt", ""))
+        for each in project.iter("spatialrefsys")
+    }
+    assert (
+        all(f"EPSG:{crs.to_epsg()}" == name for name, crs in systems.items()) and len(systems) == 2
+    )
     layers = {each.findtext("id"): each for each in project.findall("projectlayers/maplayer")}
     shown = [each.get("id") for each in project.iter("layer-tree-layer")]
     assert shown[-1] == "mosaic" and set(shown) == set(layers)  # the map below all others

@@ -223,6 +223,8 @@ def qgs_of(
             geopackage=geopackage,
             mosaic=mosaic,
             crs=map_.crs,
+            wkt=map_.crs.to_wkt(),
+            wgs84_wkt=_WGS84_WKT,
             bounds=map_.bounds,
             alpha_band=4 if map_.count == 4 else -1,
         )
