@@ -18,7 +18,7 @@ from sorvolo.heights.adjustment import (
     matched_deviations,
     triangulate,
 )
-from sorvolo.heights.cameras import Cameras3D, solve_cameras
+from sorvolo.heights.cameras import Cameras3D, find_tracks, solve_tracks
 from sorvolo.heights.figures import camera_warnings
 from sorvolo.heights.smooth_sigma import SmoothSigma
 from sorvolo.registration.features import gray_from_rgb
@@ -188,7 +188,7 @@ def test_cameras_are_solved_from_pictures(survey) -> None:
         )
         for view in views
     ]
-    solved = solve_cameras(off, lambda number: pictures[number])
+    solved = solve_tracks(off, find_tracks(off, lambda number: pictures[number]))
     assert not solved.lost
     places = np.array([view.site_from_camera.translation_m for view in solved.views])
     true = np.array([view.site_from_camera.translation_m for view in views])
@@ -217,7 +217,7 @@ def test_a_map_that_leans_on_a_slope_does_not_tilt_the_heights(survey) -> None:
         )
         for number, view in enumerate(views)
     ]
-    solved = solve_cameras(off, lambda number: pictures[number])
+    solved = solve_tracks(off, find_tracks(off, lambda number: pictures[number]))
     axes = np.array(
         [
             (view.site_from_camera.rotation - true.site_from_camera.rotation)[:, 2]
@@ -229,7 +229,7 @@ def test_a_map_that_leans_on_a_slope_does_not_tilt_the_heights(survey) -> None:
 
 def test_one_strip_is_named_as_weak(survey) -> None:
     views, pictures = survey
-    solved = solve_cameras(views[:4], lambda number: pictures[number])
+    solved = solve_tracks(views[:4], find_tracks(views[:4], lambda number: pictures[number]))
     assert any("one strip" in each for each in camera_warnings(solved))
 
 
@@ -254,7 +254,7 @@ def test_pictures_without_common_points_are_refused() -> None:
     rng = np.random.default_rng(0)
     noise = [rng.integers(0, 255, (240, 320), dtype=np.uint8) for _ in views]
     with pytest.raises(InputError, match="overlap"):
-        solve_cameras(views, lambda number: noise[number])
+        solve_tracks(views, find_tracks(views, lambda number: noise[number]))
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])

@@ -10,8 +10,11 @@ import pytest
 
 from small_flights import simulate_into, small_flight
 from sorvolo.cli.main import main
+from sorvolo.errors import DiskFullError
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.lab.simulation.settings import OutputSettings
+from sorvolo.missions.heights import run as heights_run
+from sorvolo.missions.map import planar_run
 
 _LEVEL = small_flight(
     6,
@@ -102,3 +105,37 @@ def _off_m(folder: Path) -> np.ndarray:
 
 def _corners_m(feature: dict[str, Any], frame: LocalFrame) -> np.ndarray:
     return frame.ground_from_lonlat(np.array(feature["geometry"]["coordinates"][0])[:4])
+
+
+def test_a_map_that_a_full_disk_stopped_keeps_what_its_heights_took(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    simulate_into(tmp_path / "made", replace(_LEVEL, scene=replace(_LEVEL.scene, relief_m=12.0)))
+    folder = tmp_path / "made"
+
+    def mapped(site: Path) -> int:
+        command = [
+            "map",
+            str(folder / "flight1" / "photos"),
+            "--site",
+            str(site),
+            "--model",
+            "none",
+        ]
+        return main([*command, "--camera", str(folder / "camera.xml")])
+
+    def full(*_: object) -> None:
+        raise DiskFullError("disk full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(planar_run, "ground_tiles", full)
+        assert mapped(tmp_path / "stopped") == 1
+    with monkeypatch.context() as patch:
+        for each in ("find_tracks", "sweep_surface"):  # minutes of work of a large flight
+            patch.setattr(heights_run, each, full)
+        assert mapped(tmp_path / "stopped") == 0
+    assert mapped(tmp_path / "whole") == 0
+    for name in ("mosaic.tif", "flights/photos/heights.tif", "flights/photos/terrain.tif"):
+        assert (tmp_path / "stopped" / name).read_bytes() == (
+            tmp_path / "whole" / name
+        ).read_bytes()

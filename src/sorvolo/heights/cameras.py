@@ -221,16 +221,8 @@ class Cameras3D:
     view_pieces: Rows = field(default_factory=lambda: np.zeros(0, int))
 
 
-def solve_cameras(
-    views: Sequence[View],
-    gray: Callable[[int], ImageGray],
-) -> Cameras3D:
-    """The cameras of a flight in 3D. Raises InputError where photos share too little for it."""
-    return solve_tracks(views, find_tracks(views, gray))
-
-
 def solve_tracks(views: Sequence[View], tracks: Tracks) -> Cameras3D:
-    """The cameras of a flight by points found before; attitudes may lean as the map's do on a slope.
+    """The cameras of a flight in 3D, by the points of `find_tracks`; attitudes may lean as the map's do on a slope.
 
     Raises InputError where photos share too little for it.
     """

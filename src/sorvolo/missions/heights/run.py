@@ -13,7 +13,7 @@ from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import Floats32, ImageGray, ImageRGB, ImageRGBA
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.geometry.pose import Pose
-from sorvolo.heights.cameras import Cameras3D, solve_cameras
+from sorvolo.heights.cameras import Cameras3D, Tracks, find_tracks, solve_tracks
 from sorvolo.heights.figures import (
     camera_figures,
     camera_warnings,
@@ -29,6 +29,7 @@ from sorvolo.heights.terrain import terrain
 from sorvolo.heights.views import View, fix_from_residual, ground_outlines_m, pixels_wide
 from sorvolo.missions.flight.headline import contradicts_itself
 from sorvolo.missions.flight.report import peak_memory_mb
+from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.mission import FlightOutcome, mission
 from sorvolo.mosaic.exposure import corrected
 from sorvolo.paths import AnyPath
@@ -259,21 +260,28 @@ def model_ground(
     views: Sequence[View],
     keyframes: Sequence[StoredKeyframe],
     cell_m: float | None = None,
+    memo: ResultCache | None = None,
 ) -> Generator[HeightsUpdate, None, GroundModel]:
     """The ground that views, each of one keyframe, see in space, yielding progress.
 
-    Raises InputError where they share too little for it.
+    What a killed run found out is taken from its `memo`. Raises InputError where views share too little for it.
     """
+    memo, last = memo or ResultCache(), keyframes[-1]
     flight_id, site = keyframes[0].flight_id, archive.site()
     started_s = time.monotonic()
     _lattice(site, views, cell_m)  # too many cells end here, before minutes of work
     yield HeightsUpdate(flight_id, "cameras", 0.0)
-    solved = solve_cameras(views, FlightPictures(archive, keyframes).gray)
+    gray = FlightPictures(archive, keyframes).gray
+    tracks = memo.of(last, "tracks", Tracks, lambda: find_tracks(views, gray))
+    solved = solve_tracks(views, tracks)
     kept = [each for each in keyframes if each.name not in set(solved.lost)]
     pictures = FlightPictures(archive, kept, solved.radial)
     cameras_s = time.monotonic() - started_s
     give_back()
-    swept = yield from _sweep(site, solved, pictures, cell_m, flight_id)
+    swept = memo.known(last.index, "surface", Surface)
+    if swept is None:
+        swept = yield from _sweep(site, solved, pictures, cell_m, flight_id)
+        memo.keep(last, "surface", swept, compresses=True)
     surface, judgement = judged_by_points(swept, solved)
     yield HeightsUpdate(flight_id, "ground", 0.0)
     bare_m, shows_ground = terrain(surface.lattice, surface.up_m)

@@ -11,6 +11,7 @@ from sorvolo.geometry.homography import apply_homography
 from sorvolo.geometry.level_ground import is_on_ground
 from sorvolo.heights.views import View, fix_from_residual, ground_outlines_m
 from sorvolo.missions.flight.report import LEVEL, MapShape
+from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.heights.run import GroundModel, model_ground
 from sorvolo.mosaic.graph_report import GraphReport
 from sorvolo.store.site.archive import Archive
@@ -59,7 +60,10 @@ def shape_of(
 
 
 def ground_of(
-    archive: Archive, frames: Sequence[PlacedFrame], keyframes: Sequence[StoredKeyframe]
+    archive: Archive,
+    frames: Sequence[PlacedFrame],
+    keyframes: Sequence[StoredKeyframe],
+    memo: ResultCache,
 ) -> GroundModel | str:
     """The ground that a flight's frames see, each stored as the keyframe beside it; why there is none, in words."""
     views = [
@@ -72,7 +76,7 @@ def ground_of(
         for frame, stored in zip(frames, keyframes, strict=True)
         if stored.site_from_camera is not None
     ]
-    work = model_ground(archive, views, keyframes)
+    work = model_ground(archive, views, keyframes, memo=memo)
     while True:
         try:
             next(work)

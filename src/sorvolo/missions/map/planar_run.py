@@ -399,7 +399,7 @@ class PlanarRun(FlightRun):
             frames = [each for each in placed if each.status is not Status.REJECTED]
             keyframes = [writer.keyframe(each, self.images[each.index]) for each in frames]
             with self._log.stage(Stage.HEIGHTS):
-                found = ground_of(self._archive, frames, keyframes)
+                found = ground_of(self._archive, frames, keyframes, self._memo)
             if isinstance(found, str):
                 shape = MapShape(True, f"the map is flat, for heights could not be made: {found}")
             else:
