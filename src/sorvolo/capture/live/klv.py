@@ -163,10 +163,10 @@ def vmti_set(
         for label, number in classes.items()
     ]
     count = _unsigned(len(targets))
-    items = {3: b"sorvolo", 4: bytes([6]), 5: count, 6: count}
-    items |= {8: _unsigned(size_px[0]), 9: _unsigned(size_px[1])}
+    width, height = map(_unsigned, size_px)
+    items = {3: b"sorvolo", 4: b"\6", 5: count, 6: count, 8: width, 9: height}
     items |= {101: _series(packs), 103: _series(ontology)}
-    return b"".join(_tagged(tag, value) for tag, value in items.items())
+    return b"".join(_tagged(*item) for item in items.items())
 
 
 def checksum(data: bytes) -> int:

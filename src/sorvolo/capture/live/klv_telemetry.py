@@ -7,7 +7,6 @@ from fractions import Fraction
 from math import cos, isfinite, isnan, nan, radians, sin, tan
 from pathlib import Path
 from statistics import median
-from types import MappingProxyType
 from typing import Any, TypeAlias
 
 import av
@@ -248,7 +247,7 @@ def mux_klv(
     samples: Sequence[CorrectedFrame],
     headings_deg: Sequence[float],
     height_reference: str,
-    detections: Mapping[float, Sequence[VmtiTarget]] = MappingProxyType({}),
+    detections: Mapping[float, Sequence[VmtiTarget]],
 ) -> None:
     """Write `target`, an MPEG transport stream with the video's own packets and these samples as MISB ST 0601.
 

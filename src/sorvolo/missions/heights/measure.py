@@ -27,7 +27,6 @@ from sorvolo.store.site.files import DamagedError, HeightFile
 from sorvolo.survey.flight import Site
 
 _MOST_BYTES = 16_000_000  # of heights.json, which has kilobytes; by choice
-_PART_CELLS = 1024  # a side of what a point cloud is written by: bounds the memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +133,7 @@ def coloured_heights(archive: Archive, version: VersionEntry) -> Iterator[PointC
     lattice, colours = surface.lattice, archive.tiles(version.id)
     grid, cells = archive.site_grid().grid, height_grid(archive.site(), lattice.cell_m).grid
     stands, _ = standing(surface, ground)
-    for x0, y0, x1, y1 in lattice.windows(_PART_CELLS):
+    for x0, y0, x1, y1 in lattice.windows(1024):  # bounds the memory
         rows, columns = np.nonzero(np.isfinite(surface.up_m[y0:y1, x0:x1]))
         at = rows + y0, columns + x0
         places_m = cells.projected_from_grid(np.column_stack(at[::-1]) + np.array(lattice.first))

@@ -28,6 +28,7 @@ _TIME = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d{1,6})?(Z|[+-]\d\d:\d\d)
 _APPLICATION = 0x47504B47  # "GPKG"
 _VERSION = 10300  # GeoPackage 1.3.0, as its requirement 2 writes it
 _WGS84 = 4326
+_NOW = "strftime('%Y-%m-%dT%H:%M:%S.000Z', 'now')"
 _WGS84_WKT = (
     'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],PRIMEM["Greenwich",0],'
     'UNIT["degree",0.0174532925199433],AUTHORITY["EPSG","4326"]]'
@@ -104,10 +105,9 @@ def _write_layer(file: sqlite3.Connection, name: str, features: Sequence[Feature
         ],
     )
     bounds = shapely.total_bounds(shapes)
-    now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.000Z")
     file.execute(
-        "INSERT INTO gpkg_contents VALUES (?, 'features', ?, '', ?, ?, ?, ?, ?, ?)",
-        (name, name, now, *(float(each) for each in bounds), _WGS84),
+        f"INSERT INTO gpkg_contents VALUES (?, 'features', ?, '', {_NOW}, ?, ?, ?, ?, ?)",
+        (name, name, *(float(each) for each in bounds), _WGS84),
     )
     file.execute(
         "INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, ?, 0, 0)", (name, kind, _WGS84)
@@ -118,15 +118,14 @@ def _write_styles(file: sqlite3.Connection, styles: Mapping[str, str]) -> None:
     """The table in which QGIS keeps styles; registered, so that programs do not take it for a damaged layer."""
     if not styles:
         return
-    now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.000Z")
     file.execute(_STYLES_TABLE)
     file.executemany(
-        "INSERT INTO layer_styles VALUES (NULL, '', '', ?, 'geom', 'sorvolo', ?, '', 1, 'Sorvolo', '', NULL, ?)",
-        [(name, qml, now) for name, qml in styles.items()],
+        f"INSERT INTO layer_styles VALUES (NULL, '', '', ?, 'geom', 'sorvolo', ?, '', 1, 'Sorvolo', '', NULL, {_NOW})",
+        styles.items(),
     )
     file.execute(
-        "INSERT INTO gpkg_contents VALUES (?, 'attributes', ?, '', ?, NULL, NULL, NULL, NULL, 0)",
-        ("layer_styles", "layer_styles", now),
+        "INSERT INTO gpkg_contents VALUES ('layer_styles', 'attributes', 'layer_styles', '', "
+        f"{_NOW}, NULL, NULL, NULL, NULL, 0)"
     )
 
 

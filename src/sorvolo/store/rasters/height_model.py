@@ -16,7 +16,6 @@ from rasterio.transform import Affine
 from rasterio.windows import Window
 from scipy.ndimage import map_coordinates
 
-from sorvolo.build import VERSION
 from sorvolo.errors import InputError, NoHeightsError, StoreError
 from sorvolo.geometry.arrays import Floats, Floats32, Mask
 from sorvolo.geometry.crs import WGS84, transformer, vertical_name
@@ -237,11 +236,6 @@ def read_height_cog(path: Path, grid: Grid) -> HeightBands:
         ) from error
 
 
-_GROUND, _OTHER = 2, 1  # classes of LAS 1.4: the second is "unclassified"
-_LAZ_STEP_M = 0.001
-_WITH_COLOUR = 7  # the point format of LAS 1.4 without near infrared
-
-
 @dataclass(frozen=True, eq=False)
 class PointCloud:
     """Points (N, 3) of easting, northing, height, m, with their sigma (N,), colour (N, 3), and whether they are ground."""
@@ -270,15 +264,15 @@ def write_laz(parts: Iterable[PointCloud], grid: Grid, height_reference: str, pa
     header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt))
     header.vlrs.append(laspy.VLR("LASF_Spec", 3, "", f"heights: {height_reference}".encode()))
     header.global_encoding.wkt = True
-    header.generating_software = f"sorvolo {VERSION}"
-    header.scales, header.offsets = np.full(3, _LAZ_STEP_M), np.rint([*grid.origin_m, 0])
+    header.generating_software = "sorvolo"
+    header.scales, header.offsets = np.full(3, 0.001), np.rint([*grid.origin_m, 0])
     try:
         with atomic_path(path) as temporary, laspy.open(temporary, "w", header=header) as sink:
             for part in parts:
                 points = laspy.ScaleAwarePointRecord.zeros(len(part.points_m), header=header)
                 points.x, points.y, points.z = part.points_m.T
                 points.red, points.green, points.blue = part.rgb.T * np.uint16(257)  # of 16 bits
-                points.classification = np.where(part.is_ground, _GROUND, _OTHER)
+                points.classification = 1 + part.is_ground  # "unclassified" is 1, ground 2
                 points.return_number[:] = points.number_of_returns[:] = 1
                 points["sigma_m"] = part.sigma_m
                 sink.write_points(points)
