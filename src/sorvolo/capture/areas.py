@@ -186,7 +186,21 @@ def _from_geojson(path: Path, text: str) -> list[Rings]:
     try:
         tree = json.loads(text)
         if tree.get("fileType") == "Plan":
-            return _from_plan(path, tree)
+            # the surveys' polygons of a QGroundControl plan; their corners are latitude
+            # first
+            items = tree["mission"]["items"]
+            corners = [
+                each["polygon"]
+                for each in items
+                if each.get("type") == "ComplexItem" and "polygon" in each
+            ]
+            if not corners:
+                raise InputError(
+                    f"{path}: a QGroundControl plan without a survey's polygon; draw the area as a survey in it, or give it as "
+                    "GeoJSON or KML"
+                )
+            order = "a plan puts latitude first"
+            return [(_checked(path, _positions(path, each)[:, ::-1], order),) for each in corners]
         polygons, lines = _geojson_shapes(path, tree, _wgs84_from_stated(path, tree))
     except (
         ValueError,
@@ -212,21 +226,6 @@ def _wgs84_from_stated(path: Path, tree: Any) -> Callable[[Floats], Floats]:
     return lambda places: _checked(
         path, np.column_stack(to_wgs84.transform(places[:, 0], places[:, 1])), f"its crs is {name}"
     )
-
-
-def _from_plan(path: Path, tree: Any) -> list[Rings]:
-    """The surveys' polygons of a QGroundControl plan; their corners are latitude first."""
-    items = tree["mission"]["items"]
-    corners = [
-        each["polygon"] for each in items if each.get("type") == "ComplexItem" and "polygon" in each
-    ]
-    if not corners:
-        raise InputError(
-            f"{path}: a QGroundControl plan without a survey's polygon; draw the area as a survey in it, or give it as "
-            "GeoJSON or KML"
-        )
-    order = "a plan puts latitude first"
-    return [(_checked(path, _positions(path, each)[:, ::-1], order),) for each in corners]
 
 
 def _geometries(tree: Any) -> Iterator[Any]:

@@ -137,7 +137,27 @@ def camera_from_option(option: str, width_px: int, height_px: int) -> CameraMode
         return _camera_of_preset(_nearest_in_size(presets, width_px), width_px, height_px, math.nan)
     key, equals, text = option.partition("=")
     if equals:
-        return _camera_of_number(key.strip().lower(), text, width_px, height_px)
+        key = key.strip().lower()
+        try:
+            number = float(text)
+        except ValueError as error:
+            raise InputError(f"--camera {key}={text}: {text!r} is not a number") from error
+        sigma = 0.03
+        if key == "aov":
+            focal_px = (
+                0.5 * width_px / math.tan(math.radians(number) / 2)
+                if 0 < number < 180
+                else math.nan
+            )
+        elif key == "focal_px":
+            focal_px = number
+        elif key == "focal_35mm":
+            focal_px, sigma = _focal_px(number, width_px, height_px), 0.05
+        else:
+            raise InputError(f"--camera {key}={text}: the key must be aov, focal_px or focal_35mm")
+        if not _is_lens(focal_px, width_px):
+            raise InputError(f"--camera {key}={text}: no lens for pictures {width_px} px wide")
+        return _plain_camera(width_px, height_px, focal_px, f"given as {key}={number:g}", sigma)
     if path.suffix.lower() in (".xml", ".yml", ".yaml", ".json") or "/" in option:
         raise InputError(f"{option}: no such camera file")
     raise InputError(
@@ -166,27 +186,6 @@ def _camera_of_preset(
         return _plain_camera(width_px, height_px, focal_px, words, preset.focal_sigma)
     words += f"; not a full photo of {preset.width_px} px, and video may use less of the sensor"
     return _plain_camera(width_px, height_px, focal_px, words, max(0.05, preset.focal_sigma))
-
-
-def _camera_of_number(key: str, text: str, width_px: int, height_px: int) -> CameraModel:
-    try:
-        number = float(text)
-    except ValueError as error:
-        raise InputError(f"--camera {key}={text}: {text!r} is not a number") from error
-    sigma = 0.03
-    if key == "aov":
-        focal_px = (
-            0.5 * width_px / math.tan(math.radians(number) / 2) if 0 < number < 180 else math.nan
-        )
-    elif key == "focal_px":
-        focal_px = number
-    elif key == "focal_35mm":
-        focal_px, sigma = _focal_px(number, width_px, height_px), 0.05
-    else:
-        raise InputError(f"--camera {key}={text}: the key must be aov, focal_px or focal_35mm")
-    if not _is_lens(focal_px, width_px):
-        raise InputError(f"--camera {key}={text}: no lens for pictures {width_px} px wide")
-    return _plain_camera(width_px, height_px, focal_px, f"given as {key}={number:g}", sigma)
 
 
 def _focal_px(focal_35mm: float, width_px: int, height_px: int) -> float:

@@ -126,21 +126,6 @@ def find_board(name: str, image: ImageRGB, board: Board) -> BoardView | NoBoard:
     return BoardView(name, corners_px, float(np.ravel(sharpness[0])[0]))
 
 
-def select_views(views: Sequence[BoardView], width_px: int, height_px: int) -> list[BoardView]:
-    """The views worth using: of nearly equal ones the sharpest, at most `MOST_VIEWS`, far from each other."""
-    same_px = _SAME_VIEW * float(np.hypot(width_px, height_px))
-    distinct: list[BoardView] = []
-    for view in sorted(views, key=lambda each: each.blur_px):
-        if all(_distance_px(view, other) >= same_px for other in distinct):
-            distinct.append(view)
-    chosen, rest = distinct[:1], distinct[1:]
-    while rest and len(chosen) < MOST_VIEWS:
-        farthest = max(rest, key=lambda each: min(_distance_px(each, other) for other in chosen))
-        rest.remove(farthest)
-        chosen.append(farthest)
-    return chosen
-
-
 def _rounded_down(value: float) -> str:
     """To a tenth, so that too little never reads as enough."""
     return f"{np.floor(10 * value) / 10:.1f}"
@@ -154,12 +139,30 @@ def calibrate(
     Refused are fewer than 8 views that differ, boards that leave most of the picture empty, boards without a
     variety of tilts (the focal length is then not determined), and a fit that is bad or uncertain.
     """
-    used = select_views(views, width_px, height_px)
+    # the views worth using: of nearly equal ones the sharpest, at most `MOST_VIEWS`, far
+    # from each other
+    same_px = _SAME_VIEW * float(np.hypot(width_px, height_px))
+    distinct: list[BoardView] = []
+    for view in sorted(views, key=lambda each: each.blur_px):
+        if all(_distance_px(view, other) >= same_px for other in distinct):
+            distinct.append(view)
+    used, rest = distinct[:1], distinct[1:]
+    while rest and len(used) < MOST_VIEWS:
+        farthest = max(rest, key=lambda each: min(_distance_px(each, other) for other in used))
+        rest.remove(farthest)
+        used.append(farthest)
     _need(
         len(used) >= FEWEST_VIEWS,
         f"{len(used)} different views of the board, {FEWEST_VIEWS} are needed",
     )
-    coverage = _coverage(used, board, width_px, height_px)
+    # the part of the picture that lies inside the corners of at least one board
+    scale = 200 / max(width_px, height_px)
+    seen = np.zeros((round(height_px * scale), round(width_px * scale)), np.uint8)
+    count = board.columns * board.rows
+    outline = np.array([0, board.columns - 1, count - 1, count - board.columns])
+    for view in used:
+        cv2.fillConvexPoly(seen, np.rint(view.corners_px[outline] * scale).astype(np.int32), 1)
+    coverage = float(seen.mean())
     _need(
         coverage >= LEAST_COVERAGE,
         f"the boards fill {_rounded_down(100 * coverage)} % of the picture, {LEAST_COVERAGE:.0%} are needed",
@@ -241,17 +244,6 @@ def _outliers(view_errors_px: Floats) -> list[int]:
     return [
         int(index) for index in np.flatnonzero(view_errors_px > middle + max(4 * spread, middle))
     ]
-
-
-def _coverage(views: Sequence[BoardView], board: Board, width_px: int, height_px: int) -> float:
-    """The part of the picture that lies inside the corners of at least one board."""
-    scale = 200 / max(width_px, height_px)
-    seen = np.zeros((round(height_px * scale), round(width_px * scale)), np.uint8)
-    count = board.columns * board.rows
-    outline = np.array([0, board.columns - 1, count - 1, count - board.columns])
-    for view in views:
-        cv2.fillConvexPoly(seen, np.rint(view.corners_px[outline] * scale).astype(np.int32), 1)
-    return float(seen.mean())
 
 
 def _distance_px(a: BoardView, b: BoardView) -> float:

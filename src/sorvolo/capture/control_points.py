@@ -149,7 +149,20 @@ def read_control_points(path: Path) -> ControlFile:
     lines = _labelled([_line(path, number, line) for number, line in numbered[1:]])
     if not lines:
         raise InputError(f"{path}: no control point after its first line; {_NEEDED} is needed")
-    _check_labels(path, lines)
+    first: dict[str, _Line] = {}
+    marked: set[tuple[str, str]] = set()
+    for line in lines:
+        known = first.setdefault(line.label, line)
+        if (known.x, known.y) != (line.x, line.y):
+            raise InputError(
+                f"{path}: {line.label} has other coordinates in line {line.number} than in line {known.number}; give "
+                "each point one place"
+            )
+        if (line.label, line.image) in marked:
+            raise InputError(
+                f"{path}, line {line.number}: {line.label} is marked twice in {line.image}; keep one mark"
+            )
+        marked.add((line.label, line.image))
     return ControlFile(path, crs_words, tuple(lines))
 
 
@@ -253,23 +266,6 @@ def _labelled(lines: Sequence[_Line]) -> list[_Line]:
         else replace(line, label=names.setdefault((line.x, line.y), f"point {len(names) + 1}"))
         for line in lines
     ]
-
-
-def _check_labels(path: Path, lines: Sequence[_Line]) -> None:
-    first: dict[str, _Line] = {}
-    marked: set[tuple[str, str]] = set()
-    for line in lines:
-        known = first.setdefault(line.label, line)
-        if (known.x, known.y) != (line.x, line.y):
-            raise InputError(
-                f"{path}: {line.label} has other coordinates in line {line.number} than in line {known.number}; give "
-                "each point one place"
-            )
-        if (line.label, line.image) in marked:
-            raise InputError(
-                f"{path}, line {line.number}: {line.label} is marked twice in {line.image}; keep one mark"
-            )
-        marked.add((line.label, line.image))
 
 
 def _parsed_crs(words: str, path: Path) -> CRS:

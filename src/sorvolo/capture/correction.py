@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from sorvolo.geometry.arrays import Floats, Mask, PointsM, Rows
+from sorvolo.geometry.arrays import Floats, Mask, PointsM
 from sorvolo.geometry.pose import Pose
 from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 from sorvolo.survey.corrected import Bias, PathFit, TelemetryFaults
@@ -204,7 +204,14 @@ def headings_deg(
     if not known.any():
         known = np.ones(len(poses), bool)
         pointing = np.array([-each.rotation[1, 1] - 1j * each.rotation[0, 1] for each in poses])
-    nearest = _nearest(np.flatnonzero(known), len(poses))
+    # (count,) for each row the place in `known`, which is in order, of the row nearest to
+    # it
+    known = np.flatnonzero(known)
+    count = len(poses)
+    after = np.minimum(np.searchsorted(known, np.arange(count)), len(known) - 1)
+    before = np.maximum(after - 1, 0)
+    is_before = np.abs(known[before] - np.arange(count)) < np.abs(known[after] - np.arange(count))
+    nearest = np.where(is_before, before, after)
     return [float(each) for each in np.degrees(np.angle(pointing))[nearest] % 360.0]
 
 
@@ -256,14 +263,6 @@ def _courses(times_s: Floats, path_m: PointsM) -> tuple[NDArray[np.complex128], 
     velocity = (path_m[after] - path_m[before]) @ np.array([1j, 1]) / passed_s
     moves = np.abs(velocity) >= _COURSE_HOVERING_M_S
     return velocity[moves], moves
-
-
-def _nearest(known: Rows, count: int) -> Rows:
-    """(count,) for each row the place in `known`, which is in order, of the row nearest to it."""
-    after = np.minimum(np.searchsorted(known, np.arange(count)), len(known) - 1)
-    before = np.maximum(after - 1, 0)
-    is_before = np.abs(known[before] - np.arange(count)) < np.abs(known[after] - np.arange(count))
-    return np.where(is_before, before, after)
 
 
 def _least_misses(seen: NDArray[np.complex128], fixes: NDArray[np.complex128]) -> Floats:

@@ -144,7 +144,16 @@ def open_picture(file: Path | BytesIO, name: str) -> Image.Image:
     else:
         head = file.getvalue()[:12]
     if is_heif(head):
-        _heif_module(name).register_heif_opener()
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                import pillow_heif
+        except ImportError as error:
+            raise InputError(
+                f"{name} is a HEIC picture, which needs an extra: pip install 'sorvolo[heic]'; or convert it to JPEG"
+            ) from error
+        module: ModuleType = pillow_heif
+        module.register_heif_opener()
     return Image.open(file)
 
 
@@ -221,19 +230,6 @@ def _open_dng(data: bytes, name: str) -> Any:
         raise InputError(
             f"{name} is damaged or no raw picture that is known; copy it again"
         ) from error
-
-
-def _heif_module(name: str) -> ModuleType:
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            import pillow_heif
-    except ImportError as error:
-        raise InputError(
-            f"{name} is a HEIC picture, which needs an extra: pip install 'sorvolo[heic]'; or convert it to JPEG"
-        ) from error
-    module: ModuleType = pillow_heif
-    return module
 
 
 _SAME_ASPECT = 0.01  # relative, of pictures of another size than the flight's; by choice

@@ -212,22 +212,18 @@ def camera_from_nodes(
 def _matrix(file_name: str, nodes: Mapping[str, Node]) -> Matrix3:
     found = _first(nodes, _MATRIX_KEYS)
     if found is None:
-        return _checked_matrix(file_name, _matrix_of_names(file_name, nodes))
+        numbers = [_first(nodes, (f"{name}px", name)) for name in ("fx", "fy", "cx", "cy")]
+        if any(not isinstance(each, float) for each in numbers):
+            raise InputError(
+                f"{file_name}: no camera matrix; a node such as camera_matrix (3 x 3), or fx, fy, cx and "
+                "cy, is needed"
+            )
+        fx, fy, cx, cy = (float(each) for each in numbers if isinstance(each, float))
+        return _checked_matrix(file_name, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
     matrix = np.asarray(found) if isinstance(found, np.ndarray) else np.zeros(0)
     if matrix.size != 9:
         raise InputError(f"{file_name}: the camera matrix must be 3 x 3, got shape {matrix.shape}")
     return _checked_matrix(file_name, matrix.reshape(3, 3))
-
-
-def _matrix_of_names(file_name: str, nodes: Mapping[str, Node]) -> Matrix3:
-    numbers = [_first(nodes, (f"{name}px", name)) for name in ("fx", "fy", "cx", "cy")]
-    if any(not isinstance(each, float) for each in numbers):
-        raise InputError(
-            f"{file_name}: no camera matrix; a node such as camera_matrix (3 x 3), or fx, fy, cx and "
-            "cy, is needed"
-        )
-    fx, fy, cx, cy = (float(each) for each in numbers if isinstance(each, float))
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
 def _checked_matrix(file_name: str, matrix: Matrix3) -> Matrix3:

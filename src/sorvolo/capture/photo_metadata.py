@@ -148,6 +148,23 @@ def read_photo_metadata(path: Path) -> PhotoMetadata:
     written = properties.get("dji:UTCAtExposure", properties.get("sensefly:UTCTime", ""))
     written = written.replace("-", ":").replace("T", " ").rstrip("Z")
     stamp_ns = _parse_ns(written if "." in written else f"{written}.0", "%Y:%m:%d %H:%M:%S.%f")
+    altitude_m, is_ellipsoidal = _altitude(gps)
+    # The receiver's own estimate, else one from its dilution of precision.
+    stated_m = _positive(gps.get(ExifTags.GPS.GPSHPositioningError))
+    columns = {
+        "horizontal_sigma_m": stated_m
+        if isfinite(stated_m)
+        else sigma_from_hdop_m(_positive(gps.get(ExifTags.GPS.GPSDOP))),
+        "course_deg": _number(gps.get(ExifTags.GPS.GPSTrack)),
+        "speed_m_s": _number(gps.get(ExifTags.GPS.GPSSpeed))
+        * _M_S_PER_SPEED_UNIT.get(_text(gps.get(ExifTags.GPS.GPSSpeedRef)) or "K", nan),
+        **photo_xmp.height_columns(properties, altitude_m, exif_is_ellipsoidal=is_ellipsoidal),
+    }
+    columns |= _finite(photo_xmp.telemetry_columns(properties))
+    if "sensefly:Heading" in properties:
+        columns["course_deg"] = (
+            nan  # its GPSTrack repeats the heading, from which wind turns the course
+        )
     return PhotoMetadata(
         header.width_px,
         header.height_px,
@@ -160,7 +177,7 @@ def read_photo_metadata(path: Path) -> PhotoMetadata:
         full_width_px,
         stamp_ns or _receiver_utc_ns(gps) or _zoned_clock_ns(main, detail),
         _camera_clock_ns(main, detail),
-        _telemetry_columns(gps, properties) | place,
+        _finite(columns) | place,
         unreadable,
         photo_xmp.stated_lens(properties, full_width_px, full_height_px),
         place_doubt,
@@ -324,27 +341,6 @@ def _zoned_clock_ns(main: _Tags, detail: _Tags) -> int:
         return 0
     minutes_east = (int(zone[2]) * 60 + int(zone[3])) * (-1 if zone[1] == "-" else 1)
     return clock_ns - minutes_east * 60 * 1_000_000_000
-
-
-def _telemetry_columns(gps: _Tags, properties: Mapping[str, str]) -> dict[str, float]:
-    altitude_m, is_ellipsoidal = _altitude(gps)
-    # The receiver's own estimate, else one from its dilution of precision.
-    stated_m = _positive(gps.get(ExifTags.GPS.GPSHPositioningError))
-    columns = {
-        "horizontal_sigma_m": stated_m
-        if isfinite(stated_m)
-        else sigma_from_hdop_m(_positive(gps.get(ExifTags.GPS.GPSDOP))),
-        "course_deg": _number(gps.get(ExifTags.GPS.GPSTrack)),
-        "speed_m_s": _number(gps.get(ExifTags.GPS.GPSSpeed))
-        * _M_S_PER_SPEED_UNIT.get(_text(gps.get(ExifTags.GPS.GPSSpeedRef)) or "K", nan),
-        **photo_xmp.height_columns(properties, altitude_m, exif_is_ellipsoidal=is_ellipsoidal),
-    }
-    columns |= _finite(photo_xmp.telemetry_columns(properties))
-    if "sensefly:Heading" in properties:
-        columns["course_deg"] = (
-            nan  # its GPSTrack repeats the heading, from which wind turns the course
-        )
-    return _finite(columns)
 
 
 def _place(gps: _Tags, properties: Mapping[str, str]) -> tuple[dict[str, float], PlaceDoubt | None]:

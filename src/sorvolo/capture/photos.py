@@ -387,7 +387,19 @@ def _best_times(photos: Sequence[Photo]) -> tuple[list[int], str, list[Notice]]:
         "photos without a time, placed by their names: {}",
     )
     if any(utc and local for utc, local in zip(utc_ns, local_ns)):
-        utc_ns, moved = _dates_mended(utc_ns, local_ns)
+        # the photos' UTC, and how many were moved by a day: some receivers change their
+        # date late, not at midnight UTC
+        offsets_ns = [
+            utc - local if utc and local else None for utc, local in zip(utc_ns, local_ns)
+        ]
+        # of two dates the right one is nearer to the camera's clock, which is off by its time zone alone
+        usual_ns = min((each for each in offsets_ns if each is not None), key=abs)
+        mended = []
+        for utc, offset_ns in zip(utc_ns, offsets_ns):
+            off_ns = 0 if offset_ns is None else offset_ns - usual_ns
+            is_a_day = abs(abs(off_ns) - DAY_NS) < _SAME_CLOCK_NS
+            mended.append(utc - DAY_NS * (1 if off_ns > 0 else -1) if is_a_day else utc)
+        utc_ns, moved = mended, sum(new != old for new, old in zip(mended, utc_ns))
         times_ns, origin = _times_of_two_clocks(utc_ns, local_ns)
         words = "photos whose GPS date is a day off by the camera's clock, set right: {}"
         return times_ns, origin, [*notice("gps_date", moved, words), *untimed]
@@ -406,19 +418,6 @@ def _best_times(photos: Sequence[Photo]) -> tuple[list[int], str, list[Notice]]:
         "unknown: no photo has a time; they are taken to be one second apart, by name",
         untimed,
     )
-
-
-def _dates_mended(utc_ns: Sequence[int], local_ns: Sequence[int]) -> tuple[list[int], int]:
-    """The photos' UTC, and how many were moved by a day: some receivers change their date late, not at midnight UTC."""
-    offsets_ns = [utc - local if utc and local else None for utc, local in zip(utc_ns, local_ns)]
-    # of two dates the right one is nearer to the camera's clock, which is off by its time zone alone
-    usual_ns = min((each for each in offsets_ns if each is not None), key=abs)
-    mended = []
-    for utc, offset_ns in zip(utc_ns, offsets_ns):
-        off_ns = 0 if offset_ns is None else offset_ns - usual_ns
-        is_a_day = abs(abs(off_ns) - DAY_NS) < _SAME_CLOCK_NS
-        mended.append(utc - DAY_NS * (1 if off_ns > 0 else -1) if is_a_day else utc)
-    return mended, sum(new != old for new, old in zip(mended, utc_ns))
 
 
 def _times_of_two_clocks(utc_ns: list[int], local_ns: list[int]) -> tuple[list[int], str]:

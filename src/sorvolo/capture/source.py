@@ -152,9 +152,18 @@ def open_sources(
     addresses = [live_address(text) for text in map(str, inputs) if is_live_address(text)]
     recorded = [Path(each) for each in inputs if not is_live_address(str(each))]
     videos, albums = _sort_inputs(recorded)
-    names = _distinct_names(
-        [*(each.chapters[0].resolve() for each in videos), *(album.place for album in albums)]
-    )
+    # each flight's name; with the folder before it where two are the same: cards are
+    # numbered anew
+    places = [*(each.chapters[0].resolve() for each in videos), *(album.place for album in albums)]
+    names = [safe_name(place.name if place.is_dir() else place.stem) for place in places]
+    names = [
+        safe_name(f"{place.parent.name}_{name}") if names.count(name) > 1 else name
+        for name, place in zip(names, places)
+    ]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise InputError(
+            f"two flights would be named {twice[0]}; rename one, or map them one by one"
+        )
     # Raises InputError where telemetry was given for more than one flight.
     flights = len(names) + len(addresses) + len(given)
     if telemetry is not None and flights > 1:
@@ -175,7 +184,11 @@ def open_sources(
             for address in addresses
         ),
     ]
-    _give_names(sources, known)
+    # names that are safe as folders and no other flight has, by their fingerprints
+    taken = dict(known)
+    for each in sources:
+        each.name = _free_name(safe_name(each.name), each.fingerprint, taken)
+        taken[each.name] = each.fingerprint
     if better_camera is not None:
         for each in sources:
             each.camera = better_camera(each.camera)
@@ -377,31 +390,6 @@ def _nothing_in(folder: Path, files: int) -> str:
     return (
         f"{folder} holds no pictures or videos among {files} files ({wanted} are pictures); {hint}"
     )
-
-
-def _distinct_names(places: Sequence[Path]) -> list[str]:
-    """Each flight's name; with the folder before it where two are the same: cards are numbered anew."""
-    names = [safe_name(place.name if place.is_dir() else place.stem) for place in places]
-    names = [
-        safe_name(f"{place.parent.name}_{name}") if names.count(name) > 1 else name
-        for name, place in zip(names, places)
-    ]
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise InputError(
-            f"two flights would be named {twice[0]}; rename one, or map them one by one"
-        )
-    return names
-
-
-def _give_names(
-    sources: Sequence["VideoSource | PhotoSource | LiveSource | GivenFrames"],
-    known: Mapping[str, str],
-) -> None:
-    """Names that are safe as folders and no other flight has, by their fingerprints."""
-    taken = dict(known)
-    for each in sources:
-        each.name = _free_name(safe_name(each.name), each.fingerprint, taken)
-        taken[each.name] = each.fingerprint
 
 
 def _free_name(name: str, fingerprint: str, taken: Mapping[str, str]) -> str:

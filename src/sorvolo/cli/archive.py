@@ -14,7 +14,6 @@ from sorvolo.cli.sites import show_copy
 from sorvolo.survey.wording import counted, counted_list
 
 if TYPE_CHECKING:
-    from sorvolo.store.copies.transfer import CopyOutcome
     from sorvolo.store.index.finding import FoundFlight, FoundThing
 
 archive_app = typer.Typer(no_args_is_help=True)
@@ -201,7 +200,29 @@ def copy_command(
         row = vars(outcome) | {"faults": dict(outcome.faults), "is_whole": not outcome.faults}
         print_json({"source": source, "target": target, **row})
     else:
-        _show_copied(outcome, target, verified=verify)
+        done = "compared" if verify else "copied"
+        typer.echo(
+            f"{target}: {done} {outcome.copied:,} of {outcome.files:,} files ({outcome.copied_bytes / 1e6:,.1f} MB), "
+            f"version {outcome.newest} of the map"
+        )
+        if outcome.left_out:
+            names = ", ".join(outcome.left_out[:_MAX_FAULTS])
+            typer.echo(
+                f"not copied, not part of the map: {names}{', ...' if len(outcome.left_out) > _MAX_FAULTS else ''}"
+            )
+        for path, fault in list(outcome.faults.items())[:_MAX_FAULTS]:
+            typer.echo(f"{path}: {fault}", err=True)
+        if len(outcome.faults) > _MAX_FAULTS:
+            typer.echo(
+                f"and {len(outcome.faults) - _MAX_FAULTS:,} more (--json lists all)", err=True
+            )
+        if not outcome.faults:
+            typer.echo("every file matches" if verify else "the copy is complete")
+        elif not verify:
+            typer.echo(
+                "the rest was copied; restore these files of the map from another copy, or map again",
+                err=True,
+            )
     if outcome.faults:
         raise typer.Exit(FAILED)
 
@@ -231,28 +252,4 @@ def prune_command(
         typer.echo(
             f"{place}: {done} {counted(pruned.objects, 'object')} ({pruned.bytes / 1e6:,.1f} MB); "
             f"{pruned.kept_bytes / 1e6:,.1f} MB remain"
-        )
-
-
-def _show_copied(outcome: "CopyOutcome", target: str, *, verified: bool) -> None:
-    done = "compared" if verified else "copied"
-    typer.echo(
-        f"{target}: {done} {outcome.copied:,} of {outcome.files:,} files ({outcome.copied_bytes / 1e6:,.1f} MB), "
-        f"version {outcome.newest} of the map"
-    )
-    if outcome.left_out:
-        names = ", ".join(outcome.left_out[:_MAX_FAULTS])
-        typer.echo(
-            f"not copied, not part of the map: {names}{', ...' if len(outcome.left_out) > _MAX_FAULTS else ''}"
-        )
-    for path, fault in list(outcome.faults.items())[:_MAX_FAULTS]:
-        typer.echo(f"{path}: {fault}", err=True)
-    if len(outcome.faults) > _MAX_FAULTS:
-        typer.echo(f"and {len(outcome.faults) - _MAX_FAULTS:,} more (--json lists all)", err=True)
-    if not outcome.faults:
-        typer.echo("every file matches" if verified else "the copy is complete")
-    elif not verified:
-        typer.echo(
-            "the rest was copied; restore these files of the map from another copy, or map again",
-            err=True,
         )

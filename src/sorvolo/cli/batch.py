@@ -2,7 +2,7 @@
 
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from rich.markup import escape
@@ -105,7 +105,20 @@ def batch(
         report = shown_work(running, _show_update)
     counts = report.counts()
     if as_json:
-        print_json(_plain(report, root))
+        rows = [{**vars(row), "is_known": row.key in report.known} for row in report.rows]
+        print_json(
+            {
+                "root": str(root),
+                "counts": report.counts(),
+                "seconds": report.seconds,
+                "cpu_s": round(
+                    sum(row.cpu_s for row in report.rows if row.key not in report.known), 3
+                ),
+                "tries": report.tries,
+                "crashes": report.crashes,
+                "flights": rows,
+            }
+        )
     else:
         _show(report, places, root, Console())
     if counts.get("failed") or counts.get("set aside"):
@@ -135,19 +148,6 @@ def _state_name(row: "BatchRow", is_known: bool) -> str:
     if row.state == "waiting":
         return "again" if row.tries else "waiting"
     return "known" if is_known and row.state == "done" else row.state
-
-
-def _plain(report: "BatchReport", root: Path) -> dict[str, Any]:
-    rows = [{**vars(row), "is_known": row.key in report.known} for row in report.rows]
-    return {
-        "root": str(root),
-        "counts": report.counts(),
-        "seconds": report.seconds,
-        "cpu_s": round(sum(row.cpu_s for row in report.rows if row.key not in report.known), 3),
-        "tries": report.tries,
-        "crashes": report.crashes,
-        "flights": rows,
-    }
 
 
 def _show(report: "BatchReport", places: list[Path], root: Path, console: Console) -> None:

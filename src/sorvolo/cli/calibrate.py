@@ -49,26 +49,22 @@ def calibrate(
     if as_json:
         print_json(_as_json(result, out))
     else:
-        _show(result, out)
-
-
-def _show(result: "Calibration", out: Path) -> None:
-    camera, table = result.camera, Table("view", "error, px", title="Reprojection error")
-    for name, error_px in result.view_errors_px.items():
-        table.add_row(name, f"{error_px:.3f}")
-    for name in result.dropped:
-        table.add_row(name, "left out: contradicts the others")
-    console = Console()
-    console.print(table)
-    k1, k2, p1, p2, k3 = camera.distortion
-    console.print(
-        f"{out}: {camera.width_px}x{camera.height_px}, focal length {camera.fx_px:.1f} x "
-        f"{camera.fy_px:.1f} px "
-        f"(1 sigma {result.focal_sigma:.2%}), centre {camera.cx_px:.1f}, {camera.cy_px:.1f}\n"
-        f"k1 {k1:.5f}  k2 {k2:.5f}  p1 {p1:.5f}  p2 {p2:.5f}  k3 {k3:.5f}\n"
-        f"reprojection error {result.reprojection_error_px:.3f} px rms over {len(result.view_errors_px)} views; tilts "
-        f"differ by up to {result.tilt_spread_deg:.0f} deg; {result.coverage:.0%} of the picture covered"
-    )
+        camera, table = result.camera, Table("view", "error, px", title="Reprojection error")
+        for name, error_px in result.view_errors_px.items():
+            table.add_row(name, f"{error_px:.3f}")
+        for name in result.dropped:
+            table.add_row(name, "left out: contradicts the others")
+        console = Console()
+        console.print(table)
+        k1, k2, p1, p2, k3 = camera.distortion
+        console.print(
+            f"{out}: {camera.width_px}x{camera.height_px}, focal length {camera.fx_px:.1f} x "
+            f"{camera.fy_px:.1f} px "
+            f"(1 sigma {result.focal_sigma:.2%}), centre {camera.cx_px:.1f}, {camera.cy_px:.1f}\n"
+            f"k1 {k1:.5f}  k2 {k2:.5f}  p1 {p1:.5f}  p2 {p2:.5f}  k3 {k3:.5f}\n"
+            f"reprojection error {result.reprojection_error_px:.3f} px rms over {len(result.view_errors_px)} views; tilts "
+            f"differ by up to {result.tilt_spread_deg:.0f} deg; {result.coverage:.0%} of the picture covered"
+        )
 
 
 def _as_json(result: "Calibration", out: Path) -> dict[str, object]:

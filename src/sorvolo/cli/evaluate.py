@@ -28,12 +28,10 @@ from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
     from sorvolo.lab.evaluation.change_metrics import EventScores
-    from sorvolo.lab.evaluation.changes import MeasuredChanges
     from sorvolo.lab.evaluation.detection_scores import (
         Interval,
         ScoreDifference,
         SetComparison,
-        SetScores,
     )
     from sorvolo.lab.evaluation.map_quality import Spread
     from sorvolo.lab.evaluation.mask_folders import MaskScores
@@ -130,7 +128,35 @@ def detector(
     for notice in notices:
         console.print(f"note: {notice}", markup=False)
     for scores in measured.sets:
-        _show_scores(console, scores)
+        numbers = "labels", "AP", "AP50", "precision", "recall", "from"
+        table = new_table(
+            "class", *numbers, whole=("class", *numbers), right=numbers, title=scores.name
+        )
+        for row in scores.classes:
+            table.add_row(
+                row.label,
+                str(row.labels),
+                _between(scores.intervals[f"AP {row.label}"]),
+                _between(scores.intervals[f"AP50 {row.label}"]),
+                _share(row.reported.precision),
+                _share(row.reported.recall),
+                f"{row.reported.score:.2f}",
+            )
+        table.add_section()
+        table.add_row(
+            "mean",
+            "",
+            _between(scores.intervals["AP"]),
+            _between(scores.intervals["AP50"]),
+            _share(scores.intervals["thesis_map"].value),
+        )
+        console.print(table)
+        if scores.groups > 1:
+            console.print(
+                f"{scores.pictures:,} pictures of {scores.groups} videos or flights; 95 % intervals over these",
+            )
+        for remark in scores.remarks:
+            console.print(f"{scores.name}: {remark}")
     for side_by_side in measured.comparisons:
         _show_comparison(console, side_by_side)
     if out is not None:
@@ -197,23 +223,19 @@ def changes(
         return
     console = Console()
     for each in measured:
-        show_changes(console, each)
-
-
-def show_changes(console: Console, measured: "MeasuredChanges") -> None:
-    """The tables of one flight's changes."""
-    if measured.masks is not None:
-        _show_masks(console, measured.flight, measured.masks)
-    if measured.events is not None:
-        _show_events(console, measured.flight, measured.events, measured.map_shift_m)
-    if measured.classes is not None:
-        classes = measured.classes
-        console.print(
-            f"{measured.flight}: class before and after, of the events of the right kind: {classes.right} right, "
-            f"{classes.wrong} wrong, {classes.unnamed} without a class",
-        )
-    for remark in measured.remarks:
-        console.print(f"{measured.flight}: {remark}")
+        # the tables of one flight's changes
+        if each.masks is not None:
+            _show_masks(console, each.flight, each.masks)
+        if each.events is not None:
+            _show_events(console, each.flight, each.events, each.map_shift_m)
+        if each.classes is not None:
+            classes = each.classes
+            console.print(
+                f"{each.flight}: class before and after, of the events of the right kind: {classes.right} right, "
+                f"{classes.wrong} wrong, {classes.unnamed} without a class",
+            )
+        for remark in each.remarks:
+            console.print(f"{each.flight}: {remark}")
 
 
 def _show_masks(console: Console, flight: str, masks: "MaskScores") -> None:
@@ -335,38 +357,6 @@ def _add(table: Table, name: str, spread: "Spread") -> None:
             f"{spread.rms_px:.2f}",
             str(spread.count),
         )
-
-
-def _show_scores(console: Console, scores: "SetScores") -> None:
-    numbers = "labels", "AP", "AP50", "precision", "recall", "from"
-    table = new_table(
-        "class", *numbers, whole=("class", *numbers), right=numbers, title=scores.name
-    )
-    for row in scores.classes:
-        table.add_row(
-            row.label,
-            str(row.labels),
-            _between(scores.intervals[f"AP {row.label}"]),
-            _between(scores.intervals[f"AP50 {row.label}"]),
-            _share(row.reported.precision),
-            _share(row.reported.recall),
-            f"{row.reported.score:.2f}",
-        )
-    table.add_section()
-    table.add_row(
-        "mean",
-        "",
-        _between(scores.intervals["AP"]),
-        _between(scores.intervals["AP50"]),
-        _share(scores.intervals["thesis_map"].value),
-    )
-    console.print(table)
-    if scores.groups > 1:
-        console.print(
-            f"{scores.pictures:,} pictures of {scores.groups} videos or flights; 95 % intervals over these",
-        )
-    for remark in scores.remarks:
-        console.print(f"{scores.name}: {remark}")
 
 
 def _show_comparison(console: Console, comparison: "SetComparison") -> None:

@@ -177,11 +177,6 @@ def _show(
         ]
     rows += [("written", str(each)) for each in out]
     console.print(facts_table("Flight plan", rows))
-    for warning in _warnings(answers, settings):
-        console.print(f"[yellow]warning[/yellow]  {warning}")
-
-
-def _warnings(answers: "FlightAnswers", settings: "PlanSettings") -> list[str]:
     from sorvolo.geometry.planning import LEGAL_CEILING_M
 
     warnings = []
@@ -205,7 +200,8 @@ def _warnings(answers: "FlightAnswers", settings: "PlanSettings") -> list[str]:
         warnings.append(
             f"the focal length is a guess, uncertain by {sigma:.0%}, so are the heights; calibrate once"
         )
-    return warnings
+    for warning in warnings:
+        console.print(f"[yellow]warning[/yellow]  {warning}")
 
 
 def _as_json(

@@ -1,7 +1,7 @@
 """`sorvolo reproduce`: the experiments of the thesis's chapter 4, on the UMCD dataset or a simulated one."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.box import SIMPLE_HEAD
@@ -103,24 +103,23 @@ def reproduce(
     if as_json:
         print_json(document)
     else:
-        _show(document, out / PAGE)
+        # the tables as the thesis prints them
+        page = out / PAGE
+        from sorvolo.lab.thesis.sheets import reproduction_sheets
+
+        console = Console()
+        if missing := document["missing"]:
+            words = f"{len(missing)} of {counted(len(missing) + len(document['rows']), 'row')} could not be made"
+            console.print(f"{words}; {page} has the reasons", style="yellow", soft_wrap=True)
+        for sheet in reproduction_sheets(document["tables"]):
+            if sheet.rows:
+                table = Table(
+                    *map(escape, sheet.columns), title=escape(sheet.title), box=SIMPLE_HEAD
+                )
+                for row in sheet.rows:
+                    table.add_row(*map(escape, row))
+                console.print(table)
+        console.print(document["size"])
+        console.print(f"tables and figures: {page}", soft_wrap=True)
     if document["missing"]:
         raise typer.Exit(TO_CHECK)
-
-
-def _show(document: dict[str, Any], page: Path) -> None:
-    """The tables as the thesis prints them."""
-    from sorvolo.lab.thesis.sheets import reproduction_sheets
-
-    console = Console()
-    if missing := document["missing"]:
-        words = f"{len(missing)} of {counted(len(missing) + len(document['rows']), 'row')} could not be made"
-        console.print(f"{words}; {page} has the reasons", style="yellow", soft_wrap=True)
-    for sheet in reproduction_sheets(document["tables"]):
-        if sheet.rows:
-            table = Table(*map(escape, sheet.columns), title=escape(sheet.title), box=SIMPLE_HEAD)
-            for row in sheet.rows:
-                table.add_row(*map(escape, row))
-            console.print(table)
-    console.print(document["size"])
-    console.print(f"tables and figures: {page}", soft_wrap=True)

@@ -171,7 +171,19 @@ def search_command(
     if as_json:
         print_json({"folder": str(outputs.folder), **report})
     elif through_trees:
-        _show_under_trees(report, outputs.folder, Console())
+        console = Console()
+        console.print(escape(report["headline"]["text"]), style="bold", soft_wrap=True)
+        for row in report["people"]:
+            where = f"{row['latitude_deg']:.6f}, {row['longitude_deg']:.6f}"
+            pictures = ", ".join(row["pictures"])
+            announce_person(f"{where}  {row['anomaly']:.0f} sigmas, see {pictures}", console)
+        show_notices_and_warnings(report, console)
+        for name, file in (
+            ("page", "under_trees.html"),
+            ("GeoTIFF", "under_trees.tif"),
+            ("places", "under_trees.geojson"),
+        ):
+            show_path(name, outputs.folder / file, console)
     else:
         _show(report, outputs.folder, outputs.refly, Console())
     if pdf:
@@ -197,21 +209,6 @@ def _look_through_trees(
             else:
                 progress.show(f"under the trees of {update.flight}: {update.stage},", update.number, update.total)  # fmt: skip
     return report
-
-
-def _show_under_trees(report: Mapping[str, Any], folder: Path, console: Console) -> None:
-    console.print(escape(report["headline"]["text"]), style="bold", soft_wrap=True)
-    for row in report["people"]:
-        where = f"{row['latitude_deg']:.6f}, {row['longitude_deg']:.6f}"
-        pictures = ", ".join(row["pictures"])
-        announce_person(f"{where}  {row['anomaly']:.0f} sigmas, see {pictures}", console)
-    show_notices_and_warnings(report, console)
-    for name, file in (
-        ("page", "under_trees.html"),
-        ("GeoTIFF", "under_trees.tif"),
-        ("places", "under_trees.geojson"),
-    ):
-        show_path(name, folder / file, console)
 
 
 def _map_all(

@@ -1,6 +1,6 @@
 """`sorvolo watch`: each object printed when it is found; in the end how many of what, where, and how sure."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -150,7 +150,34 @@ def watch_command(
         print_json({"watches": results})
     else:
         for result in results:
-            _show_result(result, Console(), coordinates)
+            console = Console()
+            tracks = [feature["properties"] for feature in result["tracks"]["features"]]
+            console.print(
+                f"Watch of {escape(result['flight'])}: {escape(result['headline']['text'])}",
+                style="bold",
+            )
+            if tracks:
+                _show_tracks(tracks, console, coordinates, on_ground=result["georeferenced"])
+            frames, latency = result["frames"], result["latency_s"]
+            skipped = (
+                f", {frames['skipped']:,} left that were to be searched"
+                if frames["skipped"]
+                else ""
+            )
+            console.print(
+                f"{frames['detected']:,} of {counted(frames['read'], 'frame')} searched at "
+                f"{result['frames_per_second'] or 0.0:.1f} frames/s{skipped}; delay {1000 * (latency['median'] or 0):.0f} ms "
+                f"(median), {1000 * (latency['max'] or 0):.0f} ms at most",
+            )
+            show_notices_and_warnings(result, console)
+            folder = Path(result["folder"])
+            show_path("report", folder / "report.html", console)
+            if result["georeferenced"]:
+                show_path("GeoJSON", folder / "tracks.geojson", console)
+                show_path("searched", folder / "searched.geojson", console)
+            else:
+                show_path("list", folder / "tracks.json", console)
+                console.print(f"  {result['tracks']['note']}", style="dim")
     if not results:
         Console(stderr=True).print("stopped before the first frame was searched")
     if not results or not all(each["headline"]["complete"] for each in results):
@@ -202,32 +229,6 @@ def _result(folder: Path) -> dict[str, Any]:
 
     tracks = read_json(features_path(folder, "tracks"))
     return {"folder": str(folder), **read_json(folder / "report.json"), "tracks": tracks}
-
-
-def _show_result(result: Mapping[str, Any], console: Console, form: PlaceFormat) -> None:
-    tracks = [feature["properties"] for feature in result["tracks"]["features"]]
-    console.print(
-        f"Watch of {escape(result['flight'])}: {escape(result['headline']['text'])}",
-        style="bold",
-    )
-    if tracks:
-        _show_tracks(tracks, console, form, on_ground=result["georeferenced"])
-    frames, latency = result["frames"], result["latency_s"]
-    skipped = f", {frames['skipped']:,} left that were to be searched" if frames["skipped"] else ""
-    console.print(
-        f"{frames['detected']:,} of {counted(frames['read'], 'frame')} searched at "
-        f"{result['frames_per_second'] or 0.0:.1f} frames/s{skipped}; delay {1000 * (latency['median'] or 0):.0f} ms "
-        f"(median), {1000 * (latency['max'] or 0):.0f} ms at most",
-    )
-    show_notices_and_warnings(result, console)
-    folder = Path(result["folder"])
-    show_path("report", folder / "report.html", console)
-    if result["georeferenced"]:
-        show_path("GeoJSON", folder / "tracks.geojson", console)
-        show_path("searched", folder / "searched.geojson", console)
-    else:
-        show_path("list", folder / "tracks.json", console)
-        console.print(f"  {result['tracks']['note']}", style="dim")
 
 
 def _show_tracks(

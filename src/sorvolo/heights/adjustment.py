@@ -64,7 +64,12 @@ class Scene:
 
     def corrected(self) -> Floats:
         """(M, 2) where the points would be seen by the lens as it was found."""
-        return through_lens(self.seen, self.shared)
+        # (M, 2) normalised rays without the left-over distortion and shift of `shared` (see
+        # Scene)
+        square = (self.seen**2).sum(axis=1, keepdims=True)
+        return (
+            self.seen * (1 + self.shared[1] * square + self.shared[2] * square**2) + self.shared[3:]
+        )
 
     def keeping(self, observations: Mask) -> "Scene":
         """The scene with these observations, (M,) bool, only, and the points that two of them still see."""
@@ -78,12 +83,6 @@ class Scene:
             point=point,
             seen=self.seen[observations],
         )
-
-
-def through_lens(seen: Floats, shared: Floats) -> Floats:
-    """(M, 2) normalised rays without the left-over distortion and shift of `shared` (see Scene)."""
-    square = (seen**2).sum(axis=1, keepdims=True)
-    return seen * (1 + shared[1] * square + shared[2] * square**2) + shared[3:]
 
 
 @dataclass(frozen=True, eq=False)

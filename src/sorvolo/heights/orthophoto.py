@@ -68,7 +68,24 @@ def choose_photos(lattice: Lattice, up_m: Floats32, views: Sequence[View]) -> Wi
     labels = np.full(lattice.shape, -1, np.int16)
     best = np.zeros(lattice.shape, np.float32)
     for number, view in enumerate(views):
-        x0, y0, x1, y1 = _window_of(view, lattice, up_m)
+        # the cells that a view may see, and the way from them to below the camera: x0, y0,
+        # x1, y1, ends exclusive
+        low_m, high_m = float(up_m.min()), float(up_m.max())
+        corners = np.concatenate(
+            [
+                ground_outlines_m([view], each)
+                for each in (low_m, high_m)
+                if each < view.site_from_camera.translation_m[2]
+            ]
+            + [view.site_from_camera.translation_m[None, :2]]
+        )
+        cells = lattice.cells_from_site(corners)
+        x0, y0 = np.clip(
+            np.floor(cells.min(axis=0)).astype(int) - 1, 0, [lattice.width, lattice.height]
+        ).tolist()
+        x1, y1 = np.clip(
+            np.ceil(cells.max(axis=0)).astype(int) + 2, 0, [lattice.width, lattice.height]
+        ).tolist()
         if x1 <= x0 or y1 <= y0:
             continue
         here = slice(y0, y1), slice(x0, x1)
@@ -160,25 +177,16 @@ class _Painter:
         apron = -(-LAYER_APRON_PX // ALIGN_PX) * ALIGN_PX
         side = count * self._grid.tile_px + 2 * apron
         shift = _shift(first[0] * self._grid.tile_px - apron, first[1] * self._grid.tile_px - apron)
-        labels = self._fine_labels(self._cells_from_grid @ shift, side)
-        inner = slice(apron, side - apron)
-        if (labels[inner, inner] < 0).all():
-            return None
-        picture = blend(labels, self._layers(labels, shift, side))[inner, inner]
-        alpha = (labels[inner, inner] >= 0).view(np.uint8) * np.uint8(255)
-        rgba = np.dstack([picture, alpha])
-        rgba[alpha == 0] = 0
-        return rgba
-
-    def _fine_labels(self, cells_from_here: Matrix3, side: int) -> Winners:
-        """(side, side) the view of each pixel of a tile, the borders between views drawn straight between cells."""
+        # (side, side) the view of each pixel of a tile, the borders between views drawn
+        # straight between cells
+        cells_from_here = self._cells_from_grid @ shift
         ends = cells_from_here @ np.array([[0, side, 0, side], [0, 0, side, side], [1, 1, 1, 1]])
         limit = np.array(self._labels.shape[::-1])
         low = np.clip(np.floor(ends[:2].min(axis=1)).astype(int) - 2, 0, limit)
         high = np.clip(np.ceil(ends[:2].max(axis=1)).astype(int) + 3, 0, limit)
         coarse = self._labels[low[1] : high[1], low[0] : high[0]]
         there = (_shift(-low[0], -low[1]) @ cells_from_here)[:2]
-        return winners_from_shares(
+        labels = winners_from_shares(
             (
                 (
                     number,
@@ -199,6 +207,14 @@ class _Painter:
             side,
             side,
         )
+        inner = slice(apron, side - apron)
+        if (labels[inner, inner] < 0).all():
+            return None
+        picture = blend(labels, self._layers(labels, shift, side))[inner, inner]
+        alpha = (labels[inner, inner] >= 0).view(np.uint8) * np.uint8(255)
+        rgba = np.dstack([picture, alpha])
+        rgba[alpha == 0] = 0
+        return rgba
 
     def _layers(self, labels: Winners, shift: Matrix3, side: int) -> Iterator[Layer]:
         up_m = np.asarray(
@@ -231,24 +247,3 @@ class _Painter:
 
 def _shift(x: float, y: float) -> Matrix3:
     return np.array([[1.0, 0, x], [0, 1, y], [0, 0, 1]])
-
-
-def _window_of(view: View, lattice: Lattice, up_m: Floats32) -> tuple[int, int, int, int]:
-    """The cells that a view may see, and the way from them to below the camera: x0, y0, x1, y1, ends exclusive."""
-    low_m, high_m = float(up_m.min()), float(up_m.max())
-    corners = np.concatenate(
-        [
-            ground_outlines_m([view], each)
-            for each in (low_m, high_m)
-            if each < view.site_from_camera.translation_m[2]
-        ]
-        + [view.site_from_camera.translation_m[None, :2]]
-    )
-    cells = lattice.cells_from_site(corners)
-    x0, y0 = np.clip(
-        np.floor(cells.min(axis=0)).astype(int) - 1, 0, [lattice.width, lattice.height]
-    ).tolist()
-    x1, y1 = np.clip(
-        np.ceil(cells.max(axis=0)).astype(int) + 2, 0, [lattice.width, lattice.height]
-    ).tolist()
-    return x0, y0, x1, y1

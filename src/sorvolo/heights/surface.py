@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, Mask, PointsM
+from sorvolo.geometry.arrays import Floats32, ImageGray, Mask, PointsM
 from sorvolo.heights.borders import beyond_borders
 from sorvolo.heights.free_space import IslandSettings, islands, seen_through
 from sorvolo.heights.lattice import Lattice
@@ -213,19 +213,15 @@ def _sigma_m(
     """(H, W) one sigma of the heights: of the match, of other likely heights, of an edge nearby, of the cameras."""
     likeness = np.sqrt(np.clip(swept.score, 0.01, 1))
     match = _MATCH_CELLS * lattice.cell_m / np.maximum(swept.spread, 0.02) / likeness
-    relief = _RELIEF_SHARE * _relief(up_m)
+    # (H, W) highest minus lowest within two cells
+    known = np.isfinite(up_m)
+    around = np.ones((5, 5), np.uint8)
+    high = cv2.dilate(np.where(known, up_m, -1e6).astype(np.float32), around)
+    low = cv2.erode(np.where(known, up_m, 1e6).astype(np.float32), around)
+    relief = _RELIEF_SHARE * np.where(known, high - low, 0.0)
     other = np.nan_to_num(swept.deviation_m)
     sigma = np.sqrt(match**2 + relief**2 + other**2 + camera_sigma.on(lattice) ** 2).astype(
         np.float32
     )
     sigma[~np.isfinite(up_m)] = np.nan
     return sigma
-
-
-def _relief(up_m: Floats32) -> Floats:
-    """(H, W) highest minus lowest within two cells."""
-    known = np.isfinite(up_m)
-    around = np.ones((5, 5), np.uint8)
-    high = cv2.dilate(np.where(known, up_m, -1e6).astype(np.float32), around)
-    low = cv2.erode(np.where(known, up_m, 1e6).astype(np.float32), around)
-    return np.where(known, high - low, 0.0)

@@ -111,7 +111,19 @@ def sweep(
     if obstacles is not None:
         for each, eye_m in zip(laid, eyes_m):
             each.hidden_below_m = obstacles.hidden_below_m(lattice, eye_m)
-    agreement = _agreements(laid, levels, settings)
+    agreement = kernels.agreements(
+        [each.contrast for each in laid],
+        np.array([each.channel for each in laid]),
+        np.array([each.planes for each in laid]),
+        np.array([each.frame for each in laid]),
+        np.array([[each.inset_px(side) for side in settings.window_cells] for each in laid]),
+        [each.hidden_below_m for each in laid],
+        levels,
+        settings.window_cells,
+        laid[0].shape,
+        _PAIR_SHARE,
+        cv2.getNumThreads(),
+    )
     seen_by = np.sum(seen, axis=0).astype(np.float32)
     smoothing = settings.smoothing
     total = kernels.path_costs(
@@ -129,7 +141,12 @@ def sweep(
         np.nan
     )  # no two photos see the height that fits, or they do not agree
     shown_by = np.sum([each.shows(up_m, least) for each in laid], axis=0).astype(np.float32)
-    return Swept(up_m, score, seen_by, _widest(seen, spreads), deviation, shown_by)
+    # (H, W) the largest spread of two photos that see a cell; 0 where fewer do
+    widest = np.zeros(seen[0].shape, np.float32)
+    for i in range(len(seen)):
+        for j in range(i):
+            np.maximum(widest, np.float32(spreads[i, j]), out=widest, where=seen[i] & seen[j])
+    return Swept(up_m, score, seen_by, widest, deviation, shown_by)
 
 
 def likeness_on(
@@ -200,7 +217,9 @@ def choose_views(
         chosen.append(best)
         seen += covers[best]
         angle = np.arccos(np.clip(rays @ rays[best], -1, 1))
-        least = np.minimum(least, _usefulness(angle))
+        least = np.minimum(
+            least, np.clip(angle / 0.35, 0.05, 1) * np.clip((1.2 - angle) / 0.5, 0.02, 1)
+        )
     return chosen
 
 
@@ -214,11 +233,6 @@ def _level_shown(lattice: Lattice, views: Sequence[View], up_m: float) -> tuple[
     return ground, np.array(shown).reshape(len(views), -1)
 
 
-def _usefulness(angle: Floats) -> Floats:
-    """0 to 1: two photos from the same place show no height, from too far apart nothing alike."""
-    return np.clip(angle / 0.35, 0.05, 1) * np.clip((1.2 - angle) / 0.5, 0.02, 1)
-
-
 def _spreads(lattice: Lattice, views: Sequence[View], up_m: float) -> Floats:
     """(V, V) how far apart two photos stand, seen from the lattice's middle, over how high they are."""
     middle = lattice.site_from_cells @ [(lattice.width - 1) / 2, (lattice.height - 1) / 2, 1.0]
@@ -229,15 +243,6 @@ def _spreads(lattice: Lattice, views: Sequence[View], up_m: float) -> Floats:
     ]
     rays = rays[:, :2] / np.maximum(rays[:, 2:], 0.1)
     return np.asarray(np.linalg.norm(rays[:, None] - rays[None], axis=2))
-
-
-def _widest(seen: Sequence[Mask], spreads: Floats) -> Floats32:
-    """(H, W) the largest spread of two photos that see a cell; 0 where fewer do."""
-    widest = np.zeros(seen[0].shape, np.float32)
-    for i in range(len(seen)):
-        for j in range(i):
-            np.maximum(widest, np.float32(spreads[i, j]), out=widest, where=seen[i] & seen[j])
-    return widest
 
 
 class _Laid:
@@ -355,27 +360,6 @@ def _contrast(picture: Floats32, angle_rad: float) -> Floats32:
     away = picture - cv2.filter2D(picture, -1, line / line.sum())
     spread = cv2.sqrBoxFilter(away, -1, (side, side))
     return np.asarray(away / np.sqrt(spread + np.float32(_NOISE_LEVELS**2)), np.float32)
-
-
-def _agreements(laid: Sequence[_Laid], levels_m: Floats, settings: SweepSettings) -> Floats32:
-    """(H, L, W) how well the photos agree at each of L heights, 0 to 1; NaN where fewer than two see it.
-
-    The mean over the better half of the pairs that see a cell, for a photo from which something hides it agrees with
-    none (Kang, Szeliski and Chai 2001).
-    """
-    return kernels.agreements(
-        [each.contrast for each in laid],
-        np.array([each.channel for each in laid]),
-        np.array([each.planes for each in laid]),
-        np.array([each.frame for each in laid]),
-        np.array([[each.inset_px(side) for side in settings.window_cells] for each in laid]),
-        [each.hidden_below_m for each in laid],
-        levels_m,
-        settings.window_cells,
-        laid[0].shape,
-        _PAIR_SHARE,
-        cv2.getNumThreads(),
-    )
 
 
 def _cost(agreement: Floats32, settings: SmoothingSettings) -> Floats32:

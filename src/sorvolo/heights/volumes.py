@@ -167,7 +167,8 @@ def above_rim(surface: HeightField, polygons: Polygons) -> Volume:
             "no heights around the area to measure from; give a smaller area, or two flights"
         )
     base = filled(surface.up_m, around)
-    rim = _rim_sigma(surface, inside)
+    around = np.isfinite(surface.sigma_m) & ~inside
+    rim = float(np.median(surface.sigma_m[around]))
     risen = HeightField(surface.lattice, surface.up_m - base, surface.sigma_m)
     return _added_up(risen, inside, polygons, rim)
 
@@ -217,11 +218,6 @@ def _offset_sigma(off: Floats, usable: Mask, cell_m: float) -> float:
     if len(means) < 2:
         return float(np.std(off[usable]))
     return float(means.std(ddof=1) / np.sqrt(len(means)))
-
-
-def _rim_sigma(surface: HeightField, inside: Mask) -> float:
-    around = np.isfinite(surface.sigma_m) & ~inside
-    return float(np.median(surface.sigma_m[around]))
 
 
 # per case of corners above the level (top-left 1, top-right 2, bottom-right 4, bottom-left 8): pairs of edges that a

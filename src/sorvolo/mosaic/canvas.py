@@ -7,7 +7,7 @@ images.
 """
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping
+from collections.abc import Callable, Iterable, Iterator, MutableMapping
 from concurrent.futures import ThreadPoolExecutor, wait
 from itertools import pairwise
 
@@ -95,14 +95,26 @@ class Canvas:
         gone = {each for each in forget if each in self._frames} | (
             changed.keys() & self._frames.keys()
         )
-        touched = self._chunks_before_and_after(changed, gone)
+        # the chunks under changed and gone frames, where they lie now and where they will
+        # lie
+        touched: set[TileIndex] = set()
+        for each in [*gone, *changed]:
+            touched |= self._chunks_of(changed[each] if each in changed else self._frames[each])
+            if each in self._frames:
+                touched |= self._chunks_of(self._frames[each])
         if self._known is not None:
             for key in touched:
                 self._bound(key, self._known)
                 self._release(key, gone & self._painted_before, self._known)
             self._painted_before -= gone
         before = {key: self._chunks[key].winner.copy() for key in touched if key in self._chunks}
-        self._remove(gone)
+        emptied: set[TileIndex] = set()
+        for each in gone:
+            emptied |= self._chunks_of(self._frames.pop(each))
+        for key in emptied:
+            staying = self._chunks.pop(key).frames - gone
+            for each in sorted(staying):
+                self._enter(self._frames[each], key)
         for frame in changed.values():
             self._add(frame)
         dirty = self._dirty_cells(touched, before, gone | changed.keys())
@@ -136,17 +148,6 @@ class Canvas:
     @staticmethod
     def _chunks_of(frame: CanvasFrame) -> frozenset[TileIndex]:
         return Grid((0.0, 0.0), 1.0, CELL_PX * _CHUNK_CELLS).tiles_touched(frame.outline_px)
-
-    def _chunks_before_and_after(
-        self, changed: Mapping[int, CanvasFrame], gone: set[int]
-    ) -> set[TileIndex]:
-        """The chunks under changed and gone frames, where they lie now and where they will lie."""
-        touched: set[TileIndex] = set()
-        for each in [*gone, *changed]:
-            touched |= self._chunks_of(changed[each] if each in changed else self._frames[each])
-            if each in self._frames:
-                touched |= self._chunks_of(self._frames[each])
-        return touched
 
     def _add(self, frame: CanvasFrame) -> None:
         self._frames[frame.id] = frame
@@ -188,15 +189,6 @@ class Canvas:
             cells = cv2.dilate(theirs.astype(np.uint8), np.ones((3, 3), np.uint8))[1:-1, 1:-1] > 0
             ground = np.repeat(np.repeat(cells, CELL_PX, axis=0), CELL_PX, axis=1)
             known.release(column * CELL_PX, row * CELL_PX, ground)
-
-    def _remove(self, ids: set[int]) -> None:
-        emptied: set[TileIndex] = set()
-        for each in ids:
-            emptied |= self._chunks_of(self._frames.pop(each))
-        for key in emptied:
-            staying = self._chunks.pop(key).frames - ids
-            for each in sorted(staying):
-                self._enter(self._frames[each], key)
 
     def _dirty_cells(
         self, touched: set[TileIndex], before: dict[TileIndex, NDArray[np.int64]], changed: set[int]

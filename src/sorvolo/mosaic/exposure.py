@@ -6,7 +6,7 @@ undoes its exposure: what two frames a and b show of the same ground agrees when
 V(r_a) = log I_b + log g_b - log V(r_b). That is linear in log g, a2 and a4.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 import cv2
@@ -120,7 +120,29 @@ def solve_exposure(pairs: Mapping[tuple[int, int], ColourPairs]) -> Exposure:
     ids = sorted({each for link in pairs for each in link})
     if not any(len(each) for each in pairs.values()):
         return Exposure({each: np.ones(3) for each in ids})
-    solution, spread = _robust_solution(_equations(pairs, ids), len(ids))
+    # the equations of all links, at least one of which has pairs
+    links = sorted(pairs)
+    counts = np.array([min(len(pairs[each]), POINTS_PER_LINK) for each in links])
+    links, counts = [each for each, count in zip(links, counts) if count], counts[counts > 0]
+    exists = np.arange(counts.max()) < counts[:, None]
+    radius2_a, radius2_b = np.zeros((2, *exists.shape), np.float32)
+    difference = np.zeros((*exists.shape, 3), np.float32)
+    for row, (link, count) in enumerate(zip(links, counts.tolist(), strict=True)):
+        chosen = pairs[link].thinned(POINTS_PER_LINK)
+        radius2_a[row, :count], radius2_b[row, :count] = chosen.radius2_a, chosen.radius2_b
+        colours_a, colours_b = (
+            each.astype(np.float32) for each in (chosen.colours_a, chosen.colours_b)
+        )
+        difference[row, :count] = np.log(np.maximum(colours_a, 1.0)) - np.log(
+            np.maximum(colours_b, 1.0)
+        )
+    lens = [len(ids), len(ids) + 1]
+    columns = np.column_stack(
+        [np.searchsorted(ids, links), np.tile([*lens, *lens], (len(links), 1))]
+    )
+    solution, spread = _robust_solution(
+        _Equations(columns, radius2_a, radius2_b, difference, exists), len(ids)
+    )
     gains = np.exp(np.clip(solution[:-2], -_LARGEST_LOG_GAIN, _LARGEST_LOG_GAIN))
     return Exposure(dict(zip(ids, gains)), solution[-2:, 0].copy(), spread)
 
@@ -193,30 +215,6 @@ class _Equations:
             yield some, np.stack([one, -one, -a, -(a**2), b, b**2], axis=-1)
 
 
-def _equations(pairs: Mapping[tuple[int, int], ColourPairs], ids: Sequence[int]) -> _Equations:
-    """The equations of all links, at least one of which has pairs."""
-    links = sorted(pairs)
-    counts = np.array([min(len(pairs[each]), POINTS_PER_LINK) for each in links])
-    links, counts = [each for each, count in zip(links, counts) if count], counts[counts > 0]
-    exists = np.arange(counts.max()) < counts[:, None]
-    radius2_a, radius2_b = np.zeros((2, *exists.shape), np.float32)
-    difference = np.zeros((*exists.shape, 3), np.float32)
-    for row, (link, count) in enumerate(zip(links, counts.tolist(), strict=True)):
-        chosen = pairs[link].thinned(POINTS_PER_LINK)
-        radius2_a[row, :count], radius2_b[row, :count] = chosen.radius2_a, chosen.radius2_b
-        colours_a, colours_b = (
-            each.astype(np.float32) for each in (chosen.colours_a, chosen.colours_b)
-        )
-        difference[row, :count] = np.log(np.maximum(colours_a, 1.0)) - np.log(
-            np.maximum(colours_b, 1.0)
-        )
-    lens = [len(ids), len(ids) + 1]
-    columns = np.column_stack(
-        [np.searchsorted(ids, links), np.tile([*lens, *lens], (len(links), 1))]
-    )
-    return _Equations(columns, radius2_a, radius2_b, difference, exists)
-
-
 def _robust_solution(equations: _Equations, frames: int) -> tuple[Floats, float]:
     """(U, 3) unknowns per channel, logarithms of gains first, and the robust spread of what is left."""
     prior = np.repeat([_GAIN_SIGMA**-2, _VIGNETTE_SIGMA**-2], [frames, 2])
@@ -234,32 +232,26 @@ def _robust_solution(equations: _Equations, frames: int) -> tuple[Floats, float]
         typical = float(np.median(length[equations.exists]))
         spread = max(_COLOUR_SIGMA, _SIGMA_FROM_MEDIAN * typical)
         weight = equations.exists / (1 + (length / spread) ** 2) / spread**2
-        solution = _solve(equations, weight, prior, frames)
+        # (U, 3) unknowns from weighted normal equations; the vignette is one for all
+        # channels
+        columns, count = equations.columns, len(prior)
+        blocks, right = np.zeros((len(columns), 6, 6)), np.zeros((count, 3))
+        for some, factors in equations.batches():
+            weighted = np.swapaxes(factors * weight[some, :, None], 1, 2)  # (l, 6, P)
+            blocks[some] = weighted @ factors
+            np.add.at(right, columns[some], -(weighted @ equations.difference[some]))
+        rows, others = np.broadcast_arrays(columns[:, :, None], columns[:, None, :])
+        normal = csc_array(
+            (blocks.ravel(), (rows.ravel(), others.ravel())), shape=(count, count)
+        ) + diags_array(prior)
+        # gains per channel eliminated for the vignette of their mean, then put back with that vignette
+        normal = normal.tocsc()
+        mean = _solved(normal, right.mean(axis=1))
+        lens = mean[frames:]
+        known = (normal[:frames, frames:] @ lens)[:, None]
+        gains = _solved(normal[:frames, :frames], right[:frames] - known)
+        solution = np.vstack([gains, np.tile(lens[:, None], (1, 3))])
     return solution, typical * _SIGMA_FROM_MEDIAN
-
-
-def _solve(equations: _Equations, weight: Floats, prior: Floats, frames: int) -> Floats:
-    """(U, 3) unknowns from weighted normal equations; the vignette is one for all channels.
-
-    Frames share equations only with the frames that they overlap: the matrix is sparse, and so is its solution's cost.
-    """
-    columns, count = equations.columns, len(prior)
-    blocks, right = np.zeros((len(columns), 6, 6)), np.zeros((count, 3))
-    for some, factors in equations.batches():
-        weighted = np.swapaxes(factors * weight[some, :, None], 1, 2)  # (l, 6, P)
-        blocks[some] = weighted @ factors
-        np.add.at(right, columns[some], -(weighted @ equations.difference[some]))
-    rows, others = np.broadcast_arrays(columns[:, :, None], columns[:, None, :])
-    normal = csc_array(
-        (blocks.ravel(), (rows.ravel(), others.ravel())), shape=(count, count)
-    ) + diags_array(prior)
-    # gains per channel eliminated for the vignette of their mean, then put back with that vignette
-    normal = normal.tocsc()
-    mean = _solved(normal, right.mean(axis=1))
-    lens = mean[frames:]
-    known = (normal[:frames, frames:] @ lens)[:, None]
-    gains = _solved(normal[:frames, :frames], right[:frames] - known)
-    return np.vstack([gains, np.tile(lens[:, None], (1, 3))])
 
 
 def _solved(normal: csc_array, right: Floats) -> Floats:

@@ -125,7 +125,22 @@ def _fronts(count: int, one: Rows, other: Rows) -> list[_Front]:
     when = splu(
         regular, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0
     ).perm_c.astype(int)
-    tied = _tied_then(when, one, other)
+    # for each camera, in the order of `when`, the later ones that it is tied to when it
+    # goes out, sorted: those that it was tied to from the first, and what those had left
+    # that went out before and reached it first
+    first, last = np.minimum(when[one], when[other]), np.maximum(when[one], when[other])
+    order = np.argsort(first, kind="stable")
+    parts = [
+        [each]
+        for each in np.split(last[order], np.searchsorted(first[order], np.arange(1, len(when))))
+    ]
+    tied = []
+    for at, some in enumerate(parts):
+        here = np.unique(np.concatenate(some))
+        here = here[here > at]
+        tied.append(here)
+        if len(here):
+            parts[here[0]].append(here)
     camera = np.argsort(when)
     merged: list[
         list[int]
@@ -174,25 +189,6 @@ def _waiting_little(
         if len(tied[end]):
             before[front_of[tied[end][0]]].append(end)
     return [each for order in branch.values() for each in order]
-
-
-def _tied_then(when: Rows, one: Rows, other: Rows) -> list[Rows]:
-    """For each camera, in the order of `when`, the later ones that it is tied to when it goes out, sorted: those that
-    it was tied to from the first, and what those had left that went out before and reached it first."""
-    first, last = np.minimum(when[one], when[other]), np.maximum(when[one], when[other])
-    order = np.argsort(first, kind="stable")
-    parts = [
-        [each]
-        for each in np.split(last[order], np.searchsorted(first[order], np.arange(1, len(when))))
-    ]
-    tied = []
-    for at, some in enumerate(parts):
-        here = np.unique(np.concatenate(some))
-        here = here[here > at]
-        tied.append(here)
-        if len(here):
-            parts[here[0]].append(here)
-    return tied
 
 
 def _pieces(fronts: Sequence[_Front]) -> list[tuple[Floats, Floats]]:

@@ -93,26 +93,6 @@ def shared_sigma(settings: PoseGraphSettings, as_reported: NDArray[np.bool_]) ->
     )
 
 
-def unconfirmed(shared: Floats, sigma: Floats, factors: Factors) -> list[int]:
-    """The offsets, as indices of SHARED, that a flight does not show: telemetry is taken as it reports them.
-
-    An offset that all frames share (altitude's zero, gimbal, compass) and that the rest of the flight sees at less than
-    two of its own sigmas is noise: left free, it would only turn, tilt or scale the whole map. `shared` (8,) are the
-    offsets found with the priors `sigma` (8,), `factors` the normal equations, whose last unknowns they are.
-    """
-    variances = shared_variances(factors)
-    silent = set()
-    for k in (k for group in _GROUPS for k in group):
-        if not 0 < sigma[k] < OFFSET_WIDEST_SIGMA:
-            continue
-        variance = max(float(variances[k]), 1e-30)
-        information = 1 / variance - 1 / sigma[k] ** 2  # of the flight alone, without the prior
-        estimate = shared[k] / variance / information if information > 0 else 0.0
-        if estimate**2 * max(information, 0.0) <= OFFSET_LEAST_SIGMAS**2:
-            silent.add(k)
-    return [k for group in _GROUPS if silent.issuperset(group) for k in group]
-
-
 def shared_variances(factors: Factors) -> Floats:
     """(8,) of the shared unknowns, the last of the normal equations."""
     units = np.zeros((factors.size, len(SHARED)))
@@ -313,7 +293,21 @@ class PoseGraph:
         moved = self.settle()
         sigma = shared_sigma(self._settings, self._as_reported)
         factors = self._solve(self._own(), shared=True, iterations=0).equations.factorised()
-        self._as_reported[unconfirmed(self._shared, sigma, factors)] = True
+        # the offsets, as indices of SHARED, that a flight does not show: telemetry is taken
+        # as it reports them
+        variances = shared_variances(factors)
+        silent = set()
+        for k in (k for group in _GROUPS for k in group):
+            if not 0 < sigma[k] < OFFSET_WIDEST_SIGMA:
+                continue
+            variance = max(float(variances[k]), 1e-30)
+            information = 1 / variance - 1 / sigma[k] ** 2  # of the flight alone, without the prior
+            estimate = self._shared[k] / variance / information if information > 0 else 0.0
+            if estimate**2 * max(information, 0.0) <= OFFSET_LEAST_SIGMAS**2:
+                silent.add(k)
+        self._as_reported[[k for group in _GROUPS if silent.issuperset(group) for k in group]] = (
+            True
+        )
         return moved | self.settle()
 
     def report(self) -> GraphReport:

@@ -120,7 +120,13 @@ def _photos(part: Path, target: Path, most_bytes: int, keep_free_bytes: int) -> 
     try:
         with zipfile.ZipFile(part) as archive:
             entries = list(_entries(archive, most_bytes))
-            _demand_room(part, sum(each.file_size for each in entries) + keep_free_bytes)
+            wanted_bytes = sum(each.file_size for each in entries) + keep_free_bytes
+            free_bytes = shutil.disk_usage(part.parent).free
+            if wanted_bytes > free_bytes:
+                raise UploadRefusal(
+                    f"unpacked it needs {wanted_bytes / 1e9:.1f} GB with what stays free, {free_bytes / 1e9:.1f} GB are there; "
+                    "delete uploads or flights that you no longer need, and upload it again"
+                )
             target.mkdir(parents=True, exist_ok=True)
             left = most_bytes
             for entry in entries:
@@ -139,15 +145,6 @@ def _photos(part: Path, target: Path, most_bytes: int, keep_free_bytes: int) -> 
     if not photos:
         raise UploadRefusal("there is no photo in it")
     return {"kind": "photos", "photos": photos}
-
-
-def _demand_room(part: Path, wanted_bytes: int) -> None:
-    free_bytes = shutil.disk_usage(part.parent).free
-    if wanted_bytes > free_bytes:
-        raise UploadRefusal(
-            f"unpacked it needs {wanted_bytes / 1e9:.1f} GB with what stays free, {free_bytes / 1e9:.1f} GB are there; "
-            "delete uploads or flights that you no longer need, and upload it again"
-        )
 
 
 def _entries(archive: zipfile.ZipFile, most_bytes: int) -> Iterator[zipfile.ZipInfo]:

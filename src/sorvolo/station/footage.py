@@ -329,34 +329,30 @@ class LiveFootage:
         has_metadata = False
         for item in self._units.of(container, video, klv_streams(container)):
             if isinstance(item, _Data):
-                pieces = self._stated(item, shift_us)
+                pts_us = self._timeline.last_us if item.pts_us is None else item.pts_us + shift_us
+                pieces = [
+                    _piece(pts_us, _sample_of(each))
+                    for each in local_sets(item.payload, self._counts)
+                    if each.time_ns
+                ]
                 has_metadata |= bool(pieces)
                 yield from pieces
                 continue
             shift_us = self._timeline.shift(item.dts_us, time.monotonic_ns() // 1000)
             placed = item.shifted(shift_us)
-            yield from self._fixed(placed.pts_us)
+            # the receiver's moments that came since the last picture
+            while self._fixes:
+                arrived_ns, epoch = self._fixes.popleft()
+                age_us = max(0, (time.time_ns() - arrived_ns) // 1000)
+                yield _piece(
+                    max(0, placed.pts_us - age_us), MessageSample(arrived_ns, dict(epoch.values))
+                )
             if not has_metadata and placed.dts_us >= due_us:
                 due_us = placed.dts_us + _TIME_EVERY_US
                 yield _piece(
                     placed.pts_us, MessageSample(self._clock.utc_ns(placed.pts_us, time.time_ns()))
                 )
             yield placed
-
-    def _stated(self, data: "_Data", shift_us: int) -> list[FootagePiece]:
-        pts_us = self._timeline.last_us if data.pts_us is None else data.pts_us + shift_us
-        return [
-            _piece(pts_us, _sample_of(each))
-            for each in local_sets(data.payload, self._counts)
-            if each.time_ns
-        ]
-
-    def _fixed(self, pts_us: int) -> Iterator[FootagePiece]:
-        """The receiver's moments that came since the last picture."""
-        while self._fixes:
-            arrived_ns, epoch = self._fixes.popleft()
-            age_us = max(0, (time.time_ns() - arrived_ns) // 1000)
-            yield _piece(max(0, pts_us - age_us), MessageSample(arrived_ns, dict(epoch.values)))
 
 
 class Timeline:
@@ -447,7 +443,11 @@ class _Units:
             for unit in filtering.filter(packet):
                 data = bytes(unit)
                 if unit.is_keyframe:
-                    sets = parameter_sets(codec, data) or sets or _extra_sets(codec, video)
+                    sets = (
+                        parameter_sets(codec, data)
+                        or sets
+                        or parameter_sets(codec, video.codec_context.extradata or b"")
+                    )
                     data = with_parameter_sets(codec, data, sets)
                 if (piece := self._piece(codec, unit, data)) is not None:
                     yield piece
@@ -475,11 +475,6 @@ class _Units:
                 else []
             ),
         ]
-
-
-def _extra_sets(codec: str, video: Any) -> bytes:
-    """The parameter sets that the container states outside of its packets, as an RTSP session does."""
-    return parameter_sets(codec, video.codec_context.extradata or b"")
 
 
 def _format_of(video: Any, name: str) -> Format:

@@ -69,7 +69,15 @@ class MapWatch(ThreadOwner):
 
     def _look_at(self, site_id: str) -> None:
         archive = self._shelf.open(site_id)
-        self._look_at_coverage(site_id, archive)
+        # announce that the coverage of the flight in the air is another one; when it ends,
+        # the site has changed
+        try:
+            written_ns = archive.live_coverage_path.stat().st_mtime_ns
+        except OSError:
+            written_ns = 0
+        if written_ns and written_ns != self._covered.get(site_id):
+            self._events.append(NewEvent("coverage.changed", {}, site_id))
+        self._covered[site_id] = written_ns
         mark, before = archive.change_mark(), self._seen.get(site_id)
         if before is not None and before.mark == mark:
             return
@@ -94,16 +102,6 @@ class MapWatch(ThreadOwner):
             return False
         announced = self._events.newest("map.tiles", site_id)
         return announced is None or announced["data"]["revision"] != state.revision
-
-    def _look_at_coverage(self, site_id: str, archive: Archive) -> None:
-        """Announce that the coverage of the flight in the air is another one; when it ends, the site has changed."""
-        try:
-            written_ns = archive.live_coverage_path.stat().st_mtime_ns
-        except OSError:
-            written_ns = 0
-        if written_ns and written_ns != self._covered.get(site_id):
-            self._events.append(NewEvent("coverage.changed", {}, site_id))
-        self._covered[site_id] = written_ns
 
     def _announce(
         self, site_id: str, archive: Archive, state: TilePyramid | None, before: TilePyramid | None

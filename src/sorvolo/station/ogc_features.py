@@ -369,7 +369,36 @@ def stac_routes(shelf: SiteShelf) -> APIRouter:
                 404, f"the map has no version {version}; /api/stac/{site} links to those there are"
             )
         bbox = _bbox(archive, version)
-        assets = _assets(request, site, archive, found, is_newest=found.id == versions[-1].id)
+        is_newest = found.id == versions[-1].id
+        tiles = f"/api/sites/{site}/tiles/{found.id}/{{z}}/{{x}}/{{y}}.webp"
+        assets: dict[str, Any] = {
+            "tiles": {
+                "href": address(request, tiles),
+                "type": "image/webp",
+                "title": "XYZ tiles",
+                "roles": ["visual"],
+            }
+        }
+        for cog in cogs_of(archive).values():
+            belongs = (
+                is_newest if cog.id == "mosaic" else cog.id.partition(":")[2] == found.flight_id
+            )
+            if belongs:
+                assets[f"{cog.id}-tiles"] = {
+                    "href": address(request, tilejson_address(site, cog)),
+                    "type": "application/json",
+                    "title": f"{cog.title}, TileJSON",
+                    "roles": ["tiles"],
+                }
+                name = cog.file.rpartition("/")[2]
+                file = name if cog.id == "mosaic" else f"{found.flight_id}-{name}"
+                assets[cog.id] = {
+                    "href": address(request, f"/api/sites/{site}/exports/{file}"),
+                    "type": "image/tiff; application=geotiff; profile=cloud-optimized",
+                    "title": cog.title,
+                    "roles": ["data"],
+                    "proj:code": archive.site().crs,
+                }
         return GeoJsonResponse(
             {
                 "type": "Feature",
@@ -400,39 +429,6 @@ def stac_routes(shelf: SiteShelf) -> APIRouter:
         )
 
     return router
-
-
-def _assets(
-    request: Request, site: str, archive: Archive, version: VersionEntry, *, is_newest: bool
-) -> dict[str, Any]:
-    tiles = f"/api/sites/{site}/tiles/{version.id}/{{z}}/{{x}}/{{y}}.webp"
-    assets: dict[str, Any] = {
-        "tiles": {
-            "href": address(request, tiles),
-            "type": "image/webp",
-            "title": "XYZ tiles",
-            "roles": ["visual"],
-        }
-    }
-    for cog in cogs_of(archive).values():
-        belongs = is_newest if cog.id == "mosaic" else cog.id.partition(":")[2] == version.flight_id
-        if belongs:
-            assets[f"{cog.id}-tiles"] = {
-                "href": address(request, tilejson_address(site, cog)),
-                "type": "application/json",
-                "title": f"{cog.title}, TileJSON",
-                "roles": ["tiles"],
-            }
-            name = cog.file.rpartition("/")[2]
-            file = name if cog.id == "mosaic" else f"{version.flight_id}-{name}"
-            assets[cog.id] = {
-                "href": address(request, f"/api/sites/{site}/exports/{file}"),
-                "type": "image/tiff; application=geotiff; profile=cloud-optimized",
-                "title": cog.title,
-                "roles": ["data"],
-                "proj:code": archive.site().crs,
-            }
-    return assets
 
 
 def _bbox(archive: Archive, version: int | None) -> list[float] | None:

@@ -246,6 +246,10 @@ def view_of_sample(columns: Mapping[str, float], stated: Mapping[str, float]) ->
     if not isfinite(known("latitude_deg")) or not isfinite(known("longitude_deg")):
         return None
     elevation_deg = known("camera_pitch_deg")
+    # to level ground along the camera's axis; NaN where it looks at the sky or the height
+    # is unknown
+    height_m = known("height_above_takeoff_m")
+    down = -sin(radians(elevation_deg))
     return DroneView(
         known("latitude_deg"),
         known("longitude_deg"),
@@ -256,7 +260,11 @@ def view_of_sample(columns: Mapping[str, float], stated: Mapping[str, float]) ->
         elevation_deg,
         stated.get("sensor_horizontal_fov_deg", nan),
         stated.get("sensor_vertical_fov_deg", nan),
-        _range_m(known("height_above_takeoff_m"), elevation_deg),
+        (
+            height_m / down
+            if isfinite(height_m) and isfinite(elevation_deg) and down > 0.05
+            else nan
+        ),
         known("horizontal_sigma_m"),
     )
 
@@ -307,14 +315,6 @@ def _angle_deg(one: tuple[float, float], other: tuple[float, float], height_m: f
     a, b = (*one, -height_m), (*other, -height_m)
     cross = (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
     return degrees(atan2(hypot(*cross), sum(x * y for x, y in zip(a, b))))
-
-
-def _range_m(height_m: float, elevation_deg: float) -> float:
-    """To level ground along the camera's axis; NaN where it looks at the sky or the height is unknown."""
-    down = -sin(radians(elevation_deg))
-    return (
-        height_m / down if isfinite(height_m) and isfinite(elevation_deg) and down > 0.05 else nan
-    )
 
 
 def _middle(geometry: Mapping[str, Any]) -> tuple[float, float] | None:

@@ -114,7 +114,11 @@ class Relay(ThreadOwner):
                 self._lose(event, str(error))
                 return True
             except Exception as error:  # whatever a receiver does must not end the relay
-                self._note(str(error) or type(error).__name__)
+                why = str(error) or type(error).__name__
+                words = " ".join(why.split())[:200]
+                if words != self._words:
+                    _LOG.warning("%s cannot be reached: %s; trying again", self.name, words)
+                self._words = words
                 if _age_s(event) > _OLDEST_S:
                     self._lose(event, self._words)
                     return True
@@ -133,12 +137,6 @@ class Relay(ThreadOwner):
         _LOG.warning(
             "%s does not take event %s (%s): %s", self.name, event["seq"], event["type"], why
         )
-
-    def _note(self, why: str) -> None:
-        words = " ".join(why.split())[:200]
-        if words != self._words:
-            _LOG.warning("%s cannot be reached: %s; trying again", self.name, words)
-        self._words = words
 
     def _keep_place(self) -> None:
         try:
@@ -278,19 +276,15 @@ def mqtt_place(url: str, password: str = "") -> MqttPlace:
     if parts.scheme not in _PORTS or not host or is_pattern:
         raise SettingsError(f"--mqtt {parts.scheme}://{host or ''} is no broker; {_WANTED}")
     prefix, user = parts.path.strip("/") or "sorvolo", unquote(parts.username or "")
-    _check_password(parts.password, password, user)
-    return MqttPlace(
-        host, port or _PORTS[parts.scheme], prefix, user, password, parts.scheme == "mqtts"
-    )
-
-
-def _check_password(in_address: str | None, password: str, user: str) -> None:
-    if in_address is not None:
+    if parts.password is not None:
         raise SettingsError(
             "--mqtt: everybody on this machine could read a password in the address; give it in SORVOLO_MQTT_PASSWORD"
         )
     if password and not user:
         raise SettingsError(f"--mqtt: a password without a user's name; {_WANTED}")
+    return MqttPlace(
+        host, port or _PORTS[parts.scheme], prefix, user, password, parts.scheme == "mqtts"
+    )
 
 
 class MqttSender:

@@ -119,7 +119,14 @@ class Reviews:
                 )
             votes = [each for each in self.history(site_id, wish.kind) if each.id == thing][::-1]
             if wish.kind == "change":
-                votes += filter(None, [self._from_site(site_id, _by_id(votes)).get(thing)])
+                votes += filter(
+                    None,
+                    [
+                        self._from_site(
+                            site_id, {votes[-1].id: _standing(votes[-1].id, votes)} if votes else {}
+                        ).get(thing)
+                    ],
+                )
             made = Review(
                 wish.kind,
                 thing,
@@ -133,7 +140,17 @@ class Reviews:
             if votes and replace(made, revision=votes[-1].revision, at=votes[-1].at) == votes[-1]:
                 return _standing(thing, votes)
             standing = _standing(thing, [*votes, made])
-            key, kept = self._key(site_id), self._kept_as(site_id, made)
+            # the id under which a vote is kept
+            found = (
+                self._collections.get(site_id, FINDINGS).features if made.kind == "object" else []
+            )
+            key, kept = (
+                self._key(site_id),
+                next(
+                    (each["properties"]["voted_as"] for each in found if each["id"] == made.id),
+                    made.id,
+                ),
+            )
             event = NewEvent("review.changed", asdict(standing), site_id)
             try:
                 with self._events.appending([event]) as connection:
@@ -225,13 +242,6 @@ class Reviews:
         }
         return aliases | {str(each["id"]): str(each["id"]) for each in found}
 
-    def _kept_as(self, site_id: str, vote: Review) -> str:
-        """The id under which a vote is kept."""
-        found = self._collections.get(site_id, FINDINGS).features if vote.kind == "object" else []
-        return next(
-            (each["properties"]["voted_as"] for each in found if each["id"] == vote.id), vote.id
-        )
-
 
 def _standing(thing: str, votes: Sequence[Review]) -> Review:
     """How votes, the oldest first, stand: each person's last one counts."""
@@ -241,10 +251,6 @@ def _standing(thing: str, votes: Sequence[Review]) -> Review:
     verdict = counted[0] if len(set(counted)) == 1 else "disputed" if counted else NO_VERDICT
     state = "disputed" if verdict == "disputed" else "agreed" if len(counted) > 1 else "single"
     return replace(last, id=thing, verdict=verdict, state=state)
-
-
-def _by_id(votes: Sequence[Review]) -> dict[str, Review]:
-    return {votes[-1].id: _standing(votes[-1].id, votes)} if votes else {}
 
 
 def review_routes(reviews: Reviews, shelf: SiteShelf) -> APIRouter:

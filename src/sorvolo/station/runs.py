@@ -163,7 +163,16 @@ class Runs(ThreadOwner):
         """
         demand_room(self._settings.root, self._settings.free_floor_gb)
         with self._lock:
-            self._demand_turn(wish)
+            running = [each for each, _ in self._running()]
+            if len(running) >= self._settings.limits.most_missions:
+                raise Problem(
+                    409, f"{len(running)} missions run already; wait until one ends, or stop one"
+                )
+            is_writing = writes(wish.mission, wish.input is not None, wish.options.model_dump())
+            for each in running if is_writing else ():
+                own = each.mission, each.input is not None, each.options or {}
+                if each.site == wish.site and writes(*own):
+                    raise _busy(409, each, f"writes into the site {wish.site!r}")
             makes_site = wish.mission in ("map", "watch") or (
                 wish.mission == "search" and wish.input is not None
             )
@@ -171,7 +180,38 @@ class Runs(ThreadOwner):
             site = find(wish.site)
             run_id = secrets.token_hex(8)
             folder = self._folder / run_id
-            order = self._order(wish, run_id, site, folder)
+            options = wish.options
+            given = {
+                name: "" if each is None else self._inputs.source(each)
+                for name, each in (
+                    ("source", wish.input),
+                    ("telemetry", options.telemetry),
+                    ("camera", options.camera_file),
+                )
+            }
+            results = site / SEARCH_FOLDER if wish.mission == "search" else folder / "results"
+            stream, door = (
+                (wish.input.stream if wish.input else None) or "",
+                self._settings.camera_door,
+            )
+            is_camera = (
+                wish.input is not None and wish.input.stream_url is not None and door.is_socket()
+            )
+            order = RunOrder(
+                run=run_id,
+                mission=wish.mission,
+                site=str(site.resolve()),
+                source=given["source"],
+                telemetry=given["telemetry"],
+                camera=given["camera"] or options.camera or "",
+                folder=str(results.resolve()),
+                stream=_stream_of_camera(given["source"], run_id) if is_camera else stream,
+                away_s=self._settings.limits.away_s,
+                options=options.model_dump() | {"live_s": _LIVE_S, "voters": options.votes + 2},
+                door=str(door.resolve()) if is_camera else "",
+                streams=str((self._settings.root / STREAMS_FOLDER).resolve()),
+                floor_gb=self._settings.free_floor_gb,
+            )
             with writing(folder):
                 folder.mkdir(parents=True)
             order.write(folder)
@@ -287,7 +327,12 @@ class Runs(ThreadOwner):
         short = shortage(self._settings.root, floor_gb)
         if not (is_low := bool(short)):
             self._reserve.hold()
-        self._note_shortage(short)
+        # let the missions that run state that the disk is full (`short`: in words), or no
+        # more
+        with self._lock:
+            for run, _ in self._running():
+                if bool(short) != bool(run.notice):
+                    self._keep(replace(run, notice=_notice(run, short) if short else None), [])
         if is_low != self._is_low:
             data = {"is_low": is_low, "free_gb": round(free_gb, 2), "floor_gb": floor_gb}
             self._events.append(NewEvent("station.disk", data))
@@ -309,13 +354,6 @@ class Runs(ThreadOwner):
                 if uses(run):
                     raise _busy(423, run, words)
             yield
-
-    def _note_shortage(self, short: str) -> None:
-        """Let the missions that run state that the disk is full (`short`: in words), or no more."""
-        with self._lock:
-            for run, _ in self._running():
-                if bool(short) != bool(run.notice):
-                    self._keep(replace(run, notice=_notice(run, short) if short else None), [])
 
     def _begin(self, run: Run) -> None:
         with self._events.appending([_event("run.started", run, run_row(run))]) as connection:
@@ -445,49 +483,6 @@ class Runs(ThreadOwner):
                 "UPDATE runs SET state = ?, record = ?, journal_offset = coalesce(?, journal_offset) WHERE id = ?",
                 (run.state, compact_json(asdict(run)), offset, run.id),
             )
-
-    def _demand_turn(self, wish: RunWish) -> None:
-        running = [each for each, _ in self._running()]
-        if len(running) >= self._settings.limits.most_missions:
-            raise Problem(
-                409, f"{len(running)} missions run already; wait until one ends, or stop one"
-            )
-        is_writing = writes(wish.mission, wish.input is not None, wish.options.model_dump())
-        for each in running if is_writing else ():
-            own = each.mission, each.input is not None, each.options or {}
-            if each.site == wish.site and writes(*own):
-                raise _busy(409, each, f"writes into the site {wish.site!r}")
-
-    def _order(self, wish: RunWish, run_id: str, site: Path, folder: Path) -> RunOrder:
-        options = wish.options
-        given = {
-            name: "" if each is None else self._inputs.source(each)
-            for name, each in (
-                ("source", wish.input),
-                ("telemetry", options.telemetry),
-                ("camera", options.camera_file),
-            )
-        }
-        results = site / SEARCH_FOLDER if wish.mission == "search" else folder / "results"
-        stream, door = (wish.input.stream if wish.input else None) or "", self._settings.camera_door
-        is_camera = (
-            wish.input is not None and wish.input.stream_url is not None and door.is_socket()
-        )
-        return RunOrder(
-            run=run_id,
-            mission=wish.mission,
-            site=str(site.resolve()),
-            source=given["source"],
-            telemetry=given["telemetry"],
-            camera=given["camera"] or options.camera or "",
-            folder=str(results.resolve()),
-            stream=_stream_of_camera(given["source"], run_id) if is_camera else stream,
-            away_s=self._settings.limits.away_s,
-            options=options.model_dump() | {"live_s": _LIVE_S, "voters": options.votes + 2},
-            door=str(door.resolve()) if is_camera else "",
-            streams=str((self._settings.root / STREAMS_FOLDER).resolve()),
-            floor_gb=self._settings.free_floor_gb,
-        )
 
 
 def run_row(run: Run) -> dict[str, Any]:

@@ -82,7 +82,12 @@ class StationSettings:
             raise SettingsError(f"--port {self.port}: a port from 1 to 65535 was needed")
         if not self.free_floor_gb >= 0:
             raise SettingsError(f"free_floor_gb is not below 0, got {self.free_floor_gb}")
-        _check_certificate(self.tls_cert, self.tls_key)
+        # raise SettingsError unless both files are there, or neither was given
+        if (self.tls_cert is None) != (self.tls_key is None):
+            raise SettingsError("--tls-cert and --tls-key belong together; give both, or neither")
+        for each in (self.tls_cert, self.tls_key):
+            if each is not None and not each.is_file():
+                raise SettingsError(f"no such file: {each}; a PEM file was needed")
         for text in self.stream_ranges:
             _check_range(text)
         if self.public_url:
@@ -167,15 +172,6 @@ def check_exposure(settings: StationSettings, *, has_tokens: bool) -> None:
             f"{where}, and without TLS tokens could be read on the way; give --tls-cert and --tls-key, or "
             "--insecure-lan in a network that you trust"
         )
-
-
-def _check_certificate(certificate: Path | None, key: Path | None) -> None:
-    """Raise SettingsError unless both files are there, or neither was given."""
-    if (certificate is None) != (key is None):
-        raise SettingsError("--tls-cert and --tls-key belong together; give both, or neither")
-    for each in (certificate, key):
-        if each is not None and not each.is_file():
-            raise SettingsError(f"no such file: {each}; a PEM file was needed")
 
 
 def _check_range(text: str) -> None:

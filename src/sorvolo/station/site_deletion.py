@@ -88,9 +88,29 @@ class SiteDeletion:
                 raise Problem(
                     412, f"the site {site_id!r} has changed since; look again at what would be lost"
                 )
-            gone = self._moved_away(folder)
+            # where the folder lies now, unseen. Raises StoreError where it cannot be moved:
+            # the site is as it was
+            gone = self._bin / secrets.token_hex(8)
+            with writing(self._bin):
+                self._bin.mkdir(mode=0o700, exist_ok=True)
             try:
-                self._forget(site_id)
+                folder.rename(gone)
+            except OSError as error:
+                words = (
+                    "it lies on another disk than the station's own"
+                    if error.errno == errno.EXDEV
+                    else error.strerror
+                )
+                raise StoreError(
+                    f"cannot delete {folder} ({words}); delete the folder itself"
+                ) from error
+            try:
+                # drop what the station keeps of a site whose folder is gone
+                self._shelf.forget(site_id)
+                for run in self._runs.of_site(site_id):
+                    self._runs.delete(run.id)
+                self._reviews.forget(site_id)
+                self._drawings.forget(site_id)
             finally:
                 shutil.rmtree(gone, ignore_errors=True)
 
@@ -106,7 +126,23 @@ class SiteDeletion:
         """The site's folder, while no mission begins on it and no other program writes it."""
         with self._runs.unused_site(site_id):
             folder = self._shelf.folder(site_id)
-            self._demand_own(site_id, folder)
+            # raise Problem (409) for a site of which the folder is not the whole, or more
+            file = catalogue_file(folder)
+            reasons = {
+                "is the folder that the station serves; end it, and delete that": folder
+                == self._shelf.root,
+                "has its catalogue in PostgreSQL; drop its schema, delete its folder": file is None
+                or file.name != CATALOGUE,
+                "is a working copy of a site in a store, and would come back; delete that": (
+                    folder / ORIGIN
+                ).exists(),
+                "is being copied; finish that with the same `sorvolo site copy`": (
+                    folder / COPYING
+                ).exists(),
+            }
+            for why, is_so in reasons.items():
+                if is_so:
+                    raise Problem(409, f"the site {site_id!r} {why}")
             try:
                 lock = lock_folder(folder)
             except BusyError as error:
@@ -117,25 +153,6 @@ class SiteDeletion:
                 yield folder
             finally:
                 os.close(lock)
-
-    def _demand_own(self, site_id: str, folder: Path) -> None:
-        """Raise Problem (409) for a site of which the folder is not the whole, or more."""
-        file = catalogue_file(folder)
-        reasons = {
-            "is the folder that the station serves; end it, and delete that": folder
-            == self._shelf.root,
-            "has its catalogue in PostgreSQL; drop its schema, delete its folder": file is None
-            or file.name != CATALOGUE,
-            "is a working copy of a site in a store, and would come back; delete that": (
-                folder / ORIGIN
-            ).exists(),
-            "is being copied; finish that with the same `sorvolo site copy`": (
-                folder / COPYING
-            ).exists(),
-        }
-        for why, is_so in reasons.items():
-            if is_so:
-                raise Problem(409, f"the site {site_id!r} {why}")
 
     def _known(self, site_id: str, folder: Path) -> "_Known":
         """What the site's catalogue holds. Raises Problem (410) where the folder goes meanwhile."""
@@ -159,32 +176,6 @@ class SiteDeletion:
         return _Known(
             len(flights), len(complete), _mark(about.st_dev, about.st_ino, len(flights), newest)
         )
-
-    def _forget(self, site_id: str) -> None:
-        """Drop what the station keeps of a site whose folder is gone."""
-        self._shelf.forget(site_id)
-        for run in self._runs.of_site(site_id):
-            self._runs.delete(run.id)
-        self._reviews.forget(site_id)
-        self._drawings.forget(site_id)
-
-    def _moved_away(self, folder: Path) -> Path:
-        """Where the folder lies now, unseen. Raises StoreError where it cannot be moved: the site is as it was."""
-        gone = self._bin / secrets.token_hex(8)
-        with writing(self._bin):
-            self._bin.mkdir(mode=0o700, exist_ok=True)
-        try:
-            folder.rename(gone)
-        except OSError as error:
-            words = (
-                "it lies on another disk than the station's own"
-                if error.errno == errno.EXDEV
-                else error.strerror
-            )
-            raise StoreError(
-                f"cannot delete {folder} ({words}); delete the folder itself"
-            ) from error
-        return gone
 
 
 def site_deletion_routes(deletion: SiteDeletion) -> APIRouter:

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from sorvolo.errors import StoreError
-from sorvolo.geometry.arrays import PointsM
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.station.problems import Problem, below
 from sorvolo.station.settings import STATE_FOLDER, STREAMS_FOLDER
@@ -49,7 +48,13 @@ class SiteShelf:
         """The folders as they were found this many seconds ago at most."""
         with self._lock:
             if time.monotonic() - self._looked_s >= at_most_s:
-                self._found = _sites_below(self.root)
+                self._found = {
+                    ":".join(each.path.relative_to(self.root).parts)
+                    or self.root.resolve().name
+                    or "site": each.path
+                    for each in folders_below(self.root, deepest=_DEEPEST, most=_MOST_FOLDERS)
+                    if each.is_site
+                }
                 self._looked_s = time.monotonic()
             return dict(self._found)
 
@@ -113,16 +118,11 @@ class SiteShelf:
             self._open.clear()
 
 
-def _sites_below(root: Path) -> dict[str, Path]:
-    return {
-        ":".join(each.path.relative_to(root).parts) or root.resolve().name or "site": each.path
-        for each in folders_below(root, deepest=_DEEPEST, most=_MOST_FOLDERS)
-        if each.is_site
-    }
-
-
-def outline_lonlat(tiles: Sequence[TileIndex], grid: SiteGrid) -> PointsM:
-    """(4, 2) longitudes and latitudes of the corners of the box around tiles."""
+def bounds_lonlat(tiles: Sequence[TileIndex], grid: SiteGrid) -> list[float] | None:
+    """West, south, east, north of tiles, deg; None without tiles."""
+    if not tiles:
+        return None
+    # (4, 2) longitudes and latitudes of the corners of the box around tiles
     columns, rows = np.array(tiles).reshape(-1, 2).T
     size = grid.grid.tile_px
     west, east = columns.min() * size - 0.5, (columns.max() + 1) * size - 0.5
@@ -131,14 +131,7 @@ def outline_lonlat(tiles: Sequence[TileIndex], grid: SiteGrid) -> PointsM:
     site_from_grid = np.linalg.inv(grid.grid_from_site_affine(np.zeros(2), 50.0))
     corners_m = corners_px @ site_from_grid[:2, :2].T + site_from_grid[:2, 2]
     latitude, longitude, _ = grid.frame.wgs84_from_site(corners_m)
-    return np.column_stack([longitude, latitude])
-
-
-def bounds_lonlat(tiles: Sequence[TileIndex], grid: SiteGrid) -> list[float] | None:
-    """West, south, east, north of tiles, deg; None without tiles."""
-    if not tiles:
-        return None
-    corners = outline_lonlat(tiles, grid)
+    corners = np.column_stack([longitude, latitude])
     return [round(float(each), 8) for each in (*corners.min(axis=0), *corners.max(axis=0))]
 
 
@@ -167,23 +160,21 @@ def site_detail(site_id: str, archive: Archive) -> dict[str, Any]:
     compared = {each.flight_id for each in versions if each.id in comparisons}
     return {
         **site_summary(site_id, archive),
-        "versions": [version_row(each) for each in versions],
+        "versions": [
+            {
+                "n": each.id,
+                "flight": each.flight_id,
+                "made_at": each.created_utc,
+                "flown_at": each.flown_utc or None,
+            }
+            for each in versions
+        ],
         "flights": [
             _flight_row(each, archive, versions, compared) for each in archive.complete_flights
         ],
         "has_heights": any(
             archive.height_path(each.flight_id, HeightFile.REPORT).exists() for each in versions
         ),
-    }
-
-
-def version_row(version: VersionEntry) -> dict[str, Any]:
-    """A version of the map as the page lists it."""
-    return {
-        "n": version.id,
-        "flight": version.flight_id,
-        "made_at": version.created_utc,
-        "flown_at": version.flown_utc or None,
     }
 
 

@@ -58,7 +58,21 @@ class StoreRoot:
                 self._objects.name if is_one else f"{self._objects.name}/{name}", self.folder
             )
             try:
-                yield from self._step_site(name, working)
+                with tempfile.TemporaryDirectory(prefix="sorvolo-") as scratch:
+                    mark = _mark(working.folder)
+                    if mark != (0, 0) and mark != self._sent.get(name) and working.is_ahead():
+                        working.begin_writing()
+                    try:
+                        yield from working.fetch(Path(scratch))
+                    except OvertakenError:
+                        kept = working.set_aside()
+                        _LOG.warning(
+                            "another writer has changed %s; what this station had added is kept in %s",
+                            name,
+                            kept,
+                        )
+                        yield from working.fetch(Path(scratch))
+                    self._sent[name] = _mark(working.folder) if mark == (0, 0) else mark
             except BusyError:
                 continue  # a mission writes it: later
             except SorvoloError as error:
@@ -79,23 +93,6 @@ class StoreRoot:
                 if reported.get(name) != fault:
                     _LOG.warning("%s is not in step with its store: %s", name, fault)
             reported = faults
-
-    def _step_site(self, name: str, working: WorkingCopy) -> Generator[CopyUpdate, None, None]:
-        with tempfile.TemporaryDirectory(prefix="sorvolo-") as scratch:
-            mark = _mark(working.folder)
-            if mark != (0, 0) and mark != self._sent.get(name) and working.is_ahead():
-                working.begin_writing()
-            try:
-                yield from working.fetch(Path(scratch))
-            except OvertakenError:
-                kept = working.set_aside()
-                _LOG.warning(
-                    "another writer has changed %s; what this station had added is kept in %s",
-                    name,
-                    kept,
-                )
-                yield from working.fetch(Path(scratch))
-            self._sent[name] = _mark(working.folder) if mark == (0, 0) else mark
 
 
 def _mark(folder: Path) -> tuple[int, int]:

@@ -236,7 +236,13 @@ class WebTiles:
             state = self.live(site_id)
             is_final = version == f"live-{state.revision}"
         elif version.isdecimal() and len(version) < 10:
-            state, is_final = self._version(site_id, archive, int(version)), True
+            number = int(version)
+            if number not in {each.id for each in archive.versions()}:
+                raise Problem(
+                    404,
+                    f"the map has no version {number}; /api/sites/{site_id} lists those there are",
+                )
+            state, is_final = self._state(site_id, str(number), archive, archive), True
         else:
             raise Problem(404, f"no version {version[:40]!r}: a number or live-REVISION was needed")
         key = (site_id, state.revision, str(z), str(x), str(y), ending)
@@ -244,15 +250,6 @@ class WebTiles:
         return TileAnswer(
             self._answers.get(key, lambda: render(state, grid, z, x, y, ending)), is_final
         )
-
-    def _version(self, site_id: str, archive: Archive, number: int) -> TilePyramid:
-        if number not in {each.id for each in archive.versions()}:
-            raise Problem(
-                404, f"the map has no version {number}; /api/sites/{site_id} lists those there are"
-            )
-        return self._state(
-            site_id, str(number), archive, archive
-        )  # never changes while the site is the same
 
     def _state(self, site_id: str, name: str, archive: Archive, mark: object) -> TilePyramid:
         with self._lock:
@@ -263,7 +260,13 @@ class WebTiles:
         grid = archive.site_grid().grid
         made = TilePyramid(tiles, grid.tile_px, self._pictures)
         path = archive.mosaic_path
-        if _is_exported(archive, name) and archive.is_sound(path.name):
+        # whether a state, a version's number or `live`, is the one that the map's GeoTIFF
+        # shows
+        newest = max((each.id for each in archive.versions()), default=0)
+        shown = newest if name == "live" and not archive.is_growing else name
+        if (str(shown) == str(newest) and newest == archive.exported_version) and archive.is_sound(
+            path.name
+        ):
             made = TilePyramid(tiles, grid.tile_px, self._pictures, MapOverview(path, grid).tile)
         with self._lock:
             if len(self._states) > 200:
@@ -272,20 +275,21 @@ class WebTiles:
         return made
 
 
-def _is_exported(archive: Archive, name: str) -> bool:
-    """Whether a state, a version's number or `live`, is the one that the map's GeoTIFF shows."""
-    newest = max((each.id for each in archive.versions()), default=0)
-    shown = newest if name == "live" and not archive.is_growing else name
-    return str(shown) == str(newest) and newest == archive.exported_version
-
-
 def render(
     state: TilePyramid, site_grid: SiteGrid, z: int, x: int, y: int, ending: str = ".webp"
 ) -> bytes:
     """An encoded tile of 256 x 256 pixels; b"" where the map has nothing there."""
     if z < _SHALLOWEST_ZOOM or not _meets_map(state, site_grid, z, x, y):
         return b""
-    wanted_px = _grid_places(site_grid, z, x, y)
+    # (17, 17, 2) grid pixels of places spread over a tile, its outer edges included
+    steps = np.linspace(0.0, 1.0, _LATTICE)
+    across, down = np.meshgrid(x + steps, y + steps)
+    longitude = across / 2**z * 360.0 - 180.0
+    latitude = np.degrees(np.arctan(np.sinh(np.pi * (1 - 2 * down / 2**z))))
+    lonlat = np.column_stack([longitude.ravel(), latitude.ravel()])
+    wanted_px = site_grid.grid_from_site(site_grid.frame.ground_from_lonlat(lonlat)).reshape(
+        _LATTICE, _LATTICE, 2
+    )
     step_px = np.hypot(*(wanted_px[-1, -1] - wanted_px[0, 0])) / (TILE_PX * np.sqrt(2))
     level = int(np.clip(np.floor(np.log2(max(step_px, 1e-9)) + 0.25), 0, len(state.keys) - 1))
     level_px = (wanted_px + 0.5) / 2**level - 0.5
@@ -309,18 +313,6 @@ def encoded(rgba: ImageRGBA, ending: str) -> bytes:
     )
     assert done  # uint8 RGBA can always be encoded
     return data.tobytes()
-
-
-def _grid_places(site_grid: SiteGrid, z: int, x: int, y: int) -> Floats:
-    """(17, 17, 2) grid pixels of places spread over a tile, its outer edges included."""
-    steps = np.linspace(0.0, 1.0, _LATTICE)
-    across, down = np.meshgrid(x + steps, y + steps)
-    longitude = across / 2**z * 360.0 - 180.0
-    latitude = np.degrees(np.arctan(np.sinh(np.pi * (1 - 2 * down / 2**z))))
-    lonlat = np.column_stack([longitude.ravel(), latitude.ravel()])
-    return site_grid.grid_from_site(site_grid.frame.ground_from_lonlat(lonlat)).reshape(
-        _LATTICE, _LATTICE, 2
-    )
 
 
 def _pixels_from_lattice(places: Floats32) -> Floats32:

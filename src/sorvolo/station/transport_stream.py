@@ -38,7 +38,28 @@ class FlightFile:
         self._counters = dict.fromkeys(_PIDS, 0)  # of continuity, by PID (ISO 13818-1, 2.4.3.3)
         self.last_seq, self.last_pts_us = 0, -1
         self._file: BinaryIO = path.open("r+b" if path.exists() else "w+b", buffering=0)
-        self._recover(path)
+        # cut the file behind its last whole message and take up its state
+        size = os.fstat(self._file.fileno()).st_size
+        first = max(0, (size - _SEARCHED_BYTES) // _PACKET * _PACKET)
+        self._file.seek(first)
+        tail = self._file.read(size - first) or b""
+        end = _whole_end(tail, is_all=not first)
+        if end is None and size:
+            if first:
+                raise StoreError(
+                    f"{path}: no message in its last {_SEARCHED_BYTES:,} bytes; move it away"
+                )
+            end = 0
+        if end:
+            mark = tail[end - _PACKET : end]
+            _, self.last_seq, self.last_pts_us, _, _, _, _, *numbers = _MARK_HEAD.unpack_from(
+                mark, 4
+            )
+            self._counters = dict(zip(_PIDS, numbers))
+        keep = first + (end or 0)
+        if keep < size:
+            self._file.truncate(keep)
+        self._file.seek(keep)
 
     @property
     def size_bytes(self) -> int:
@@ -49,9 +70,25 @@ class FlightFile:
         """Write a video or telemetry message. Raises OSError where the disk does not take it; the file stays whole."""
         before, counted = self._file.tell(), dict(self._counters)
         chunk = self._packets(message)
-        mark = self._mark(message, chunk)
+        body = _MARK_HEAD.pack(
+            _MARK_NAME,
+            message.seq,
+            message.pts_us,
+            len(chunk),
+            zlib.crc32(chunk),
+            message.kind.encode(),
+            int(message.is_key),
+            *self._counters.values(),
+        )
+        body += zlib.crc32(body).to_bytes(4, "big")
+        mark = struct.pack(">BHB", 0x47, _MARK, 0x10 | message.seq & 15) + body.ljust(
+            _BODY, b"\xff"
+        )
         try:
-            _write_all(self._file, chunk + mark)
+            data = chunk + mark
+            at = self._file.write(data)
+            while at < len(data):
+                at += self._file.write(data[at:])
         except OSError:
             self._file.truncate(before)
             self._file.seek(before)
@@ -75,7 +112,9 @@ class FlightFile:
             return b"".join(self._split(_METADATA, _pes(0xBD, packet, message.pts_us, None), b""))
         unit = with_delimiter(self._codec, message.payload)
         dts_us = message.pts_us if message.dts_us is None else message.dts_us
-        clock = _pcr(dts_us, is_key=message.is_key)
+        # an adaptation field's flags and program clock
+        base = (_ticks(dts_us) - _PCR_LEAD_90KHZ) & (1 << 33) - 1
+        clock = bytes([0x50 if message.is_key else 0x10]) + (base << 15 | 0x7E00).to_bytes(6, "big")
         pictures = self._split(_VIDEO, _pes(0xE0, unit, message.pts_us, dts_us), clock)
         return b"".join([*(self._tables() if message.is_key else ()), *pictures])
 
@@ -92,7 +131,14 @@ class FlightFile:
 
     def _table(self, pid: int, table: int, body: bytes) -> bytes:
         section = struct.pack(">BH", table, 0xB000 | len(body) + 4) + body
-        section += _crc(section).to_bytes(4, "big")
+        # CRC-32 of MPEG-2 tables (ISO 13818-1, annex A): no bit is reversed, nothing is
+        # inverted at the end
+        crc = 0xFFFFFFFF
+        for byte in section:
+            crc ^= byte << 24
+            for _ in range(8):
+                crc = (crc << 1 ^ (0x04C11DB7 if crc & 0x80000000 else 0)) & 0xFFFFFFFF
+        section += crc.to_bytes(4, "big")
         head = struct.pack(">BHB", 0x47, 0x4000 | pid, 0x10 | self._next(pid))
         return (head + b"\x00" + section).ljust(_PACKET, b"\xff")
 
@@ -118,46 +164,6 @@ class FlightFile:
         number = self._counters[pid]
         self._counters[pid] = number + 1 & 15
         return number
-
-    def _mark(self, message: Message, chunk: bytes) -> bytes:
-        body = _MARK_HEAD.pack(
-            _MARK_NAME,
-            message.seq,
-            message.pts_us,
-            len(chunk),
-            zlib.crc32(chunk),
-            message.kind.encode(),
-            int(message.is_key),
-            *self._counters.values(),
-        )
-        body += zlib.crc32(body).to_bytes(4, "big")
-        return struct.pack(">BHB", 0x47, _MARK, 0x10 | message.seq & 15) + body.ljust(
-            _BODY, b"\xff"
-        )
-
-    def _recover(self, path: Path) -> None:
-        """Cut the file behind its last whole message and take up its state."""
-        size = os.fstat(self._file.fileno()).st_size
-        first = max(0, (size - _SEARCHED_BYTES) // _PACKET * _PACKET)
-        self._file.seek(first)
-        tail = self._file.read(size - first) or b""
-        end = _whole_end(tail, is_all=not first)
-        if end is None and size:
-            if first:
-                raise StoreError(
-                    f"{path}: no message in its last {_SEARCHED_BYTES:,} bytes; move it away"
-                )
-            end = 0
-        if end:
-            mark = tail[end - _PACKET : end]
-            _, self.last_seq, self.last_pts_us, _, _, _, _, *numbers = _MARK_HEAD.unpack_from(
-                mark, 4
-            )
-            self._counters = dict(zip(_PIDS, numbers))
-        keep = first + (end or 0)
-        if keep < size:
-            self._file.truncate(keep)
-        self._file.seek(keep)
 
 
 def local_set(sample: MessageSample) -> bytes:
@@ -244,28 +250,6 @@ def _stamp(mark: int, time_us: int) -> bytes:
     return struct.pack(
         ">BHH", mark << 4 | ticks >> 29 & 0xE | 1, ticks >> 14 & 0xFFFE | 1, ticks << 1 & 0xFFFE | 1
     )
-
-
-def _pcr(dts_us: int, *, is_key: bool) -> bytes:
-    """An adaptation field's flags and program clock."""
-    base = (_ticks(dts_us) - _PCR_LEAD_90KHZ) & (1 << 33) - 1
-    return bytes([0x50 if is_key else 0x10]) + (base << 15 | 0x7E00).to_bytes(6, "big")
-
-
-def _crc(data: bytes) -> int:
-    """CRC-32 of MPEG-2 tables (ISO 13818-1, annex A): no bit is reversed, nothing is inverted at the end."""
-    crc = 0xFFFFFFFF
-    for byte in data:
-        crc ^= byte << 24
-        for _ in range(8):
-            crc = (crc << 1 ^ (0x04C11DB7 if crc & 0x80000000 else 0)) & 0xFFFFFFFF
-    return crc
-
-
-def _write_all(file: BinaryIO, data: bytes) -> None:
-    at = file.write(data)
-    while at < len(data):
-        at += file.write(data[at:])
 
 
 def _whole_end(tail: bytes, *, is_all: bool) -> int | None:

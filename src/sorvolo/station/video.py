@@ -63,9 +63,23 @@ class VideoHub:
         if self._hello is None:
             return
         if message.is_key:
-            self._begin_group(message)
+            assert self._hello is not None
+            codec = codec_string(self._hello.codec, message.payload)
+            if codec is not None and codec != self._codec:
+                self._codec, self._group = codec, []
+                self._fragments = _fragments_of(self._hello, message.payload)
+                for viewer in self._viewers:
+                    self._start(viewer)
+            self._group = [message]
+            self._group_bytes = len(message.payload)
         elif self._codec and self._group:
-            self._add_to_group(message)
+            # keep a picture for new viewers; where there are too many, new viewers wait for
+            # the next key frame
+            self._group_bytes += len(message.payload)
+            if len(self._group) >= _MOST_GROUP or self._group_bytes > _MOST_GROUP_BYTES:
+                self._group = []
+            else:
+                self._group.append(message)
         if not self._codec:
             return  # no key frame yet: nobody could show it
         packed: dict[Mode, bytes] = {}
@@ -91,25 +105,6 @@ class VideoHub:
     def leave(self, viewer: "Viewer") -> None:
         """A viewer is gone."""
         self._viewers.discard(viewer)
-
-    def _begin_group(self, message: Message) -> None:
-        assert self._hello is not None
-        codec = codec_string(self._hello.codec, message.payload)
-        if codec is not None and codec != self._codec:
-            self._codec, self._group = codec, []
-            self._fragments = _fragments_of(self._hello, message.payload)
-            for viewer in self._viewers:
-                self._start(viewer)
-        self._group = [message]
-        self._group_bytes = len(message.payload)
-
-    def _add_to_group(self, message: Message) -> None:
-        """Keep a picture for new viewers; where there are too many, new viewers wait for the next key frame."""
-        self._group_bytes += len(message.payload)
-        if len(self._group) >= _MOST_GROUP or self._group_bytes > _MOST_GROUP_BYTES:
-            self._group = []
-        else:
-            self._group.append(message)
 
     def _start(self, viewer: "Viewer") -> None:
         hello = self._hello

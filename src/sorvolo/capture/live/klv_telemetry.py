@@ -92,15 +92,6 @@ def site_from_sensor_rotation(
     )
 
 
-def relative_angles(
-    platform_deg: tuple[float, float, float], site_from_camera_rotation: Matrix3
-) -> tuple[float, float, float]:
-    """Azimuth, elevation and roll relative to the platform, deg, of a camera that stands so: the inverse of
-    `site_from_sensor_rotation`."""
-    site_from_platform = site_from_gimbal_rotation(*platform_deg) @ _LEVEL_FROM_CAMERA.T
-    return gimbal_angles_from_rotation(site_from_platform.T @ site_from_camera_rotation)
-
-
 def ground_elevation_m(stated: LocalSet) -> float:
     """The ground's height at the frame's centre in the reference of the sensor's own height; NaN where unknown.
 
@@ -290,8 +281,14 @@ def packet_of(
     angles from the two together, and show the aircraft by the heading.
     """
     platform_deg = (heading_deg % 360, 0.0, 0.0)
-    azimuth_deg, elevation_deg, roll_deg = relative_angles(
-        platform_deg, site_from_gimbal_rotation(sample.yaw_deg, sample.pitch_deg, sample.roll_deg)
+    # azimuth, elevation and roll relative to the platform, deg, of a camera that stands so:
+    # the inverse of `site_from_sensor_rotation`
+    site_from_camera_rotation = site_from_gimbal_rotation(
+        sample.yaw_deg, sample.pitch_deg, sample.roll_deg
+    )
+    site_from_platform = site_from_gimbal_rotation(*platform_deg) @ _LEVEL_FROM_CAMERA.T
+    azimuth_deg, elevation_deg, roll_deg = gimbal_angles_from_rotation(
+        site_from_platform.T @ site_from_camera_rotation
     )
     values = {
         "platform_heading_deg": platform_deg[0],

@@ -98,28 +98,26 @@ class TelemetryLink:
             heard_s = time.monotonic()
             try:
                 with closing(self._open()) as wire:
-                    heard_s = self._listen(wire, backoff)
+                    # read until the wire ends; when something came last (monotonic clock)
+                    buffer = self._packets or SentenceBuffer(self._counts)
+                    heard_s, arrived_ns = time.monotonic(), time.time_ns()
+                    while not self._stop.is_set() and (data := wire.read()) is not None:
+                        if data:
+                            heard_s, arrived_ns = time.monotonic(), time.time_ns()
+                            self.outages.back()
+                            backoff.reset()
+                        elif time.monotonic() - heard_s > self._settings.silent_s:
+                            self.outages.lost(
+                                heard_s, f"silent for {time.monotonic() - heard_s:.1f} s"
+                            )
+                        for epoch in buffer.take(data, arrived_ns):
+                            self._heard(arrived_ns, epoch)
                 self.failure = "the other side closed the link"
             except OSError as error:
                 self.failure = str(error)
             if not self._stop.is_set():
                 self.outages.lost(heard_s, self.failure)
                 self._stop.wait(backoff.next_s())
-
-    def _listen(self, wire: Wire, backoff: Backoff) -> float:
-        """Read until the wire ends; when something came last (monotonic clock)."""
-        buffer = self._packets or SentenceBuffer(self._counts)
-        heard_s, arrived_ns = time.monotonic(), time.time_ns()
-        while not self._stop.is_set() and (data := wire.read()) is not None:
-            if data:
-                heard_s, arrived_ns = time.monotonic(), time.time_ns()
-                self.outages.back()
-                backoff.reset()
-            elif time.monotonic() - heard_s > self._settings.silent_s:
-                self.outages.lost(heard_s, f"silent for {time.monotonic() - heard_s:.1f} s")
-            for epoch in buffer.take(data, arrived_ns):
-                self._heard(arrived_ns, epoch)
-        return heard_s
 
 
 class SentenceBuffer:

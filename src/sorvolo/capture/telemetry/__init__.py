@@ -77,7 +77,24 @@ def read_telemetry(path: Path) -> Telemetry:
     Raises InputError for a file that is missing, a folder, empty, too large, binary, of no known format, or
     without any usable sample.
     """
-    data = _bytes_of(path)
+    try:
+        if path.is_dir():
+            raise InputError(f"{path}: a folder, not a telemetry file; name the file in it")
+        size = path.stat().st_size
+        if size > LARGEST_FILE_BYTES:
+            raise InputError(
+                f"{path}: {size / 1e6:.0f} MB is too large for telemetry (at most "
+                f"{LARGEST_FILE_BYTES / 1e6:.0f} MB); is it the video?"
+            )
+        data = path.read_bytes()
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such telemetry file; check the name") from error
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); check its permissions"
+        ) from error
+    if not data:
+        raise InputError(f"{path}: an empty file (0 bytes); copy it from the drone again")
     reader = _reader_for(data[:_HEAD_BYTES])
     if reader is None and path.name.lower().startswith("djiflightrecord"):
         raise InputError(
@@ -169,28 +186,6 @@ def unusable_files_beside(video: Path) -> list[Path]:
         and each.stem.lower() in names
         and not is_telemetry(each)
     )
-
-
-def _bytes_of(path: Path) -> bytes:
-    try:
-        if path.is_dir():
-            raise InputError(f"{path}: a folder, not a telemetry file; name the file in it")
-        size = path.stat().st_size
-        if size > LARGEST_FILE_BYTES:
-            raise InputError(
-                f"{path}: {size / 1e6:.0f} MB is too large for telemetry (at most "
-                f"{LARGEST_FILE_BYTES / 1e6:.0f} MB); is it the video?"
-            )
-        data = path.read_bytes()
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such telemetry file; check the name") from error
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read ({error.strerror}); check its permissions"
-        ) from error
-    if not data:
-        raise InputError(f"{path}: an empty file (0 bytes); copy it from the drone again")
-    return data
 
 
 def _reader_for(head: bytes) -> Reader | None:

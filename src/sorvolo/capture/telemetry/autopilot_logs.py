@@ -186,7 +186,28 @@ class DataflashReader:
             try:
                 log = DFReader_binary(file.name)
                 while (message := log.recv_match(type=["GPS", "ATT", "POS"])) is not None:
-                    _add_dataflash(message, fixes, attitude, height)
+                    # add a message where it belongs; `_timestamp` is UTC by the receiver's
+                    # clock
+                    time_s, kind = float(message._timestamp), message.get_type()
+                    if kind == "GPS" and message.Status >= _FIX_3D and not getattr(message, "I", 0):
+                        fixes.add(
+                            time_s,
+                            latitude_deg=message.Lat,
+                            longitude_deg=message.Lng,
+                            orthometric_height_m=message.Alt,
+                            horizontal_sigma_m=sigma_from_hdop_m(message.HDop),
+                            speed_m_s=message.Spd,
+                            course_deg=message.GCrs,
+                        )
+                    elif kind == "ATT":
+                        attitude.add(
+                            time_s,
+                            body_yaw_deg=message.Yaw,
+                            body_pitch_deg=message.Pitch,
+                            body_roll_deg=message.Roll,
+                        )
+                    elif kind == "POS" and hasattr(message, "RelHomeAlt"):
+                        height.add(time_s, height_above_takeoff_m=message.RelHomeAlt)
             except Exception as error:  # it raises whatever damaged bytes lead to
                 raise InputError(f"{name}: a damaged ArduPilot log; copy it again") from error
             finally:
@@ -194,30 +215,6 @@ class DataflashReader:
                     log.close()
         is_dated = bool(fixes.time_s) and fixes.time_s[0] * 1e6 > _DATED_US[0]
         return _telemetry("dataflash", name, fixes, attitude, height, dated=is_dated)
-
-
-def _add_dataflash(message: Any, fixes: _Rows, attitude: _Rows, height: _Rows) -> None:
-    """Add a message where it belongs; `_timestamp` is UTC by the receiver's clock."""
-    time_s, kind = float(message._timestamp), message.get_type()
-    if kind == "GPS" and message.Status >= _FIX_3D and not getattr(message, "I", 0):
-        fixes.add(
-            time_s,
-            latitude_deg=message.Lat,
-            longitude_deg=message.Lng,
-            orthometric_height_m=message.Alt,
-            horizontal_sigma_m=sigma_from_hdop_m(message.HDop),
-            speed_m_s=message.Spd,
-            course_deg=message.GCrs,
-        )
-    elif kind == "ATT":
-        attitude.add(
-            time_s,
-            body_yaw_deg=message.Yaw,
-            body_pitch_deg=message.Pitch,
-            body_roll_deg=message.Roll,
-        )
-    elif kind == "POS" and hasattr(message, "RelHomeAlt"):
-        height.add(time_s, height_above_takeoff_m=message.RelHomeAlt)
 
 
 class TlogReader:

@@ -88,7 +88,25 @@ def clean(
     times, video = times[keep], video[keep]
     table = {key: value[keep] for key, value in table.items()}
 
-    table, reported = _believable(table)
+    count, kept = 0, {}
+    for key, values in table.items():
+        low, high = _LIMITS[key]
+        bad = ~np.isnan(values) & ~((values >= low) & (values <= high))
+        count += int(bad.sum())
+        kept[key] = np.where(bad, np.nan, values)
+    if "longitude_deg" in kept:
+        longitude = kept["longitude_deg"]
+        kept["longitude_deg"] = np.where(
+            np.abs(longitude) > 180, (longitude + 180) % 360 - 180, longitude
+        )
+    table, reported = (
+        kept,
+        notice(
+            "out_of_range",
+            count,
+            "{} values lie outside any possible range and are taken as unknown",
+        ),
+    )
     found += reported
     if "latitude_deg" in table and "longitude_deg" in table:
         table, reported = _cleaned_fixes(times, table, position_decimals)
@@ -263,23 +281,6 @@ def _clock_notices(times: TimesNs, keep: Mask) -> list[Notice]:
             "backward_time", len(dropped) - twice, "{} samples dropped: their clock runs backward"
         ),
     ]
-
-
-def _believable(table: _Table) -> tuple[_Table, list[Notice]]:
-    count, kept = 0, {}
-    for key, values in table.items():
-        low, high = _LIMITS[key]
-        bad = ~np.isnan(values) & ~((values >= low) & (values <= high))
-        count += int(bad.sum())
-        kept[key] = np.where(bad, np.nan, values)
-    if "longitude_deg" in kept:
-        longitude = kept["longitude_deg"]
-        kept["longitude_deg"] = np.where(
-            np.abs(longitude) > 180, (longitude + 180) % 360 - 180, longitude
-        )
-    return kept, notice(
-        "out_of_range", count, "{} values lie outside any possible range and are taken as unknown"
-    )
 
 
 def _without_fixes(table: _Table, rows: Mask | Rows) -> _Table:

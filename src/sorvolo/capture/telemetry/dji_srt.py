@@ -106,7 +106,10 @@ def read(data: bytes, name: str) -> Telemetry:
     if not cues[-1].values and any(cue.values for cue in cues):
         counts["truncated"] = 1
         cues.pop()
-    _forget_empty_heights(cues)
+    # the Matrice 300 and the Mavic 2 print an absolute height of 0.0 throughout when they have none
+    if not any(cue.values.get("orthometric_height_m") for cue in cues):
+        for cue in cues:
+            cue.values.pop("orthometric_height_m", None)
     video_ns = np.array([cue.video_time_ns for cue in cues], dtype=np.int64)
     stamps_ns = np.array([cue.stamp_ns for cue in cues], dtype=np.int64)
     times_ns, refined = refine_clock(fill_stamps(stamps_ns, video_ns), video_ns)
@@ -256,10 +259,3 @@ def _latitude_comes_first(first: re.Match[str], second: re.Match[str], *, has_he
 
 def _signed(part: re.Match[str]) -> float:
     return -float(part[2]) if part[1] in ("S", "W") else float(part[2])
-
-
-def _forget_empty_heights(cues: list[_Cue]) -> None:
-    # the Matrice 300 and the Mavic 2 print an absolute height of 0.0 throughout when they have none
-    if not any(cue.values.get("orthometric_height_m") for cue in cues):
-        for cue in cues:
-            cue.values.pop("orthometric_height_m", None)

@@ -53,11 +53,6 @@ def plain_name(cell: str) -> tuple[str, str]:
     return _PUNCTUATION.sub("", label).lower(), rest.partition(")")[0].strip().lower()
 
 
-def unit_factor(quantity: str, unit: str) -> float | None:
-    """The factor to our unit (deg, m, m/s, s) of one that a header prints; None for an unknown one."""
-    return _UNITS.get(quantity, _STORED["units"]["degrees"]).get(unit)
-
-
 _HEADER_LINES = 40  # some programs write a preamble before the header
 _DATASET_RATE_HZ = 10.0  # thesis, section 2.2
 # DatCon's Tick# is the flight controller's counter, of later drones or of the Phantom 3. DatCon writes 200 rows a
@@ -213,18 +208,15 @@ def _known_columns(header: _Header) -> tuple[dict[str, int], dict[str, float], l
         if label is None:
             continue
         unit = header.columns[labels.index(label)][1]
-        factor = unit_factor(key, unit)
+        factor = _UNITS.get(key, _STORED["units"]["degrees"]).get(unit)
         if factor is None:
             notices += notice(
                 "unknown_unit", 1, f"column {label} is not used: its unit ({unit}) is unknown"
             )
         else:
             places[key], factors[key] = labels.index(label), factor
-    return places, factors, notices + _not_understood(header, places)
-
-
-def _not_understood(header: _Header, places: Mapping[str, int]) -> list[Notice]:
-    """Names columns of heights and of the gimbal that nothing reads, where what they may hold is not read either."""
+    # names columns of heights and of the gimbal that nothing reads, where what they may
+    # hold is not read either
     known = {name for names in COLUMN_NAMES.values() for name in names}
     has_heights = "relative_height" in places and "altitude" in places
     has_gimbal = "camera_pitch" in places
@@ -236,7 +228,11 @@ def _not_understood(header: _Header, places: Mapping[str, int]) -> list[Notice]:
         and not (has_gimbal if label.startswith("gimbal") else has_heights)
     ]
     words = "columns that seem to hold heights or the gimbal's angles are not understood: "
-    return notice("unknown_column", len(names), words + ", ".join(names[:6]))
+    return (
+        places,
+        factors,
+        notices + notice("unknown_column", len(names), words + ", ".join(names[:6])),
+    )
 
 
 def _rows(
@@ -343,7 +339,23 @@ def _times(
 ) -> tuple[TimesNs, TimesNs | None, list[Notice]]:
     """Each row's time, its time in the video where the table is tied to one, and the notices."""
     rows = len(table.rows)
-    stamps_ns, zoned = _stamps(table)
+    # the rows' dates as UTC, NO_TIME_NS where there is none, and how many name their time
+    # zone
+    zoned = 0
+    stamps_ns = np.full(len(table.rows), NO_TIME_NS)
+    for key in ("utc", "time"):
+        if key not in table.cells or (stamps_ns != NO_TIME_NS).any():
+            continue
+        texts = _texts(table, key)
+        if key == "utc" and "date" in table.cells:
+            texts = [_joined(day, clock) for day, clock in zip(_texts(table, "date"), texts)]
+        for row, text in enumerate(texts):
+            if stamp := time_ns_from_text(text):
+                stamps_ns[row] = stamp[0]
+                zoned += stamp[1]
+            elif epoch_ns := _epoch_ns(text, table.factors[key]):
+                stamps_ns[row] = epoch_ns
+                zoned += 1
     counter_ns = _counter(counters, rows)
     stamped = int((stamps_ns != NO_TIME_NS).sum())
     if stamped:
@@ -388,26 +400,6 @@ def _times(
             f"the table has no column of times: its {{}} rows are taken as {_DATASET_RATE_HZ:g} a second",
         )
     return relative_ns, relative_ns, notices
-
-
-def _stamps(table: _Table) -> tuple[TimesNs, int]:
-    """The rows' dates as UTC, NO_TIME_NS where there is none, and how many name their time zone."""
-    zoned = 0
-    stamps_ns = np.full(len(table.rows), NO_TIME_NS)
-    for key in ("utc", "time"):
-        if key not in table.cells or (stamps_ns != NO_TIME_NS).any():
-            continue
-        texts = _texts(table, key)
-        if key == "utc" and "date" in table.cells:
-            texts = [_joined(day, clock) for day, clock in zip(_texts(table, "date"), texts)]
-        for row, text in enumerate(texts):
-            if stamp := time_ns_from_text(text):
-                stamps_ns[row] = stamp[0]
-                zoned += stamp[1]
-            elif epoch_ns := _epoch_ns(text, table.factors[key]):
-                stamps_ns[row] = epoch_ns
-                zoned += 1
-    return stamps_ns, zoned
 
 
 def _joined(day: str, clock: str) -> str:

@@ -244,7 +244,9 @@ def _karma_samples(payload: Payload, streams: Sequence[_Stream], fused: _Stream)
     and UTC ms.
     """
     utc_from_start_ns = _system_time_ns(streams)
-    attitudes = _rows_by_time(streams, "ATTD", 4)
+    attitudes = [
+        row for stream in streams for row in stream.values.get("ATTD", []) if len(row) >= 4
+    ]
     errors = [
         row[4:6] for stream in streams for row in stream.values.get("GPRI", []) if len(row) >= 6
     ]
@@ -291,10 +293,6 @@ def _system_time_ns(streams: Sequence[_Stream]) -> int | None:
             if len(row) >= 2 and _DATED_S[0] < row[1] < _DATED_S[1]:
                 return round((row[1] - row[0]) * 1e6) * 1000
     return None
-
-
-def _rows_by_time(streams: Sequence[_Stream], key: str, least: int) -> list[tuple[float, ...]]:
-    return [row for stream in streams for row in stream.values.get(key, []) if len(row) >= least]
 
 
 def _nearest(rows: Sequence[tuple[float, ...]], time_s: float) -> tuple[float, ...] | None:

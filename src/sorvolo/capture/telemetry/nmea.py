@@ -128,7 +128,30 @@ def epochs_of(messages: list[Any]) -> tuple[list[Epoch], bool]:
         if not epochs or epochs[-1].time_ns != now_ns or message.msgID in epochs[-1].kinds:
             epochs.append(Epoch(now_ns))
         epochs[-1].kinds.add(message.msgID)
-        _add(epochs[-1], message)
+        # add a sentence's values to its moment; a GGA's position goes before an RMC's
+        epoch = epochs[-1]
+        if message.msgID == "GGA":
+            epoch.has_fix &= getattr(message, "quality", 0) != 0
+            altitude_m, separation_m = _number(message, "alt"), _number(message, "sep")
+            values = {
+                "latitude_deg": _number(message, "lat"),
+                "longitude_deg": _number(message, "lon"),
+                "orthometric_height_m": altitude_m,
+                "ellipsoidal_height_m": altitude_m + separation_m,
+                "horizontal_sigma_m": sigma_from_hdop_m(_number(message, "HDOP")),
+            }
+        else:
+            epoch.has_fix &= _is_valid(message)
+            values = {
+                "speed_m_s": _number(message, "spd") * KNOT_M_S,
+                "course_deg": _number(message, "cog"),
+            }
+            if "GGA" not in epoch.kinds:
+                values |= {
+                    "latitude_deg": _number(message, "lat"),
+                    "longitude_deg": _number(message, "lon"),
+                }
+        epoch.values |= values
     for epoch in epochs:
         if not epoch.has_fix:
             epoch.values = {}
@@ -138,32 +161,6 @@ def epochs_of(messages: list[Any]) -> tuple[list[Epoch], bool]:
 def _is_valid(message: Any) -> bool:
     """Whether an RMC sentence states a fix; one that was cut before its status states none."""
     return getattr(message, "status", "") == "A"
-
-
-def _add(epoch: Epoch, message: Any) -> None:
-    """Add a sentence's values to its moment; a GGA's position goes before an RMC's."""
-    if message.msgID == "GGA":
-        epoch.has_fix &= getattr(message, "quality", 0) != 0
-        altitude_m, separation_m = _number(message, "alt"), _number(message, "sep")
-        values = {
-            "latitude_deg": _number(message, "lat"),
-            "longitude_deg": _number(message, "lon"),
-            "orthometric_height_m": altitude_m,
-            "ellipsoidal_height_m": altitude_m + separation_m,
-            "horizontal_sigma_m": sigma_from_hdop_m(_number(message, "HDOP")),
-        }
-    else:
-        epoch.has_fix &= _is_valid(message)
-        values = {
-            "speed_m_s": _number(message, "spd") * KNOT_M_S,
-            "course_deg": _number(message, "cog"),
-        }
-        if "GGA" not in epoch.kinds:
-            values |= {
-                "latitude_deg": _number(message, "lat"),
-                "longitude_deg": _number(message, "lon"),
-            }
-    epoch.values |= values
 
 
 def _number(message: Any, attribute: str) -> float:

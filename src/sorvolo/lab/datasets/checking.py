@@ -13,7 +13,6 @@ from sorvolo.geometry.arrays import Floats
 from sorvolo.lab.datasets.parsed import (
     SHARES,
     LabelFinding,
-    ParsedBox,
     ParsedPicture,
     ParsedSet,
     findings_in,
@@ -114,14 +113,6 @@ class Naming:
         return plain(name) in self.ignored
 
 
-def of_one_unnamed(names: Naming) -> Naming:
-    """The naming of a set whose one class has the number 0 and no name, where the user looks for one class only."""
-    targets = set(names.targets.values())
-    return (
-        Naming({**names.targets, "0": targets.pop()}, names.ignored) if len(targets) == 1 else names
-    )
-
-
 def naming(classes: Mapping[str, str] | None, ignore: Iterable[str]) -> Naming:
     """What the user asked for; without `classes` the usual names are known and their look-alikes ignored."""
     asked = frozenset(plain(name) for name in ignore)
@@ -182,7 +173,14 @@ def _mapped(
     """The naming that holds for this set, and our classes in it. Raises InputError when no name maps."""
     every = dict.fromkeys([*counts, *parsed.declared])
     if list(every) == ["0"] and not parsed.declared:
-        names = of_one_unnamed(names)
+        # the naming of a set whose one class has the number 0 and no name, where the user
+        # looks for one class only
+        targets = set(names.targets.values())
+        names = (
+            Naming({**names.targets, "0": targets.pop()}, names.ignored)
+            if len(targets) == 1
+            else names
+        )
     classes = names.classes(every)
     if not classes:
         raise nothing_maps(str(place), {name: counts[name] for name in every}, names.targets)
@@ -210,7 +208,15 @@ def _labelled(
         return None, scaling
     inside, keep, clipping = _clipped(fitted, width_px, height_px, name)
     kept = ((box, edge_px) for box, edge_px, is_kept in zip(parsed.boxes, inside, keep) if is_kept)
-    boxes, labels, ignored = _targets_and_ignored(kept, names, classes)
+    # boxes of our classes with their class numbers, and boxes to ignore; boxes of other
+    # names are left out
+    boxes, labels, ignored = [], [], []
+    for box, edge_px in kept:
+        if box.is_ignored or names.is_ignored(box.name):
+            ignored.append(tuple(edge_px.tolist()))
+        elif names.is_target(box.name):
+            boxes.append(edge_px)
+            labels.append(classes.index(names.target(box.name)))
     if parsed.is_ignored:
         ignored = [(0.0, 0.0, float(width_px), float(height_px)), *ignored]
     group = group_of(parsed.path, place, pattern) if pattern or not parsed.group else parsed.group
@@ -224,20 +230,6 @@ def _labelled(
         np.array(list(dict.fromkeys(ignored)), np.float32),
         parsed.m_per_px,
     ), scaling + clipping
-
-
-def _targets_and_ignored(
-    kept: Iterable[tuple[ParsedBox, Floats]], names: Naming, classes: tuple[str, ...]
-) -> tuple[list[Floats], list[int], list[tuple[float, ...]]]:
-    """Boxes of our classes with their class numbers, and boxes to ignore; boxes of other names are left out."""
-    boxes, labels, ignored = [], [], []
-    for box, edge_px in kept:
-        if box.is_ignored or names.is_ignored(box.name):
-            ignored.append(tuple(edge_px.tolist()))
-        elif names.is_target(box.name):
-            boxes.append(edge_px)
-            labels.append(classes.index(names.target(box.name)))
-    return boxes, labels, ignored
 
 
 def _in_picture_px(

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
 from math import isfinite
 from pathlib import Path, PureWindowsPath
@@ -46,8 +46,44 @@ def read_coco(place: Path) -> ParsedSet:
                 f"{path}: an image has no id, or that of another ({row.get('id')}); each needs its own"
             )
         images[row["id"]] = row
-    boxes, wrong = _boxes(_rows(whole, "annotations", path), categories, images)
-    pictures, missing = _pictures(path, images, boxes)
+    # the boxes of each image, by its id; what was wrong with the others
+    rows = _rows(whole, "annotations", path)
+    boxes: dict[Any, list[ParsedBox]] = {}
+    wrong = []
+    for row in rows:
+        box = _box(row, categories)
+        if box is None:
+            wrong.append(LabelFinding("malformed_labels", f"annotation {row.get('id')}"))
+        elif row.get("image_id") not in images:
+            wrong.append(LabelFinding("labels_without_picture", f"annotation {row.get('id')}"))
+        else:
+            boxes.setdefault(row["image_id"], []).append(box)
+    # the images whose picture is there, and those that have none
+    pictures, missing = [], []
+    folders = _folders(path)
+    by_name = cache(
+        partial(_by_name, path.parent)
+    )  # for pictures that are not where the file has them
+    for image_id, row in images.items():
+        name = _inside(path, str(row.get("file_name", "")).replace("\\", "/"))
+        found = _found(name, folders, by_name) if name else None
+        if found is None:
+            missing.append(
+                LabelFinding(
+                    "labels_without_picture", name or f"image {image_id} without file_name"
+                )
+            )
+            continue
+        size = _finite([row.get("width"), row.get("height")])
+        pictures.append(
+            ParsedPicture(
+                found,
+                tuple(boxes.get(image_id, ())),
+                (size[0], size[1]) if size and min(size) > 0 else None,
+                _video(row),
+                next(iter(_finite([row.get("m_per_px")])), float("nan")),
+            )
+        )
     if not pictures:
         raise _no_picture(path, images)
     each_once, twice = joined(pictures)
@@ -132,23 +168,6 @@ def _rows(whole: Mapping[str, Any], key: str, path: Path) -> list[dict[str, Any]
     return rows
 
 
-def _boxes(
-    rows: Iterable[Mapping[str, Any]], categories: Mapping[Any, str], images: Container[Any]
-) -> tuple[dict[Any, list[ParsedBox]], list[LabelFinding]]:
-    """The boxes of each image, by its id; what was wrong with the others."""
-    boxes: dict[Any, list[ParsedBox]] = {}
-    findings = []
-    for row in rows:
-        box = _box(row, categories)
-        if box is None:
-            findings.append(LabelFinding("malformed_labels", f"annotation {row.get('id')}"))
-        elif row.get("image_id") not in images:
-            findings.append(LabelFinding("labels_without_picture", f"annotation {row.get('id')}"))
-        else:
-            boxes.setdefault(row["image_id"], []).append(box)
-    return boxes, findings
-
-
 def _box(row: Mapping[str, Any], categories: Mapping[Any, str]) -> ParsedBox | None:
     """The annotation's box, else the one around its polygons; None when it has none."""
     edges = _edges(row)
@@ -180,38 +199,6 @@ def _finite(value: Any) -> list[float]:
     except (TypeError, ValueError, OverflowError):
         return []
     return numbers if all(isfinite(number) for number in numbers) else []
-
-
-def _pictures(
-    path: Path, images: Mapping[Any, Mapping[str, Any]], boxes: Mapping[Any, list[ParsedBox]]
-) -> tuple[list[ParsedPicture], list[LabelFinding]]:
-    """The images whose picture is there, and those that have none."""
-    pictures, findings = [], []
-    folders = _folders(path)
-    by_name = cache(
-        partial(_by_name, path.parent)
-    )  # for pictures that are not where the file has them
-    for image_id, row in images.items():
-        name = _inside(path, str(row.get("file_name", "")).replace("\\", "/"))
-        found = _found(name, folders, by_name) if name else None
-        if found is None:
-            findings.append(
-                LabelFinding(
-                    "labels_without_picture", name or f"image {image_id} without file_name"
-                )
-            )
-            continue
-        size = _finite([row.get("width"), row.get("height")])
-        pictures.append(
-            ParsedPicture(
-                found,
-                tuple(boxes.get(image_id, ())),
-                (size[0], size[1]) if size and min(size) > 0 else None,
-                _video(row),
-                next(iter(_finite([row.get("m_per_px")])), float("nan")),
-            )
-        )
-    return pictures, findings
 
 
 def _found(

@@ -38,7 +38,13 @@ def read_okutama(place: Path) -> ParsedSet:
     files = (
         [place]
         if place.is_file()
-        else [path for path in files_below(place, ".txt") if is_okutama_file(path)]
+        else [
+            path
+            for path in files_below(place, ".txt")
+            if looks_like_okutama(
+                next((line for line in read_text(path).splitlines() if line.strip()), "")
+            )
+        ]
     )
     files_of = {path.stem: path for path in reversed(files)}
     read = {video: _boxes(path) for video, path in sorted(files_of.items())}
@@ -70,13 +76,6 @@ def read_okutama(place: Path) -> ParsedSet:
 def looks_like_okutama(line: str) -> bool:
     """Whether a line is one of this form."""
     return _LINE.fullmatch(line) is not None
-
-
-def is_okutama_file(path: Path) -> bool:
-    """Whether the file's first line is of this form."""
-    return looks_like_okutama(
-        next((line for line in read_text(path).splitlines() if line.strip()), "")
-    )
 
 
 def _boxes(path: Path) -> tuple[dict[int, list[ParsedBox]], list[LabelFinding]]:

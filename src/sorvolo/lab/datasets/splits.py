@@ -81,21 +81,6 @@ def _blocks(places: Sequence[tuple[str, int]], block: int) -> list[list[int]]:
     return blocks
 
 
-def _far_from(
-    rows: Sequence[int], others: Sequence[int], places: Sequence[tuple[str, int]], gap: int
-) -> list[int]:
-    """The rows none of whose neighbours within `gap` frames is among the others."""
-    taken: dict[str, list[int]] = {}
-    for row in others:
-        taken.setdefault(places[row][0], []).append(places[row][1])
-    kept = []
-    for row in rows:
-        sequence, number = places[row]
-        if sequence not in taken or np.abs(np.array(taken[sequence]) - number).min() > gap:
-            kept.append(row)
-    return kept
-
-
 _BLOCKS, _GAP = 10, 10  # of a set of too few videos; frames left out between them, at most
 
 
@@ -128,7 +113,16 @@ def hold_out(
             words = f"{count} pictures are too few to be divided"
             return labelled, empty, [f"nothing of {labelled.name} is held out: {words}"]
         gap, rest = min(_GAP, block // 2), sorted({*range(count)} - held)
-        learnt = _far_from(rest, sorted(held), places, gap)
+        # the rows none of whose neighbours within `gap` frames is among the others
+        others = sorted(held)
+        taken: dict[str, list[int]] = {}
+        for row in others:
+            taken.setdefault(places[row][0], []).append(places[row][1])
+        learnt = []
+        for row in rest:
+            sequence, number = places[row]
+            if sequence not in taken or np.abs(np.array(taken[sequence]) - number).min() > gap:
+                learnt.append(row)
         remarks = [
             f"{labelled.name} has too few videos to hold whole ones out: blocks of about {block} neighbouring frames were "
             "instead; frames of one video look alike, so the score will be too good"

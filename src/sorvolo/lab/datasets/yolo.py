@@ -1,7 +1,7 @@
 """YOLO: a text file for each picture, a line for each box: class number, then centre and size as shares."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from math import isfinite
 from pathlib import Path
 
@@ -54,7 +54,18 @@ def read_yolo(place: Path) -> ParsedSet:
         )
     read = {path: _boxes(labels[path], names) if path in labels else ([], []) for path in pictures}
     malformed = findings_in(read.values())
-    _demand_shares(folder, [box for boxes, _ in read.values() for box in boxes], malformed)
+    boxes = [box for boxes, _ in read.values() for box in boxes]
+    far = sum(max(abs(edge) for edge in box[1:5]) > _FARTHEST_SHARE for box in boxes)
+    if far > len(boxes) / 2:
+        raise InputError(
+            f"{folder}: {far} of {len(boxes)} boxes have numbers beyond 1, as pixels would; YOLO labels are shares of "
+            "the picture's width and height: centre x, centre y, width, height"
+        )
+    if not boxes and malformed:
+        raise InputError(
+            f"{folder}: no line of its label files is YOLO (class, centre x, centre y, width, height; first failure in "
+            f"{malformed[0].place}); if it is another form, name it"
+        )
     result = tuple(ParsedPicture(path, tuple(boxes), SHARES) for path, (boxes, _) in read.items())
     return ParsedSet(FORM, result, tuple(names), (*_lonely(folder, pictures, labels), *malformed))
 
@@ -139,22 +150,6 @@ def _label_file(picture: Path) -> Path | None:
                 return mirrored
             break
     return beside if beside.is_file() and is_label_file(beside) else None
-
-
-def _demand_shares(
-    folder: Path, boxes: Sequence[ParsedBox], malformed: Sequence[LabelFinding]
-) -> None:
-    far = sum(max(abs(edge) for edge in box[1:5]) > _FARTHEST_SHARE for box in boxes)
-    if far > len(boxes) / 2:
-        raise InputError(
-            f"{folder}: {far} of {len(boxes)} boxes have numbers beyond 1, as pixels would; YOLO labels are shares of "
-            "the picture's width and height: centre x, centre y, width, height"
-        )
-    if not boxes and malformed:
-        raise InputError(
-            f"{folder}: no line of its label files is YOLO (class, centre x, centre y, width, height; first failure in "
-            f"{malformed[0].place}); if it is another form, name it"
-        )
 
 
 def _lonely(folder: Path, pictures: list[Path], labels: dict[Path, Path]) -> Iterator[LabelFinding]:

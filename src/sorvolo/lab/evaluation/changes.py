@@ -277,9 +277,36 @@ def _evaluate(
         ground,
         least_views,
     )
-    found = _read_found(
-        features_path(site / "flights" / flight, "changes"), described, flights.clock(flight)
-    )
+    # the reported events; those reported only in the end were announced with the last frame
+    path = features_path(site / "flights" / flight, "changes")
+    clock = flights.clock(flight)
+    ended_ns, behind_ns = clock
+    found = []
+    for feature in read_features(path):
+        try:
+            properties = feature["properties"]
+            announced_ns = None
+            if "announced" in properties:
+                announced = properties["announced"]
+                announced_ns = behind_ns + (time_ns_of(announced) if announced else ended_ns)
+            world_sigma_m = _known(properties.get("sigma_m"))
+            sigma_m = _known(
+                properties.get("sigma_in_map_m", world_sigma_m)
+            )  # earlier versions stated one for both
+            found.append(
+                FoundEvent(
+                    str(properties["id"]),
+                    ChangeKind(properties["kind"]),
+                    _ring(feature, described, path),
+                    sigma_m,
+                    announced_ns,
+                    world_sigma_m,
+                )
+            )
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            raise InputError(
+                f"{path}: a change is not as docs/formats.md has it ({error!r})"
+            ) from error
     match = match_events(found, true)
     scores = score_events(match, ground.area_m2)
     if match.pairs and not scores.judged_late:
@@ -350,38 +377,6 @@ def _read_true(
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise InputError(
                 f"{path}: an event is not as docs/simulation.md has it ({error!r})"
-            ) from error
-    return events
-
-
-def _read_found(path: Path, described: Site, clock: tuple[int, int]) -> list[FoundEvent]:
-    """The reported events; those reported only in the end were announced with the last frame."""
-    ended_ns, behind_ns = clock
-    events = []
-    for feature in read_features(path):
-        try:
-            properties = feature["properties"]
-            announced_ns = None
-            if "announced" in properties:
-                announced = properties["announced"]
-                announced_ns = behind_ns + (time_ns_of(announced) if announced else ended_ns)
-            world_sigma_m = _known(properties.get("sigma_m"))
-            sigma_m = _known(
-                properties.get("sigma_in_map_m", world_sigma_m)
-            )  # earlier versions stated one for both
-            events.append(
-                FoundEvent(
-                    str(properties["id"]),
-                    ChangeKind(properties["kind"]),
-                    _ring(feature, described, path),
-                    sigma_m,
-                    announced_ns,
-                    world_sigma_m,
-                )
-            )
-        except (KeyError, TypeError, ValueError, IndexError) as error:
-            raise InputError(
-                f"{path}: a change is not as docs/formats.md has it ({error!r})"
             ) from error
     return events
 

@@ -425,7 +425,10 @@ def _class_match(
     pictures = np.array([row["image_id"] for row in seen for _ in row["dtIds"]], np.int64)
     matched, ignored = _by_iou(seen, "dtMatches"), _by_iou(seen, "dtIgnore") > 0
     right = (matched > 0) & ~ignored
-    found = _rows_of(matched[0], true_ids)
+    # (N,) where each of `ids` (N,) stands among the wanted; -1 for what does not
+    ids = matched[0]
+    row_of = {each: row for row, each in enumerate(true_ids)}
+    found = np.array([row_of.get(int(each), -1) for each in ids], np.int64)
     true_scores = np.full(len(true_ids), np.nan)
     true_scores[found[found >= 0]] = scores[found >= 0]
     order = np.argsort(-scores, kind="mergesort")
@@ -441,12 +444,6 @@ def _class_match(
         np.array([truth_rows[gt][1] for gt in true_ids], np.float32).reshape(-1, 4),
         true_scores,
     )
-
-
-def _rows_of(ids: Floats, wanted: Sequence[int]) -> Rows:
-    """(N,) where each of `ids` (N,) stands among the wanted; -1 for what does not."""
-    row_of = {each: row for row, each in enumerate(wanted)}
-    return np.array([row_of.get(int(each), -1) for each in ids], np.int64)
 
 
 def _by_iou(rows: Sequence[dict[str, Any]], key: str) -> Floats:

@@ -106,6 +106,48 @@ def detector_page(
 
 def _set(scores: Any, worst: Sequence[tuple[Any, str, ImageRGB]]) -> dict[str, Any]:
     labels = [row.label for row in scores.classes]
+    tables = []
+    for found_by_label, unit, words in (
+        (scores.by_size_px, "px", "in the picture"),
+        (scores.by_size_m, "m", "on the ground"),
+    ):
+        rows = [
+            [
+                label,
+                _range(row.low, row.high, unit),
+                row.count,
+                cell("share", _share(row.recall), row.recall),
+                _share(row.candidates / row.count),
+            ]
+            for label, found in found_by_label.items()
+            for row in found
+        ]
+        if rows:
+            tables.append((f"Size {words}", rows))
+    rows = []
+    for k, name in enumerate([*labels, "nothing there"]):
+        counts = [int(value) for value in scores.confusion[k]]
+        cells: list[Any] = [
+            cell("hit", count) if k == c else count for c, count in enumerate(counts)
+        ]
+        rows.append([name, *cells[:-1], cells[-1] if k < len(labels) else ""])
+    blocks = []
+    for kind, words in _KIND_WORDS.items():
+        figures = [
+            {
+                "words": _mistake_words(mistake),
+                "picture": name,
+                "address": picture_uri(
+                    np.asarray(np.dstack([crop, np.full(crop.shape[:2], 255, np.uint8)]), np.uint8),
+                    24_000,
+                ),
+            }
+            for mistake, name, crop in worst
+            if mistake.kind == kind
+        ]
+        if figures:
+            total = sum(each.kind == kind for each in scores.mistakes)
+            blocks.append((f"{words} ({len(figures)} of {total})", figures))
     return {
         "name": scores.name,
         "classes": [
@@ -127,10 +169,10 @@ def _set(scores: Any, worst: Sequence[tuple[Any, str, ImageRGB]]) -> dict[str, A
         ],
         "curves": _curves(scores),
         "by_score": _by_score(scores),
-        "sizes": _sizes(scores),
+        "sizes": tables,
         "confusion_names": ["label", *(f"reported as {name}" for name in labels), "missed"],
-        "confusion": _confusion(scores, labels),
-        "mistakes": _mistakes(scores, worst),
+        "confusion": rows,
+        "mistakes": blocks,
     }
 
 
@@ -216,62 +258,6 @@ def _by_score(scores: Any) -> dict[str, Any] | None:
             for row, each in shown
         ],
     }
-
-
-def _sizes(scores: Any) -> list[tuple[str, list[list[Any]]]]:
-    tables = []
-    for found_by_label, unit, words in (
-        (scores.by_size_px, "px", "in the picture"),
-        (scores.by_size_m, "m", "on the ground"),
-    ):
-        rows = [
-            [
-                label,
-                _range(row.low, row.high, unit),
-                row.count,
-                cell("share", _share(row.recall), row.recall),
-                _share(row.candidates / row.count),
-            ]
-            for label, found in found_by_label.items()
-            for row in found
-        ]
-        if rows:
-            tables.append((f"Size {words}", rows))
-    return tables
-
-
-def _confusion(scores: Any, labels: Sequence[str]) -> list[list[Any]]:
-    rows = []
-    for k, name in enumerate([*labels, "nothing there"]):
-        counts = [int(value) for value in scores.confusion[k]]
-        cells: list[Any] = [
-            cell("hit", count) if k == c else count for c, count in enumerate(counts)
-        ]
-        rows.append([name, *cells[:-1], cells[-1] if k < len(labels) else ""])
-    return rows
-
-
-def _mistakes(
-    scores: Any, worst: Sequence[tuple[Any, str, ImageRGB]]
-) -> list[tuple[str, list[dict[str, str]]]]:
-    blocks = []
-    for kind, words in _KIND_WORDS.items():
-        figures = [
-            {
-                "words": _mistake_words(mistake),
-                "picture": name,
-                "address": picture_uri(
-                    np.asarray(np.dstack([crop, np.full(crop.shape[:2], 255, np.uint8)]), np.uint8),
-                    24_000,
-                ),
-            }
-            for mistake, name, crop in worst
-            if mistake.kind == kind
-        ]
-        if figures:
-            total = sum(each.kind == kind for each in scores.mistakes)
-            blocks.append((f"{words} ({len(figures)} of {total})", figures))
-    return blocks
 
 
 def _mistake_words(mistake: Any) -> str:

@@ -229,7 +229,14 @@ def _urban(canvas: GroundCanvas) -> GroundLayout:
         )
         steps = np.cumsum(canvas.rng.normal(0, 0.35, (8, 2)) + canvas.rng.normal(0, 0.3, 2), axis=0)
         canvas.stroke(start + steps, 0.02, np.array([66.0, 65, 64]))
-    houses, parkings = _build_yards(canvas, yards)
+    # the places (east, north, yaw) of houses in the yards, and of the parked cars, whose
+    # places are painted
+    houses: list[tuple[float, float, float]] = []
+    parkings: list[tuple[float, float, float]] = []
+    for west, south, east, north in yards:
+        parkings += _paint_parking(canvas, west + 2.2, south + 2.2, east - 2.2)
+        if north - south > 22 and east - west > 18:
+            houses.append(((west + east) / 2, north - 8.5, 0.0))
     white = np.array([222.0, 222, 216])
     for west, south, east, north in blocks:
         for at in np.arange(west, east - 2, 5.0):  # the dashed middle of the road to the south
@@ -268,19 +275,6 @@ def _urban(canvas: GroundCanvas) -> GroundLayout:
         _NOWHERE,
         np.array(parkings + kerb_parkings).reshape(-1, 3),
     )
-
-
-def _build_yards(
-    canvas: GroundCanvas, yards: Sequence[_Block]
-) -> tuple[list[tuple[float, float, float]], list[tuple[float, float, float]]]:
-    """The places (east, north, yaw) of houses in the yards, and of the parked cars, whose places are painted."""
-    houses: list[tuple[float, float, float]] = []
-    parkings: list[tuple[float, float, float]] = []
-    for west, south, east, north in yards:
-        parkings += _paint_parking(canvas, west + 2.2, south + 2.2, east - 2.2)
-        if north - south > 22 and east - west > 18:
-            houses.append(((west + east) / 2, north - 8.5, 0.0))
-    return houses, parkings
 
 
 def _paint_blocks(

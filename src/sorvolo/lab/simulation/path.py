@@ -286,6 +286,19 @@ def observe(
     latitude_deg, longitude_deg, ellipsoidal_m = site.wgs84_from_site(fixes_m)
     zeros = faulty[settings.jumps :]
     latitude_deg[zeros], longitude_deg[zeros] = 0.0, 0.0
+    # the camera's angles as a gimbal reports them, and a body that leans into its speed
+    turns = rotation_from_vector(
+        np.radians(rng.standard_normal((len(true_s), 3)) * settings.attitude_noise_deg)
+    )
+    camera = np.array(
+        [
+            gimbal_angles_from_rotation(path.pose(float(t)).rotation @ turn)
+            for t, turn in zip(true_s, turns)
+        ]
+    ).reshape(-1, 3)
+    speed_m_s = np.hypot(*path.velocity_m_s(true_s)[:, :2].T)
+    lean_deg = -np.degrees(np.arctan(0.012 * speed_m_s))
+    jitter = rng.standard_normal((len(true_s), 3)) * max(settings.attitude_noise_deg, 0.1)
     columns = {
         "latitude_deg": latitude_deg,
         "longitude_deg": longitude_deg,
@@ -293,7 +306,14 @@ def observe(
         "orthometric_height_m": ellipsoidal_m - GEOID_HEIGHT_M,
         "height_above_takeoff_m": path.position_m(true_s)[:, 2]
         + rng.standard_normal(count) * _BAROMETER_NOISE_M,
-        **_attitudes(path, true_s, settings.attitude_noise_deg, rng),
+        **{
+            "camera_yaw_deg": camera[:, 0],
+            "camera_pitch_deg": camera[:, 1],
+            "camera_roll_deg": camera[:, 2],
+            "body_yaw_deg": (path.heading_deg(true_s) + jitter[:, 0]) % 360.0,
+            "body_pitch_deg": lean_deg + jitter[:, 1],
+            "body_roll_deg": jitter[:, 2],
+        },
         **_motion(path, true_s, rng),
     }
     recorded_s = true_s + settings.clock_offset_s
@@ -311,30 +331,6 @@ def observe(
 
 def _ns(time_s: Floats) -> TimesNs:
     return np.round(time_s * 1e9).astype(np.int64)
-
-
-def _attitudes(
-    path: FlownPath, time_s: Floats, noise_deg: float, rng: np.random.Generator
-) -> dict[str, Floats]:
-    """The camera's angles as a gimbal reports them, and a body that leans into its speed."""
-    turns = rotation_from_vector(np.radians(rng.standard_normal((len(time_s), 3)) * noise_deg))
-    camera = np.array(
-        [
-            gimbal_angles_from_rotation(path.pose(float(t)).rotation @ turn)
-            for t, turn in zip(time_s, turns)
-        ]
-    ).reshape(-1, 3)
-    speed_m_s = np.hypot(*path.velocity_m_s(time_s)[:, :2].T)
-    lean_deg = -np.degrees(np.arctan(0.012 * speed_m_s))
-    jitter = rng.standard_normal((len(time_s), 3)) * max(noise_deg, 0.1)
-    return {
-        "camera_yaw_deg": camera[:, 0],
-        "camera_pitch_deg": camera[:, 1],
-        "camera_roll_deg": camera[:, 2],
-        "body_yaw_deg": (path.heading_deg(time_s) + jitter[:, 0]) % 360.0,
-        "body_pitch_deg": lean_deg + jitter[:, 1],
-        "body_roll_deg": jitter[:, 2],
-    }
 
 
 def _motion(path: FlownPath, time_s: Floats, rng: np.random.Generator) -> dict[str, Floats]:

@@ -206,7 +206,9 @@ def simulate_picture(settings: PictureSettings, index: int) -> SimulatedPicture:
     camera, pose = _new_shot(settings, is_thermal, rng)
     middle = ground_from_pixels(camera, pose, np.array([[camera.cx_px, camera.cy_px]]))[0]
     m_per_px = float(np.linalg.norm(pose.translation_m - [*middle, 0.0])) / camera.fx_px
-    area = _needed_area(camera, pose)
+    outline_m = footprint(camera, pose)
+    low, high = outline_m.min(axis=0) - _MARGIN_M, outline_m.max(axis=0) + _MARGIN_M
+    area = GroundArea(float(low[0]), float(low[1]), float(high[0]), float(high[1]))
     ground = settings.ground or str(rng.choice(list(GroundKind), p=(0.25, 0.35, 0.3, 0.1)))
     width_m, height_m = area.size_m
     fine_m = max(0.72 * m_per_px, float(np.sqrt(width_m * height_m / _LARGEST_GROUND_PX)))
@@ -272,12 +274,6 @@ def _new_shot(
         f"no camera sees the ground at {settings.m_per_px[0]:g} to {settings.m_per_px[1]:g} m per pixel from"
         f" {settings.height_m[0]:g} to {settings.height_m[1]:g} m; widen one of them"
     )
-
-
-def _needed_area(camera: Camera, pose: Pose) -> GroundArea:
-    outline_m = footprint(camera, pose)
-    low, high = outline_m.min(axis=0) - _MARGIN_M, outline_m.max(axis=0) + _MARGIN_M
-    return GroundArea(float(low[0]), float(low[1]), float(high[0]), float(high[1]))
 
 
 def _targets(
@@ -391,7 +387,19 @@ def simulate_pictures(folder: AnyPath, settings: PictureSettings) -> Iterator[Pi
             threads=_THREADS,
         )
         for picture in pictures:
-            row = _image_row(picture, settings.seed)
+            height_px, width_px = picture.image.shape[:2]
+            name = f"site{settings.seed}-{picture.index + 1:06d}"
+            row = {
+                "id": picture.index + 1,
+                "file_name": f"images/{name}.jpg",
+                "width": width_px,
+                "height": height_px,
+                "flight": name,
+                "m_per_px": round(picture.m_per_px, 5),
+                "height_above_ground_m": round(float(picture.site_from_camera.translation_m[2]), 2),
+                "ground": picture.ground,
+                "thermal": picture.is_thermal,
+            }
             atomic_write_bytes(
                 partial / row["file_name"], jpeg_from_image(picture.image), durable=False
             )
@@ -410,19 +418,3 @@ def simulate_pictures(folder: AnyPath, settings: PictureSettings) -> Iterator[Pi
                 "annotations": annotations,
             },
         )
-
-
-def _image_row(picture: SimulatedPicture, seed: int) -> dict[str, Any]:
-    height_px, width_px = picture.image.shape[:2]
-    name = f"site{seed}-{picture.index + 1:06d}"
-    return {
-        "id": picture.index + 1,
-        "file_name": f"images/{name}.jpg",
-        "width": width_px,
-        "height": height_px,
-        "flight": name,
-        "m_per_px": round(picture.m_per_px, 5),
-        "height_above_ground_m": round(float(picture.site_from_camera.translation_m[2]), 2),
-        "ground": picture.ground,
-        "thermal": picture.is_thermal,
-    }

@@ -84,23 +84,7 @@ def preset(name: str) -> SimulationSettings:
         raise SettingsError(
             f"unknown preset {name!r}; choose {', '.join(_GENERAL)}, or one of {', '.join(rows)}"
         )
-    return _from_row(name, rows[name])
-
-
-def _dataset() -> dict[str, _Row]:
-    rows: dict[str, _Row] = {}
-    for ground, table in _WITHOUT_TELEMETRY.items():
-        numbers = [int(each) for each in table.split()]
-        videos = zip(*(numbers[column::4] for column in range(4)))
-        for number, (length_s, fps, height_m, speed_m_s) in enumerate(videos, start=1):
-            size_px = _HD if fps == 50 else _SD
-            rows[f"umcd-{ground}-path{number:02d}"] = _Row(
-                ground, length_s, fps, height_m, speed_m_s, size_px
-            )
-    return rows | {f"umcd-telemetry-{name}": row for name, row in _WITH_TELEMETRY.items()}
-
-
-def _from_row(name: str, row: _Row) -> SimulationSettings:
+    row = rows[name]
     return SimulationSettings(
         preset=name,
         flights=row.flights,
@@ -119,6 +103,19 @@ def _from_row(name: str, row: _Row) -> SimulationSettings:
         ),
         output=OutputSettings(telemetry=row.telemetry),
     )
+
+
+def _dataset() -> dict[str, _Row]:
+    rows: dict[str, _Row] = {}
+    for ground, table in _WITHOUT_TELEMETRY.items():
+        numbers = [int(each) for each in table.split()]
+        videos = zip(*(numbers[column::4] for column in range(4)))
+        for number, (length_s, fps, height_m, speed_m_s) in enumerate(videos, start=1):
+            size_px = _HD if fps == 50 else _SD
+            rows[f"umcd-{ground}-path{number:02d}"] = _Row(
+                ground, length_s, fps, height_m, speed_m_s, size_px
+            )
+    return rows | {f"umcd-telemetry-{name}": row for name, row in _WITH_TELEMETRY.items()}
 
 
 def _demo() -> SimulationSettings:

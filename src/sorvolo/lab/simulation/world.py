@@ -15,7 +15,6 @@ from sorvolo.lab.simulation.ground import GroundKind, GroundLayout, PaintedGroun
 from sorvolo.lab.simulation.ground_painting import GroundArea, GroundRaster
 from sorvolo.lab.simulation.settings import (
     DEFAULT_ORIGIN,
-    SceneSettings,
     SimulationSettings,
     WeatherSettings,
 )
@@ -290,15 +289,21 @@ def build_world(
         area,
         np.random.default_rng([settings.seed, 10]),
     )
-    days = [
-        _furnish(
-            settings.scene,
-            painted.layout,
-            plans_m[0],
-            settings,
-            np.random.default_rng([settings.seed, 2]),
+    # the things of the first flight: scenery first, then targets
+    scene = settings.scene
+    waypoints_m = plans_m[0]
+    rng = np.random.default_rng([settings.seed, 2])
+    things = list(scenery(scene.ground, painted.layout, rng)) if scene.has_scenery else []
+    wanted = (
+        [ThingLabel.PERSON] * scene.people
+        + [ThingLabel.CAR] * scene.cars
+        + [ThingLabel.SMALL] * scene.small_objects
+    )
+    for label in wanted:
+        things.append(
+            _place(label, len(things) + 1, things, painted.layout, waypoints_m, settings, rng)
         )
-    ]
+    days = [tuple(things)]
     for flight in range(2, settings.flights + 1):
         days.append(_next_day(days[0], painted.layout, plans_m[0], settings, flight))
     return World(
@@ -389,25 +394,6 @@ def is_free(thing: Thing, others: Sequence[Thing]) -> bool:
     )
 
 
-def _furnish(
-    scene: SceneSettings,
-    layout: GroundLayout,
-    waypoints_m: Floats,
-    settings: SimulationSettings,
-    rng: np.random.Generator,
-) -> tuple[Thing, ...]:
-    """The things of the first flight: scenery first, then targets."""
-    things = list(scenery(scene.ground, layout, rng)) if scene.has_scenery else []
-    wanted = (
-        [ThingLabel.PERSON] * scene.people
-        + [ThingLabel.CAR] * scene.cars
-        + [ThingLabel.SMALL] * scene.small_objects
-    )
-    for label in wanted:
-        things.append(_place(label, len(things) + 1, things, layout, waypoints_m, settings, rng))
-    return tuple(things)
-
-
 def _next_day(
     first: tuple[Thing, ...],
     layout: GroundLayout,
@@ -417,7 +403,19 @@ def _next_day(
 ) -> tuple[Thing, ...]:
     """The things of a later flight: some targets of the first are gone, some moved, some are new, some move."""
     rng = np.random.default_rng([settings.seed, 4, flight])
-    today = _left_and_moved(first, layout, waypoints_m, settings, rng)
+    # the first flight's things, some of its targets taken away, some moved
+    targets = [thing for thing in first if thing.label.is_target]
+    order = [targets[i].id for i in rng.permutation(len(targets))]
+    removed = set(order[: settings.later.removed])
+    shifted = set(order[settings.later.removed : settings.later.removed + settings.later.moved])
+    today = [thing for thing in first if thing.id not in removed]
+    for i, thing in enumerate(today):
+        if thing.id in shifted:
+            others = [other for other in today if other.id != thing.id]
+            place = _place(thing.label, thing.id, others, layout, waypoints_m, settings, rng)
+            today[i] = replace(
+                thing, east_m=place.east_m, north_m=place.north_m, yaw_deg=place.yaw_deg
+            )
     next_id = 1000 * flight
     later = settings.later
     came = (
@@ -434,29 +432,6 @@ def _next_day(
         else thing
         for thing in today
     )
-
-
-def _left_and_moved(
-    first: tuple[Thing, ...],
-    layout: GroundLayout,
-    waypoints_m: Floats,
-    settings: SimulationSettings,
-    rng: np.random.Generator,
-) -> list[Thing]:
-    """The first flight's things, some of its targets taken away, some moved."""
-    targets = [thing for thing in first if thing.label.is_target]
-    order = [targets[i].id for i in rng.permutation(len(targets))]
-    removed = set(order[: settings.later.removed])
-    shifted = set(order[settings.later.removed : settings.later.removed + settings.later.moved])
-    today = [thing for thing in first if thing.id not in removed]
-    for i, thing in enumerate(today):
-        if thing.id in shifted:
-            others = [other for other in today if other.id != thing.id]
-            place = _place(thing.label, thing.id, others, layout, waypoints_m, settings, rng)
-            today[i] = replace(
-                thing, east_m=place.east_m, north_m=place.north_m, yaw_deg=place.yaw_deg
-            )
-    return today
 
 
 def _place(

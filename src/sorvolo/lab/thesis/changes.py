@@ -244,19 +244,8 @@ def _compare(
         )
     after = prepare_reference(query, valid, settings, threads)
     settings = settings.in_light(light_difference(before, after))
-    difference = _differences(before, after, settings, threads)
-    kept = kernels.without_isolations(
-        difference, *settings.isolation_px, settings.most_black, threads
-    )
-    if after.known is not None:
-        kept[after.known == 0] = 0
-    return before, after, difference, kept, _similar_removed(before, after, kept, settings)
-
-
-def _differences(
-    before: ThesisReference, after: ThesisReference, settings: ThesisSettings, threads: int
-) -> ImageGray:
-    """M_diff: equation 3.19, and where its D is 1 the Hamming distance of the strings of equation 3.20."""
+    # M_diff: equation 3.19, and where its D is 1 the Hamming distance of the strings of
+    # equation 3.20
     assert settings.gray_threshold is not None  # `in_light` made it a number
     apart = cv2.absdiff(before.gray, after.gray)
     different = np.asarray(
@@ -267,7 +256,7 @@ def _differences(
         # the reach of W_a to both sides, so that no average that saw the unknown is looked at
         window = np.ones((2 * (height // 2) + 1, 2 * (width // 2) + 1), np.uint8)
         different[cv2.erode(after.known, window, borderValue=1) == 0] = 0
-    return kernels.texture_changes(
+    difference = kernels.texture_changes(
         before.planes,
         after.planes,
         different,
@@ -275,12 +264,13 @@ def _differences(
         settings.most_differing_bits,
         threads,
     )
-
-
-def _similar_removed(
-    before: ThesisReference, after: ThesisReference, kept: ImageGray, settings: ThesisSettings
-) -> Comparison:
-    """Bounding boxes less those too small (T_area) or with similar histograms (T_B), their pixels black."""
+    kept = kernels.without_isolations(
+        difference, *settings.isolation_px, settings.most_black, threads
+    )
+    if after.known is not None:
+        kept[after.known == 0] = 0
+    # bounding boxes less those too small (T_area) or with similar histograms (T_B), their
+    # pixels black
     mask, boxes = kept.copy(), kernels.region_boxes(kept)
     removed = boxes[:, 2] * boxes[:, 3] < settings.area_share * mask.size
     histograms = [
@@ -291,7 +281,13 @@ def _similar_removed(
     for x, y, width, height in boxes[removed]:
         mask[y : y + height, x : x + width] = 0
     white = [mask[y : y + height, x : x + width].any() for x, y, width, height in boxes]
-    return Comparison(mask, boxes[~removed & np.array(white, bool)])
+    return (
+        before,
+        after,
+        difference,
+        kept,
+        Comparison(mask, boxes[~removed & np.array(white, bool)]),
+    )
 
 
 def _whole_share(share: float, count: int) -> int:

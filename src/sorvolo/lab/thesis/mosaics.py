@@ -119,34 +119,30 @@ def correlation_of(site: Path, mosaic: Path) -> dict[str, Any]:
     Raises InputError as `evaluate_mosaic`, and where the picture is found nowhere on the map.
     """
     if mosaic.suffix.lower() not in (".tif", ".tiff"):
-        return _correlation_with_picture(site, mosaic)
+        other = at_most(read_picture(mosaic), _LAID_OVER_PX)
+        with Archive.open(site, write=False) as archive:
+            own = picture(archive.tiles(), _LAID_OVER_PX)
+            m_per_px = archive.site().m_per_px * own.step_px
+        stitcher = RoiStitcher(RoiStitchingSettings(ransac_px=10.0))
+        stitcher.add(0, other)
+        found = stitcher.add(1, np.ascontiguousarray(own.rgba[..., :3]))
+        if isinstance(found, str):
+            raise InputError(f"{mosaic}: was not found on the map ({found})")
+        gray = gray_from_rgb(other)
+        under = np.asarray(
+            cv2.warpPerspective(own.rgba, found.mosaic_from_image, gray.shape[::-1]), np.uint8
+        )
+        # what a mosaic does not show is one colour, black or white
+        known = (under[..., 3] == 255) & (gray > 0) & (gray < 255)
+        value = correlation(gray, gray_from_rgb(np.ascontiguousarray(under[..., :3])), known)
+        scale = float(np.sqrt(abs(np.linalg.det(found.mosaic_from_image[:2, :2]))))
+        return {
+            "correlation": value,
+            "correlation_after_shift": value,
+            "m_per_px": m_per_px / scale,
+            "area_m2": float(known.sum()) * (m_per_px / scale) ** 2,
+        }
     reference = evaluate_mosaic(site, reference=mosaic).reference
     assert reference is not None
     names = "correlation", "correlation_after_shift", "m_per_px", "area_m2"
     return {name: getattr(reference, name) for name in names}
-
-
-def _correlation_with_picture(site: Path, mosaic: Path) -> dict[str, Any]:
-    other = at_most(read_picture(mosaic), _LAID_OVER_PX)
-    with Archive.open(site, write=False) as archive:
-        own = picture(archive.tiles(), _LAID_OVER_PX)
-        m_per_px = archive.site().m_per_px * own.step_px
-    stitcher = RoiStitcher(RoiStitchingSettings(ransac_px=10.0))
-    stitcher.add(0, other)
-    found = stitcher.add(1, np.ascontiguousarray(own.rgba[..., :3]))
-    if isinstance(found, str):
-        raise InputError(f"{mosaic}: was not found on the map ({found})")
-    gray = gray_from_rgb(other)
-    under = np.asarray(
-        cv2.warpPerspective(own.rgba, found.mosaic_from_image, gray.shape[::-1]), np.uint8
-    )
-    # what a mosaic does not show is one colour, black or white
-    known = (under[..., 3] == 255) & (gray > 0) & (gray < 255)
-    value = correlation(gray, gray_from_rgb(np.ascontiguousarray(under[..., :3])), known)
-    scale = float(np.sqrt(abs(np.linalg.det(found.mosaic_from_image[:2, :2]))))
-    return {
-        "correlation": value,
-        "correlation_after_shift": value,
-        "m_per_px": m_per_px / scale,
-        "area_m2": float(known.sum()) * (m_per_px / scale) ** 2,
-    }

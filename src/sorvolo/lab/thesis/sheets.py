@@ -43,8 +43,29 @@ class Sheet:
 
 def reproduction_sheets(tables: Mapping[str, Any]) -> list[Sheet]:
     """The sheets of what `tables_of` gives, in the order of the thesis's chapter."""
+    table = tables["figure_3_12"]
+    rows = [
+        (
+            each["sequence"],
+            "rigid, 4 degrees of freedom" if each["transform"] == "similarity" else "homography",
+            f"{each['frames']} of {each['selected']}",
+            _number(each["sides"], 3),
+            _number(each["areas"], 3),
+            _percent(each["bend"]),
+        )
+        for each in table["ours"]
+    ]
     return [
-        _distortions(tables["figure_3_12"]),
+        _sheet(
+            "figure_3_12",
+            "Figure 3.12: homography and rigid transform",
+            "sequence; transform; frames placed; opposite sides, largest ratio; areas, largest ratio; bend of the path, %",
+            rows,
+            (
+                "Ratios are of the frames' outlines on the map: 1 is an undistorted frame. The bend is the path's largest "
+                "distance from the chord between its ends, over the chord; wind and drift bend it, too.",
+            ),
+        ),
         *_times(tables["table_4_1"]),
         _deviations(tables["section_4_1_1"]),
         _counted(tables["tables_4_3_and_4_4"], "tables_4_3_and_4_4", "Tables 4.3 and 4.4: frames"),
@@ -68,30 +89,6 @@ def _percent(share: float | None) -> str | None:
 
 def _number(value: float | None, decimals: int) -> str | None:
     return None if value is None else f"{value:.{decimals}f}"
-
-
-def _distortions(table: Mapping[str, Any]) -> Sheet:
-    rows = [
-        (
-            each["sequence"],
-            "rigid, 4 degrees of freedom" if each["transform"] == "similarity" else "homography",
-            f"{each['frames']} of {each['selected']}",
-            _number(each["sides"], 3),
-            _number(each["areas"], 3),
-            _percent(each["bend"]),
-        )
-        for each in table["ours"]
-    ]
-    return _sheet(
-        "figure_3_12",
-        "Figure 3.12: homography and rigid transform",
-        "sequence; transform; frames placed; opposite sides, largest ratio; areas, largest ratio; bend of the path, %",
-        rows,
-        (
-            "Ratios are of the frames' outlines on the map: 1 is an undistorted frame. The bend is the path's largest "
-            "distance from the chord between its ends, over the chord; wind and drift bend it, too.",
-        ),
-    )
 
 
 def _times(table: Mapping[str, Any]) -> list[Sheet]:

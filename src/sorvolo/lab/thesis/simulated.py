@@ -36,7 +36,15 @@ def simulated_dataset(
     Raises SettingsError for a folder that holds anything but this very dataset, StoreError on a full disk.
     """
     _claim(place, size, settings)
-    for name in chosen_presets(size, settings.videos):
+    # the presets of the videos to simulate: `videos` of each environment with telemetry,
+    # the others by the size
+    chosen: list[str] = []
+    for environment in size.environments:
+        for start, most in ((_WITH, settings.videos), (_WITHOUT, size.bare_videos)):
+            chosen += [
+                name for name in preset_names() if name.startswith(f"{start}{environment.lower()}-")
+            ][:most]
+    for name in chosen:
         if (place / _places_of(name)[2]).exists():
             continue
         scratch = place / ".partial"
@@ -45,17 +53,6 @@ def simulated_dataset(
         with writing(place):
             _arrange(scratch, place, name)
             shutil.rmtree(scratch)
-
-
-def chosen_presets(size: SimulatedSize, videos: int | None) -> list[str]:
-    """The presets of the videos to simulate: `videos` of each environment with telemetry, the others by the size."""
-    chosen: list[str] = []
-    for environment in size.environments:
-        for start, most in ((_WITH, videos), (_WITHOUT, size.bare_videos)):
-            chosen += [
-                name for name in preset_names() if name.startswith(f"{start}{environment.lower()}-")
-            ][:most]
-    return chosen
 
 
 def simulation_of(

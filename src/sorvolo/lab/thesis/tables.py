@@ -36,9 +36,26 @@ def tables_of(rows: Sequence[Row]) -> dict[str, Any]:
             if row.kind == kind
         ]
 
+    # by method: the mean deviation over its videos of UMCD; the correlation of the methods'
+    # maps with each other, and with the published mosaics of the NPU Drone-Map dataset,
+    # over those that have one
+    found = []
+    for method in MAP_METHODS:
+        own = [row for row in made if row.values.get("method") == method]
+        umcd = [row for row in own if row.values.get("environment") != ENVIRONMENT]
+        result: dict[str, Any] = {"method": method}
+        for name, count, values in (
+            ("deviation", "videos", _values(umcd, "mosaic", "deviation")),
+            ("correlation", "correlated", _values(made, "correlation", "correlation")),
+            ("published_correlation", "published", _values(own, PUBLISHED, "correlation")),
+            ("benchmark_correlation", "benchmarks", _values(own, BENCHMARK, "correlation")),
+        ):
+            result |= {name: _mean(values), count: len(values)}
+        if result["videos"] or result["published"]:
+            found.append(result)
     pairs: dict[str, tuple[Any, list[dict[str, Any]]]] = {
         "table_4_1": (TABLE_4_1, of_kind("mosaic")),
-        "section_4_1_1": (SECTION_4_1_1, _deviations(made)),
+        "section_4_1_1": (SECTION_4_1_1, found),
         "figure_3_12": (FIGURES["3.12"], of_kind("transform")),
         "tables_4_3_and_4_4": (
             {"method": "thesis", **TABLE_4_3, **TABLE_4_4},
@@ -54,26 +71,6 @@ def tables_of(rows: Sequence[Row]) -> dict[str, Any]:
     for name, texts in DIFFERENCES.items():
         tables[name]["differences"] = list(texts)
     return tables
-
-
-def _deviations(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """By method: the mean deviation over its videos of UMCD; the correlation of the methods' maps with each other, and
-    with the published mosaics of the NPU Drone-Map dataset, over those that have one."""
-    found = []
-    for method in MAP_METHODS:
-        own = [row for row in rows if row.values.get("method") == method]
-        umcd = [row for row in own if row.values.get("environment") != ENVIRONMENT]
-        result: dict[str, Any] = {"method": method}
-        for name, count, values in (
-            ("deviation", "videos", _values(umcd, "mosaic", "deviation")),
-            ("correlation", "correlated", _values(rows, "correlation", "correlation")),
-            ("published_correlation", "published", _values(own, PUBLISHED, "correlation")),
-            ("benchmark_correlation", "benchmarks", _values(own, BENCHMARK, "correlation")),
-        ):
-            result |= {name: _mean(values), count: len(values)}
-        if result["videos"] or result["published"]:
-            found.append(result)
-    return found
 
 
 def _values(rows: Iterable[Row], kind: str, name: str) -> list[float]:
