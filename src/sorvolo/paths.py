@@ -1,11 +1,17 @@
-"""How a public function takes files: as text or as any path, one or several."""
+"""How a public function takes files, as text or as any path, one or several; and what JSON gives."""
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias, overload
 
 AnyPath: TypeAlias = str | os.PathLike[str]
+
+Json: TypeAlias = dict[str, Any]
+"""A JSON object, such as a report or a feature's properties."""
+
+JsonView: TypeAlias = Mapping[str, Any]
+"""One that is only read."""
 
 
 class GivenFlight(Protocol):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sorvolo.heights.free_space import IslandSettings, islands
+from sorvolo.heights.free_space import islands
 
 
 def test_lone_pieces_of_one_pair_of_photos_are_found_and_nothing_else() -> None:
@@ -23,6 +23,4 @@ def test_lone_pieces_of_one_pair_of_photos_are_found_and_nothing_else() -> None:
     expected = np.zeros(up_m.shape, bool)
     expected[chance] = expected[shed] = True
     np.testing.assert_array_equal(found, expected)
-    np.testing.assert_array_equal(
-        islands(up_m, shown_by, 0.1, IslandSettings(window_cells=37, margin_cells=40)), found
-    )
+    np.testing.assert_array_equal(islands(up_m, shown_by, 0.1, window=37, margin=40), found)

@@ -17,12 +17,12 @@ from sorvolo.heights.figures import (
     surface_figures,
     surface_warnings,
 )
-from sorvolo.heights.free_space import IslandSettings, seen_through
+from sorvolo.heights.free_space import seen_through
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.obstacles import Obstacles
 from sorvolo.heights.orthophoto import choose_photos, paint_orthophoto, visible
 from sorvolo.heights.smooth_sigma import SmoothSigma
-from sorvolo.heights.surface import Surface, SurfaceSettings, sweep_surface
+from sorvolo.heights.surface import Surface, sizes_m, sweep_surface
 from sorvolo.heights.sweep import SweepSettings, choose_views
 from sorvolo.heights.terrain import filled, terrain
 from sorvolo.heights.views import inside
@@ -451,8 +451,8 @@ def test_a_pattern_that_repeats_fits_at_several_heights_and_is_a_hole() -> None:
     points = np.array([[-1.0, 0, 0], [0, 1, 0], [1, -2, 0], [1, 2, 0.1]])
     holes, wrong = [], []
     for unsure_cells in (3.0, np.inf):
-        settings = SurfaceSettings(unsure_cells=unsure_cells, islands=IslandSettings(most_cells=0))
-        *_, found = sweep_surface(lattice, views, gray, points, SmoothSigma(), settings)
+        given = lattice, views, gray, points, SmoothSigma()
+        *_, found = sweep_surface(*given, unsure_cells=unsure_cells, island_cells=0)
         assert isinstance(found, Surface)
         holes.append(np.isnan(found.up_m).mean())
         wrong.append((np.abs(found.up_m) > 1).mean())
@@ -482,5 +482,5 @@ def test_the_picture_of_heights_has_a_colour_for_each_height() -> None:
 
 
 def test_what_heights_a_tile_has_is_looked_for_in_coarser_pictures() -> None:
-    coarse_m, fine_m = SurfaceSettings().sizes_m(0.1)
+    coarse_m, fine_m = sizes_m(0.1)
     assert coarse_m > fine_m == 0.1

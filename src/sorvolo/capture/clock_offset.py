@@ -4,10 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sorvolo.capture.sync import CameraTrack
-from sorvolo.geometry.arrays import Floats, PointsM
+from sorvolo.geometry.arrays import Floats, Mask, PointsM
 from sorvolo.geometry.homography import fit_similarity
 
 # all by choice
@@ -141,7 +140,7 @@ class _Compared:
         self._way = np.append(legs, 0.0) + np.append(0.0, legs)  # twice that of each picture
         self._plane = seen @ np.array([1, 1j]), path_m @ np.array([1, 1j])
 
-    def _inside(self, offset_s: float) -> NDArray[np.bool_]:
+    def _inside(self, offset_s: float) -> Mask:
         at = self.times_s + offset_s
         return np.asarray((at >= self.path_s[0]) & (at <= self.path_s[-1]))
 

@@ -6,10 +6,9 @@ from enum import StrEnum
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Floats, Matrix3, PointsM, Rows, Vector3
+from sorvolo.geometry.arrays import Floats, Mask, Matrix3, PointsM, Rows, Vector3
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.geometry.pose import (
     rotation_between,
@@ -132,7 +131,7 @@ def tie_clocks(
     return replace(clock, notices=(notice,), covered_share=share)
 
 
-def _covered(fix_s: Floats, frames_s: Floats) -> NDArray[np.bool_]:
+def _covered(fix_s: Floats, frames_s: Floats) -> Mask:
     """(N,) whether each of N moments is within the M fixes, (M,) s, and in none of their gaps."""
     interval_s = float(np.median(np.diff(fix_s))) if len(fix_s) > 1 else 1.0
     after = np.searchsorted(fix_s, frames_s)

@@ -1,7 +1,7 @@
 """`sorvolo compare`: a later flight against the map; each change is printed as it is announced."""
 
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -42,6 +42,7 @@ from sorvolo.cli.printing import (
 )
 from sorvolo.cli.progress import ProgressReport, Resumed, rate_words
 from sorvolo.cli.sites import OpenedSite, ended_by_signal, opened_site, run_on_site
+from sorvolo.paths import Json, JsonView
 from sorvolo.survey.wording import area_text, counted, plural
 
 if TYPE_CHECKING:
@@ -190,7 +191,7 @@ def read_results(
     comparing: "Mission[CompareUpdate, tuple[FlightOutcome, ...]]",
     place: OpenedSite,
     form: PlaceFormat = "latlon",
-) -> list[dict[str, Any]]:
+) -> list[Json]:
     """Compare with progress and announcements on stderr; return the results of each flight.
 
     A result has the parts of the flight's report that people ask for, its changes, and the ids of those announced on
@@ -231,7 +232,7 @@ def read_results(
 
 
 def show_results(
-    results: Sequence[Mapping[str, Any]],
+    results: Sequence[JsonView],
     site: Path,
     console: Console,
     form: PlaceFormat = "latlon",
@@ -291,7 +292,7 @@ def _class_words(kind: str, before: str | None, after: str | None) -> str:
 
 
 def _show_result(
-    result: Mapping[str, Any], console: Console, form: PlaceFormat, sort: str, least_m: float
+    result: JsonView, console: Console, form: PlaceFormat, sort: str, least_m: float
 ) -> None:
     comparison, features = result["comparison"], result["changes"]["features"]
     dark = " (too dark: most changes would be missed)" if comparison.get("most_missed") else ""
@@ -327,7 +328,7 @@ def _show_result(
     show_notices_and_warnings(result, console)
 
 
-def _show_coverage(coverage: Mapping[str, Any], console: Console, *, is_local: bool) -> None:
+def _show_coverage(coverage: JsonView, console: Console, *, is_local: bool) -> None:
     """Print what kept ground from being compared, and how small a thing would be found on the rest."""
     from sorvolo.survey.coverage import GAP_WORDS, Gap
 
@@ -357,7 +358,7 @@ def _in_rows(features: Sequence[Any], sort: str, least_m: float) -> list[list[An
     for feature in sorted(features, key=lambda each: each["properties"]["rank"]):
         groups.setdefault(feature["properties"]["group"], []).append(feature)
 
-    def is_shown(change: Mapping[str, Any]) -> bool:
+    def is_shown(change: JsonView) -> bool:
         return bool(
             change["length_m"] >= least_m or change["class_before"] or change["class_after"]
         )

@@ -3,9 +3,8 @@
 import csv
 import math
 import sys
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
@@ -22,6 +21,7 @@ from sorvolo.cli.printing import (
 )
 from sorvolo.cli.progress import ProgressReport
 from sorvolo.cli.sites import opened_site
+from sorvolo.paths import JsonView
 from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
@@ -151,7 +151,7 @@ def make_and_read(
     cell_m: float | None = None,
     *,
     catalogues: "Catalogues | None" = None,
-) -> Mapping[str, Any]:
+) -> JsonView:
     """Make a flight's heights with progress on stderr; return their report."""
     from sorvolo.missions.heights.run import make_heights
     from sorvolo.store.site.files import HeightFile
@@ -164,7 +164,7 @@ def make_and_read(
     return read_json(making.result().paths[HeightFile.REPORT])
 
 
-def show_heights(site: Path, report: Mapping[str, Any], console: Console) -> None:
+def show_heights(site: Path, report: JsonView, console: Console) -> None:
     """Print what a flight's heights are good for, and where the files are."""
     from sorvolo.store.site.files import HeightFile
 
@@ -203,7 +203,7 @@ def show_heights(site: Path, report: Mapping[str, Any], console: Console) -> Non
             show_path(name, folder / file, console)
 
 
-def _judged(found: Mapping[str, Any]) -> str:
+def _judged(found: JsonView) -> str:
     """What the flight's own points state of the heights' error; "" without enough points."""
     if found["median_m"] is None:
         return ""

@@ -1,8 +1,8 @@
 """`sorvolo map`: flights into a site folder, and a summary of each."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from rich.markup import escape
@@ -41,6 +41,7 @@ from sorvolo.cli.printing import (
 )
 from sorvolo.cli.progress import show_progress
 from sorvolo.cli.sites import ended_by_signal, opened_site, run_on_site
+from sorvolo.paths import JsonView
 from sorvolo.survey.wording import counted, counted_list
 
 if TYPE_CHECKING:
@@ -181,7 +182,7 @@ def map_command(
 
 
 def _print(
-    reports: Sequence[Mapping[str, Any]],
+    reports: Sequence[JsonView],
     site: Path,
     catalogues: "Catalogues",
     *,
@@ -211,7 +212,7 @@ def _print(
         show_heights(site, report, Console())
 
 
-def _is_flat(report: Mapping[str, Any]) -> bool:
+def _is_flat(report: JsonView) -> bool:
     return bool(report.get("shape", {}).get("is_flat", True))
 
 
@@ -221,7 +222,7 @@ def _thesis() -> "MapMethod":
     return ThesisMapping()
 
 
-def show_reports(reports: Sequence[Mapping[str, Any]], site: Path, console: Console) -> None:
+def show_reports(reports: Sequence[JsonView], site: Path, console: Console) -> None:
     """Print what became of the flights, what to look at first, and where the files are."""
     for report in reports:
         frames = report["frames"]
@@ -250,7 +251,7 @@ def show_reports(reports: Sequence[Mapping[str, Any]], site: Path, console: Cons
         show_path("report", site / "flights" / report["flight"] / "report.html", console)
 
 
-def _quality_rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
+def _quality_rows(report: JsonView) -> list[tuple[str, str]]:
     """How well frames fit each other and, where the map has metres, the Earth."""
     from sorvolo.missions.flight.report import LEVEL
 
@@ -327,7 +328,7 @@ def _quality_rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def _seen(seen: Mapping[str, Any] | None) -> str:
+def _seen(seen: JsonView | None) -> str:
     """How much ground one picture alone shows, and what none does."""
     if seen is None or not seen["seen_m2"]:
         return ""
@@ -344,7 +345,7 @@ def _seen(seen: Mapping[str, Any] | None) -> str:
     )
 
 
-def _control_rows(control: Mapping[str, Any] | None) -> list[tuple[str, str]]:
+def _control_rows(control: JsonView | None) -> list[tuple[str, str]]:
     """How well the map fits its control points; those left out by name."""
     if control is None:
         return []

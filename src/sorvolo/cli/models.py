@@ -12,6 +12,7 @@ from rich.table import Table
 from sorvolo.cli.options import AsJson
 from sorvolo.cli.printing import FAILED, Console, facts_table, new_table, print_json
 from sorvolo.errors import InputError, SettingsError
+from sorvolo.paths import Json, JsonView
 
 if TYPE_CHECKING:
     from sorvolo.detection.contract import ModelInfo
@@ -54,7 +55,7 @@ def list_models(
     _show_hidden()
 
 
-def _show_rows(rows: Sequence[Mapping[str, Any]]) -> None:
+def _show_rows(rows: Sequence[JsonView]) -> None:
     table = new_table("name", "preset", "classes", "light", "numbers", "MB", "file")
     for row in rows:
         table.add_row(
@@ -240,10 +241,10 @@ def _interval(share: Any) -> str:
     return f"{known[0]} ({known[1]}-{known[2]})" if len(known) == 3 else known[0] if known else "-"
 
 
-def _row(model: "InstalledModel") -> dict[str, Any]:
+def _row(model: "InstalledModel") -> Json:
     from sorvolo.detection.session import read_info
 
-    row: dict[str, Any] = {
+    row: Json = {
         "name": model.name,
         "path": str(model.path),
         "is_packaged": model.is_packaged,
@@ -258,7 +259,7 @@ def _row(model: "InstalledModel") -> dict[str, Any]:
         return row | {"error": f"{error}"}
 
 
-def _classes(facts: Mapping[str, Any]) -> list[str]:
+def _classes(facts: JsonView) -> list[str]:
     """The classes of a model, with a word on those that are not reported in every picture."""
     if facts["second_only"]:
         return [f"{name} (in other models' reports)" for name in facts["classes"]]
@@ -279,7 +280,7 @@ def _meaning(info: "ModelInfo") -> str:
     return f"{shares}; of {others} they only order reports" if known else "they only order reports"
 
 
-def _light(facts: Mapping[str, Any]) -> str:
+def _light(facts: JsonView) -> str:
     """The light that a model knows, in words."""
     if not facts["thermal"]:
         return "day"

@@ -14,6 +14,7 @@ from rich.table import Table
 
 from sorvolo.cli.options import PlaceFormat
 from sorvolo.errors import StoreError
+from sorvolo.paths import Json, JsonView
 
 if TYPE_CHECKING:
     from sorvolo.geometry.arrays import Floats
@@ -76,7 +77,7 @@ def announce_person(words: str, console: Console) -> None:
     console.print(f"[bold red]PERSON FOUND[/bold red]  {escape(words)}", soft_wrap=True)
 
 
-def announce_people(report: Mapping[str, Any], folder: Path, console: Console) -> None:
+def announce_people(report: JsonView, folder: Path, console: Console) -> None:
     """Print each person that a map or a comparison found, by its report; `folder` has the site."""
     from sorvolo.geometry.coordinates import Coordinates, place_text
     from sorvolo.store.site.archive import Archive
@@ -99,7 +100,7 @@ def show_path(name: str, path: Path, console: Console) -> None:
     console.print(f"{name:>8}  {escape(str(path))}", soft_wrap=True)
 
 
-def show_notices_and_warnings(report: Mapping[str, Any], console: Console) -> None:
+def show_notices_and_warnings(report: JsonView, console: Console) -> None:
     """Print a report's notices, then its warnings."""
     for notice in report.get("notices", ()):
         console.print(f"[blue]note[/blue]     {escape(notice['text'])}")
@@ -114,7 +115,7 @@ def print_json(value: Any) -> None:
     typer.echo(json.dumps(plain_json(value), indent=1))
 
 
-def read_json(path: Path) -> dict[str, Any]:
+def read_json(path: Path) -> Json:
     """Return a document of a flight; raise StoreError if it cannot be read."""
     try:
         return dict(json.loads(path.read_text(encoding="utf-8")))

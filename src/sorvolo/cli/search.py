@@ -1,8 +1,8 @@
 """`sorvolo search`: what a flight's search would have found, measured, and where it could not see."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
@@ -36,6 +36,7 @@ from sorvolo.cli.printing import (
 from sorvolo.cli.progress import ProgressReport, show_progress
 from sorvolo.cli.sites import ended_by_signal, opened_site, run_on_site
 from sorvolo.errors import SettingsError
+from sorvolo.paths import Json, JsonView
 
 if TYPE_CHECKING:
     from sorvolo.cli.sites import OpenedSite
@@ -193,13 +194,11 @@ def search_command(
         raise typer.Exit(TO_CHECK)
 
 
-def _look_through_trees(
-    place: "OpenedSite", outputs: "SearchOutputs", plants: int
-) -> dict[str, Any]:
+def _look_through_trees(place: "OpenedSite", outputs: "SearchOutputs", plants: int) -> Json:
     from sorvolo.missions.search.through_trees import search_under_trees
 
     flight = outputs.flights[0] if outputs.flights else ""
-    report: dict[str, Any] = {}
+    report: Json = {}
     with ProgressReport(Console(stderr=True)) as progress:
         for update in search_under_trees(
             place.folder, outputs.folder, flight=flight, plants=plants
@@ -272,9 +271,7 @@ def _map_of(inputs: Sequence[str]) -> str:
     )
 
 
-def _show(
-    report: Mapping[str, Any], folder: Path, refly: tuple[Path, ...], console: Console
-) -> None:
+def _show(report: JsonView, folder: Path, refly: tuple[Path, ...], console: Console) -> None:
     text = report["headline"]["text"]
     console.print(escape(text[:1].upper() + text[1:]), style="bold", soft_wrap=True)
     table = Table("class", "POD", "90 % interval", "area", "seen", "sweep width", "coverage")

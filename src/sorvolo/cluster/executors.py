@@ -12,7 +12,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,6 +22,7 @@ from sorvolo.build import build
 from sorvolo.child_process import python_command
 from sorvolo.errors import SettingsError, StoreError
 from sorvolo.missions.worker import FINISHED, TO_CHECK, Order
+from sorvolo.paths import Json, JsonView
 
 LOCK = "batch.lock"
 STALL_S = 300.0  # a process that neither writes nor computes for so long is killed
@@ -40,7 +41,7 @@ class TryEnding:
     cpu_s: float = 0.0
     peak_memory_mb: float = 0.0
     host: str = ""
-    inspected: Mapping[str, Any] = field(default_factory=dict)
+    inspected: JsonView = field(default_factory=dict)
 
 
 class Executor(Protocol):
@@ -62,8 +63,8 @@ def run_order(
     started: Callable[["subprocess.Popen[bytes]"], None] = lambda _: None,
 ) -> TryEnding:
     """Do an order in a process of its own, which keeps the descriptor `lock` open, and wait for its end."""
-    began_s, last = time.monotonic(), dict[str, Any]()
-    inspected: Mapping[str, Any] = {}
+    began_s, last = time.monotonic(), Json()
+    inspected: JsonView = {}
     with tempfile.TemporaryFile() as log:
         process = subprocess.Popen(
             python_command("sorvolo.missions.worker"),
@@ -104,7 +105,7 @@ def run_order(
     )
 
 
-def _lines(process: "subprocess.Popen[bytes]", stall_s: float) -> Iterator[dict[str, Any] | None]:
+def _lines(process: "subprocess.Popen[bytes]", stall_s: float) -> Iterator[Json | None]:
     """What a process writes until it ends; None once it has done nothing for `stall_s` and was killed."""
     assert process.stdout is not None
     pipe, rest = process.stdout.fileno(), b""
@@ -132,7 +133,7 @@ def _lines(process: "subprocess.Popen[bytes]", stall_s: float) -> Iterator[dict[
             return
 
 
-def _outcome(last: Mapping[str, Any], code: int, why: str, log: Any) -> tuple[str, str]:
+def _outcome(last: JsonView, code: int, why: str, log: Any) -> tuple[str, str]:
     """How a mission ended, by its last line and its process's exit code, and the words for it."""
     data = last.get("data", {})
     if not why and last.get("type") == FINISHED:
@@ -203,7 +204,7 @@ class RayExecutor:
         self._ray: Any = ray
         self._name, self._root = name, str(root.resolve())
         self.slots = slots or max(1, int(ray.cluster_resources().get("CPU", 1)))
-        self._running: dict[str, Any] = {}
+        self._running: Json = {}
 
     def start(self, key: str, order: Order) -> None:
         """Start a mission on a machine with a free core."""
@@ -285,7 +286,7 @@ def ray_executor(name: str, slots: int | None, root: Path) -> Iterator[RayExecut
                 f"--executor {name}: no Ray cluster answers at {address} ({error}); start one there: "
                 "ray start --head, and give ray://HOST:10001 (docs/batch.md)"
             ) from None
-    options: dict[str, Any] = {"logging_level": "ERROR", "log_to_driver": False}
+    options: Json = {"logging_level": "ERROR", "log_to_driver": False}
     if address == "local":
         options |= {"num_cpus": slots, "include_dashboard": False}
     try:

@@ -159,7 +159,7 @@ def _matched(
     return np.column_stack([rows[0][good], rows[1][best[good]]])
 
 
-def _agreeing(left: Floats, right: Floats, threshold: float) -> NDArray[np.bool_]:
+def _agreeing(left: Floats, right: Floats, threshold: float) -> Mask:
     """(N,) which pairs of rays fit one relative motion of two cameras."""
     if len(left) < _LEAST_INLIERS:
         return np.zeros(len(left), bool)

@@ -20,44 +20,41 @@ from sorvolo.heights.sweep import SweepSettings, choose_views, likeness_on
 from sorvolo.heights.terrain import filled
 from sorvolo.heights.views import View
 
+ONE_PAIR = 2
+"""So many photos are one pair: nothing confirms what it shows."""
 
-@dataclass(frozen=True)
-class IslandSettings:
-    """What counts as a match by chance (peaks of Hirschmueller 2008)."""
-
-    step_cells: float = (
-        4.0  # a height this much beside its neighbour's, in cells, is another piece of ground
-    )
-    most_cells: int = 340  # of an island: one and a half of the larger patch that is compared
-    photos: int = 2  # one pair of photos: nothing confirms what it shows
-    window_cells: int = 1000  # worked on at a time ...
-    margin_cells: int = 48  # ... with so many around
+# a height this much beside its neighbour's, in cells, is another piece of ground
+_STEP_CELLS = 4.0
 
 
 def islands(
-    up_m: Floats32, shown_by: ImageGray, cell_m: float, settings: IslandSettings = IslandSettings()
+    up_m: Floats32,
+    shown_by: ImageGray,
+    cell_m: float,
+    most_cells: int = 340,
+    window: int = 1000,
+    margin: int = 48,
 ) -> Mask:
-    """(H, W) the cells of a height model, NaN in holes, that stand alone where `shown_by` (H, W) photos are too few."""
+    """(H, W) the cells of a height model, NaN in holes, that stand alone where `shown_by` (H, W) photos are too few.
+
+    They are matches by chance (peaks of Hirschmueller 2008): pieces of at most one and a half of the larger patch that
+    is compared. `window` cells a side are worked on at a time, with `margin` around.
+    """
     found = np.zeros(up_m.shape, bool)
-    margin = settings.margin_cells
-    for x0, y0, x1, y1 in _windows(up_m.shape, settings.window_cells):
+    for x0, y0, x1, y1 in _windows(up_m.shape, window):
         left, top = max(0, x0 - margin), max(0, y0 - margin)
         here = slice(top, y1 + margin), slice(left, x1 + margin)
-        alone = _alone(up_m[here], settings.step_cells * cell_m, settings.most_cells)
+        # the cells of pieces of few cells
+        piece = pieces(up_m[here], _STEP_CELLS * cell_m)
+        alone = (np.bincount(piece.ravel())[piece] <= most_cells) & np.isfinite(up_m[here])
         found[y0:y1, x0:x1] = alone[y0 - top : y1 - top, x0 - left : x1 - left]
-    return found & (shown_by <= settings.photos)
+    return found & (shown_by <= ONE_PAIR)
 
 
 def _windows(shape: tuple[int, ...], side: int) -> Iterator[tuple[int, int, int, int]]:
     for y0 in range(0, shape[0], side):
         for x0 in range(0, shape[1], side):
             yield x0, y0, min(x0 + side, shape[1]), min(y0 + side, shape[0])
-
-
-def _alone(up_m: Floats32, step_m: float, most_cells: int) -> Mask:
-    """(H, W) the cells of pieces of few cells."""
-    piece = pieces(up_m, step_m)
-    return np.asarray((np.bincount(piece.ravel())[piece] <= most_cells) & np.isfinite(up_m))
 
 
 def pieces(up_m: Floats32, step_m: float) -> Rows:

@@ -1,22 +1,23 @@
 """The height model of a flight: swept coarsely over all ground, then finely tile by tile around what was found."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from sorvolo.geometry.arrays import Floats32, ImageGray, Mask, PointsM
 from sorvolo.heights.borders import beyond_borders
-from sorvolo.heights.free_space import IslandSettings, islands, seen_through
+from sorvolo.heights.free_space import ONE_PAIR, islands, seen_through
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.obstacles import Obstacles
 from sorvolo.heights.smooth_sigma import SmoothSigma
-from sorvolo.heights.sweep import Bounds, SmoothingSettings, SweepSettings, Swept, sweep
+from sorvolo.heights.sweep import Bounds, SweepSettings, Swept, sweep
 from sorvolo.heights.views import View
 
-# a crown is few coarse cells wide
-_NARROW = SweepSettings(window_cells=(3, 7), smoothing=SmoothingSettings(more_levels=0.6))
+_FINE = SweepSettings()
+# to find what heights a tile has: a crown is few coarse cells wide
+_NARROW = SweepSettings(window_cells=(3, 7), edge_cost=0.6)
 
 
 _COARSER = 2  # cells of the first sweep, in those of the model
@@ -31,20 +32,9 @@ _RELIEF_SHARE = (
 )
 
 
-@dataclass(frozen=True)
-class SurfaceSettings:
-    """How the height model is made, and how its sigma follows from what the sweep saw."""
-
-    sweep: SweepSettings = field(default_factory=SweepSettings)
-    coarse: SweepSettings = field(
-        default_factory=lambda: _NARROW
-    )  # to find what heights a tile has
-    unsure_cells: float = 3.0  # how far off heights are that are likely as well, beyond which one pair decides nothing
-    islands: IslandSettings = field(default_factory=IslandSettings)
-
-    def sizes_m(self, cell_m: float) -> tuple[float, float]:
-        """What a pixel covers of the ground in the pictures that the two sweeps take, for cells of `cell_m`."""
-        return _COARSER * cell_m, cell_m
+def sizes_m(cell_m: float) -> tuple[float, float]:
+    """What a pixel covers of the ground in the pictures that the two sweeps take, for cells of `cell_m`."""
+    return _COARSER * cell_m, cell_m
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,12 +60,15 @@ def sweep_surface(
     pictures: Callable[[int, float], ImageGray],
     points_m: PointsM,
     camera_sigma: SmoothSigma,
-    settings: SurfaceSettings = SurfaceSettings(),
+    *,
+    unsure_cells: float = 3.0,
+    island_cells: int = 340,
 ) -> Iterator[Surface | float]:
     """Yields the share of tiles done, 0 to 1, and in the end the surface.
 
     `pictures(i, size_m)` is view i's gray picture whose pixels cover about `size_m` of ground; `points_m` (P, 3) are
-    points in space that bound the heights to look for; `camera_sigma` is what heights err by the cameras.
+    points in space that bound the heights to look for; `camera_sigma` is what heights err by the cameras. One pair of
+    photos decides nothing where other heights that are likely lie `unsure_cells` off, nor on a piece of `island_cells`.
     """
     heights_m = np.array([view.site_from_camera.translation_m[2] for view in views])
     # The heights to look for: those of the points, and beyond them, for crowns have few points,
@@ -85,48 +78,48 @@ def sweep_surface(
     ground = float(np.median(points_m[:, 2]))
     reach = camera_m - ground
     everywhere = Bounds(float(low - 0.05 * reach), float(max(high, ground + 0.4 * reach)), ground)
-    side = _tile_cells(lattice.cell_m, views, settings)
+    side = _tile_cells(lattice.cell_m, views)
     wide = lattice.coarser(_COARSER)
-    coarse = _coarse(wide, views, pictures, everywhere, settings)
-    obstacles = Obstacles.surely(wide, coarse, max(settings.coarse.window_cells))
+    coarse = _coarse(wide, views, pictures, everywhere)
+    obstacles = Obstacles.surely(wide, coarse, max(_NARROW.window_cells))
     up_m, sigma_m = (np.full(lattice.shape, np.nan, np.float32) for _ in range(2))
     covered, shown_by = np.zeros(lattice.shape, bool), np.zeros(lattice.shape, np.uint8)
     tiles = list(lattice.windows(side))
     for number, (x0, y0, x1, y1) in enumerate(tiles):
         apron = _APRON_CELLS
         window = lattice.window(x0 - apron, y0 - apron, x1 + apron, y1 + apron)
-        bounds = _tile_bounds(coarse, settings, (x0, y0, x1, y1), lattice.cell_m)
+        bounds = _tile_bounds(coarse, (x0, y0, x1, y1), lattice.cell_m)
         if bounds is not None:
             swept = sweep(
                 window,
                 views,
                 lambda i: pictures(i, lattice.cell_m),
                 bounds,
-                settings.sweep,
+                _FINE,
                 obstacles,
             )
             found = _calmed(swept)
-            unsure = swept.deviation_m > settings.unsure_cells * lattice.cell_m
-            found[unsure & (swept.shown_by <= settings.islands.photos)] = np.nan
-            sigma = _sigma_m(swept, found, window, camera_sigma, settings)
+            unsure = swept.deviation_m > unsure_cells * lattice.cell_m
+            found[unsure & (swept.shown_by <= ONE_PAIR)] = np.nan
+            sigma = _sigma_m(swept, found, window, camera_sigma)
             inner = slice(apron, -apron), slice(apron, -apron)
             up_m[y0:y1, x0:x1], sigma_m[y0:y1, x0:x1] = found[inner], sigma[inner]
             covered[y0:y1, x0:x1] = (swept.seen_by[inner] >= 2) | np.isfinite(found[inner])
             shown_by[y0:y1, x0:x1] = swept.shown_by[inner]
         yield (number + 1) / len(tiles)
-    up_m[islands(up_m, shown_by, lattice.cell_m, settings.islands)] = np.nan
+    up_m[islands(up_m, shown_by, lattice.cell_m, island_cells)] = np.nan
     ground_m = beyond_borders(
         lattice,
         up_m,
         views,
         lambda i: pictures(i, lattice.cell_m),
         side,
-        settings.sweep,
+        _FINE,
     )
     given = np.isfinite(ground_m)
     sigma_m[given] = np.hypot(sigma_m[given], _RELIEF_SHARE * (up_m[given] - ground_m[given]))
     up_m[given] = ground_m[given]
-    up_m[_seen_through(lattice, up_m, views, pictures, settings)] = np.nan
+    up_m[_seen_through(lattice, up_m, views, pictures)] = np.nan
     sigma_m[np.isnan(up_m)] = np.nan
     yield Surface(lattice, up_m, sigma_m, covered)
 
@@ -136,7 +129,6 @@ def _seen_through(
     up_m: Floats32,
     views: Sequence[View],
     pictures: Callable[[int, float], ImageGray],
-    settings: SurfaceSettings,
 ) -> Mask:
     """(H, W) the cells that photos see through, found on cells of the first sweep."""
     times = _COARSER
@@ -146,8 +138,8 @@ def _seen_through(
         np.ascontiguousarray(up_m[::times, ::times]),
         views,
         lambda i: pictures(i, coarse.cell_m),
-        _tile_cells(coarse.cell_m, views, settings),
-        settings.coarse,
+        _tile_cells(coarse.cell_m, views),
+        _NARROW,
     )
     return np.repeat(np.repeat(found, times, axis=0), times, axis=1)[
         : lattice.height, : lattice.width
@@ -159,18 +151,17 @@ def _coarse(
     views: Sequence[View],
     pictures: Callable[[int, float], ImageGray],
     bounds: Bounds,
-    settings: SurfaceSettings,
 ) -> Floats32:
     up_m = np.full(lattice.shape, np.nan, np.float32)
     apron = _COARSE_APRON_CELLS
-    for x0, y0, x1, y1 in lattice.windows(_tile_cells(lattice.cell_m, views, settings)):
+    for x0, y0, x1, y1 in lattice.windows(_tile_cells(lattice.cell_m, views)):
         window = lattice.window(x0 - apron, y0 - apron, x1 + apron, y1 + apron)
-        swept = sweep(window, views, lambda i: pictures(i, lattice.cell_m), bounds, settings.coarse)
+        swept = sweep(window, views, lambda i: pictures(i, lattice.cell_m), bounds, _NARROW)
         up_m[y0:y1, x0:x1] = _calmed(swept)[apron:-apron, apron:-apron]
     return up_m
 
 
-def _tile_cells(cell_m: float, views: Sequence[View], settings: SurfaceSettings) -> int:
+def _tile_cells(cell_m: float, views: Sequence[View]) -> int:
     ground_m = [
         view.site_from_camera.translation_m[2]
         * min(view.camera.width_px, view.camera.height_px)
@@ -181,7 +172,7 @@ def _tile_cells(cell_m: float, views: Sequence[View], settings: SurfaceSettings)
 
 
 def _tile_bounds(
-    coarse: Floats32, settings: SurfaceSettings, window: tuple[int, int, int, int], cell_m: float
+    coarse: Floats32, window: tuple[int, int, int, int], cell_m: float
 ) -> Bounds | None:
     """The heights to search in a tile; None where the coarse model has a hole as large as the tile."""
     x0, y0, x1, y1 = (round(each / _COARSER) for each in window)
@@ -208,7 +199,6 @@ def _sigma_m(
     up_m: Floats32,
     lattice: Lattice,
     camera_sigma: SmoothSigma,
-    settings: SurfaceSettings,
 ) -> Floats32:
     """(H, W) one sigma of the heights: of the match, of other likely heights, of an edge nearby, of the cameras."""
     likeness = np.sqrt(np.clip(swept.score, 0.01, 1))

@@ -6,7 +6,7 @@ and one that cannot see a place does not decide about it.
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -16,19 +16,6 @@ from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, Mask, Matrix3, 
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.obstacles import Obstacles
 from sorvolo.heights.views import View, inside
-
-
-@dataclass(frozen=True)
-class SmoothingSettings:
-    """What heights cost beside their matching cost (0 to 1), in its units."""
-
-    one_level: float = 0.1  # a change of height between neighbours
-    more_levels: float = 0.9  # of any larger change: an edge of a roof
-    unseen_sigmas: float = (
-        1.5  # below a cell's mean cost is that of a height at which fewer than two photos see it
-    )
-    temperature: float = 0.04  # of a path's total cost, by which a height is e times less likely: fits sigma to errors
-
 
 _MORE = 3  # views beyond the wanted ones ...
 _LEFT_OUT = 0.04  # ... while two of those that are chosen leave out so much of the ground that two could show
@@ -42,6 +29,12 @@ _NOISE_LEVELS = 3.0  # gray levels; texture below it decides nothing
 _LEVEL_PX = 0.8  # parallax between two planes, of the two photos farthest apart
 _MOST_LEVELS = 160  # planes of one sweep: bounds time and memory
 _LEAST_SCORE = 0.1  # of agreement, 0 to 1, below which a cell stays a hole
+# what heights cost beside their matching cost (0 to 1), in its units
+_ONE_LEVEL = 0.1  # a change of height between neighbours
+# below a cell's mean cost is that of a height at which fewer than two photos see it
+_UNSEEN_SIGMAS = np.float32(1.5)
+# of a path's total cost, by which a height is e times less likely: fits sigma to errors
+_TEMPERATURE = 0.04
 
 
 @dataclass(frozen=True)
@@ -52,7 +45,7 @@ class SweepSettings:
         5,
         15,
     )  # sides of the patches that are compared: detail, and what is sure
-    smoothing: SmoothingSettings = field(default_factory=SmoothingSettings)
+    edge_cost: float = 0.9  # of any change of height above one level: an edge of a roof
 
 
 @dataclass(frozen=True)
@@ -125,16 +118,11 @@ def sweep(
         cv2.getNumThreads(),
     )
     seen_by = np.sum(seen, axis=0).astype(np.float32)
-    smoothing = settings.smoothing
-    total = kernels.path_costs(
-        _cost(agreement, smoothing), smoothing.one_level, smoothing.more_levels
-    )
+    total = kernels.path_costs(_cost(agreement), _ONE_LEVEL, settings.edge_cost)
     up_m, score = _best(total, agreement, levels)
     # (H, W) the root mean square distance of the other levels from a height, each by its
     # probability.
-    chance = np.exp(
-        (total.min(axis=1, keepdims=True) - total) / (8 * settings.smoothing.temperature)
-    )
+    chance = np.exp((total.min(axis=1, keepdims=True) - total) / (8 * _TEMPERATURE))
     away = levels[None, :, None].astype(np.float32) - up_m[:, None]
     deviation = np.asarray(np.sqrt((chance * away**2).sum(axis=1) / chance.sum(axis=1)), np.float32)
     up_m[~(score >= _LEAST_SCORE)] = (
@@ -362,7 +350,7 @@ def _contrast(picture: Floats32, angle_rad: float) -> Floats32:
     return np.asarray(away / np.sqrt(spread + np.float32(_NOISE_LEVELS**2)), np.float32)
 
 
-def _cost(agreement: Floats32, settings: SmoothingSettings) -> Floats32:
+def _cost(agreement: Floats32) -> Floats32:
     """(H, D, W) what heights cost by their agreement; one that is not seen (NaN) as much as a cell's chance matches.
 
     How well photos agree by chance depends on the ground's texture: it is taken from the cell's other heights.
@@ -375,7 +363,7 @@ def _cost(agreement: Floats32, settings: SmoothingSettings) -> Floats32:
     seen = np.maximum((~unseen).sum(axis=1), 1).astype(np.float32)
     mean = cost.sum(axis=1) / seen
     scatter = np.sqrt(np.maximum((cost**2).sum(axis=1) / seen - mean**2, 0))
-    chance = np.clip(mean - np.float32(settings.unseen_sigmas) * scatter, 0, 1)
+    chance = np.clip(mean - _UNSEEN_SIGMAS * scatter, 0, 1)
     return np.where(unseen, chance[:, None], cost)
 
 

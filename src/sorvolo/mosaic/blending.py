@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import ImageGray, ImageRGB, Mask, Numbers
+from sorvolo.geometry.arrays import Bytes, ImageGray, ImageRGB, Mask, Numbers
 
 BANDS = 5
 """Bands of the pyramid: four Laplacians and the residual."""
@@ -71,7 +71,7 @@ def pixels_of(labels: Winners, number: int) -> ImageGray:
 
 
 def winners_from_shares(
-    shares: Iterable[tuple[int, int, int, NDArray[np.uint8]]], height: int, width: int
+    shares: Iterable[tuple[int, int, int, Bytes]], height: int, width: int
 ) -> Winners:
     """(height, width) the number of the layer with the largest share at each pixel, the first of equals.
 

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import Floats, Rows
+from sorvolo.geometry.arrays import Floats, Mask, Rows
 from sorvolo.geometry.pose import rotation_from_vector
 from sorvolo.mosaic.normal_equations import Elimination, NormalEquations
 
@@ -125,7 +125,7 @@ class GroundRows:
     by_camera: Floats
     by_shared: Floats
     sigma_px: Floats
-    seen: NDArray[np.bool_]
+    seen: Mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +141,7 @@ class Linearised:
     by_new: Floats
     by_shared: Floats
     parallax: Floats
-    seen: NDArray[np.bool_]
+    seen: Mask
 
 
 def linearise(nodes: Nodes, pairs: Pairs, shared: Floats) -> Linearised:
@@ -240,7 +240,7 @@ def solve(
     pairs: Linked,
     shared: Floats,
     shared_sigma: Floats,
-    free: NDArray[np.bool_],
+    free: Mask,
     iterations: int,
     ground: Ground = NO_GROUND,
 ) -> Solution:
@@ -286,7 +286,7 @@ class _Problem:
         pairs: Linked,
         ground: Ground,
         shared_sigma: Floats,
-        free: NDArray[np.bool_],
+        free: Mask,
     ) -> "_Problem":
         """With the nodes that are `free`, (N,) bool."""
         position = np.full(len(free), -1)

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import ImageRGB, ImageRGBA, Mask, PointsPx
+from sorvolo.geometry.arrays import Bytes, ImageRGB, ImageRGBA, Mask, PointsPx
 from sorvolo.geometry.grid import Grid, SiteGrid, TileIndex
 from sorvolo.mosaic.blending import (
     ALIGN_PX,
@@ -265,7 +265,7 @@ class Canvas:
         ids = [int(each) for each in np.unique(winners) if each != _NOBODY]
         shown = None if self._known is None else self._known.opaque(x, y, x + width, y + height)
 
-        def share_of(each: int) -> tuple[int, int, NDArray[np.uint8]]:
+        def share_of(each: int) -> tuple[int, int, Bytes]:
             left, top, share = _share(winners == each, self._frames[each], x, y, pad)
             if shown is not None and each in self._painted_before:
                 share = share * shown[top : top + share.shape[0], left : left + share.shape[1]]
@@ -385,9 +385,7 @@ def _neighbours_first(across: int, down: int) -> list[tuple[int, int]]:
     return sorted(((column, row) for row in range(down) for column in range(across)), key=along_z)
 
 
-def _share(
-    wins: Mask, frame: CanvasFrame, x: int, y: int, pad: int
-) -> tuple[int, int, NDArray[np.uint8]]:
+def _share(wins: Mask, frame: CanvasFrame, x: int, y: int, pad: int) -> tuple[int, int, Bytes]:
     """Where in a window (its origin x, y on the grid) a frame may show, and how strongly, from the cells it
     wins.
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sorvolo.errors import GeometryError
-from sorvolo.geometry.arrays import Floats, ImageRGB, Mask, Matrix3, PointsPx, frozen
+from sorvolo.geometry.arrays import Bytes, Floats, ImageRGB, Mask, Matrix3, PointsPx, frozen
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.mosaic.blending import FILL_PX, WINDOW_APRON_PX, coarse_fill
 from sorvolo.mosaic.exposure import corrected
@@ -171,7 +171,7 @@ def _centre_px(frame: CanvasFrame) -> Floats:
     return np.array([(frame.width_px - 1) / 2, (frame.height_px - 1) / 2, 1.0])
 
 
-def coverage(frame: CanvasFrame, window: tuple[int, int, int, int]) -> NDArray[np.uint8]:
+def coverage(frame: CanvasFrame, window: tuple[int, int, int, int]) -> Bytes:
     """255 where a frame has pixels in a window of grid pixels (x0, y0, x1, y1, ends exclusive), else 0."""
     size = window[2] - window[0], window[3] - window[1]
     window_from_image = _shift(-window[0], -window[1]) @ frame.grid_from_image

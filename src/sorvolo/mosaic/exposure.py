@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csc_array, diags_array
 from scipy.sparse.linalg import splu
 
 from sorvolo.geometry.arrays import (
+    Bytes,
     Floats,
     Floats16,
     Floats32,
@@ -184,7 +184,7 @@ def corrected(
     return result
 
 
-def _brightened(levels: Floats, gain: float) -> NDArray[np.uint8]:
+def _brightened(levels: Floats, gain: float) -> Bytes:
     """Gray levels times a gain; beyond the shoulder ever less, so that only what is white in the picture is white."""
     if gain <= 1:
         return (levels * gain + 0.5).astype(np.uint8)

@@ -51,7 +51,7 @@ class _Columns:
             self._columns[name][self._count] = value
         self._count += 1
 
-    def keep(self, chosen: NDArray[np.bool_]) -> None:
+    def keep(self, chosen: Mask) -> None:
         """Drop the rows where `chosen` (N,) is False."""
         count = int(np.sum(chosen))
         for each in self._columns.values():
@@ -107,7 +107,7 @@ class NodeRows:
         return self._rows.column("prior_sigma_rad")
 
     @property
-    def own(self) -> NDArray[np.bool_]:
+    def own(self) -> Mask:
         """(N,) bool: of the flight that is mapped."""
         return self._rows.column("own")
 
@@ -201,7 +201,7 @@ class LinkRows:
         )
         self._points.append(points)
 
-    def keep(self, chosen: NDArray[np.bool_]) -> None:
+    def keep(self, chosen: Mask) -> None:
         """Drop the links where `chosen` (L,) is False."""
         self._rows.keep(chosen)
 

@@ -4,9 +4,8 @@ from collections.abc import Mapping
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import ImageRGB, ImageRGBA, Mask
+from sorvolo.geometry.arrays import Bytes, ImageRGB, ImageRGBA, Mask
 from sorvolo.geometry.grid import Grid, TileIndex
 
 SETTLING_PX = 64
@@ -26,8 +25,8 @@ class KnownGround:
 
     def __init__(self, grid: Grid, tiles: Mapping[TileIndex, ImageRGBA]) -> None:
         self._grid, self._tiles = grid, tiles
-        self._opaque: dict[TileIndex, NDArray[np.uint8] | None] = {}
-        self._lasting: dict[TileIndex, NDArray[np.uint8]] = {}  # where it is not all that is opaque
+        self._opaque: dict[TileIndex, Bytes | None] = {}
+        self._lasting: dict[TileIndex, Bytes] = {}  # where it is not all that is opaque
 
     def opaque(self, x0: int, y0: int, x1: int, y1: int) -> Mask:
         """(y1 - y0, x1 - x0) what the map showed within a window of grid pixels, ends exclusive."""
@@ -58,13 +57,13 @@ class KnownGround:
                 result[there] = self._unpacked(bits)[here]
         return result
 
-    def _bits(self, index: TileIndex, *, lasting: bool) -> NDArray[np.uint8] | None:
+    def _bits(self, index: TileIndex, *, lasting: bool) -> Bytes | None:
         if index not in self._opaque:
             tile = self._tiles.get(index)
             self._opaque[index] = None if tile is None else np.packbits(tile[..., 3] == 255)
         return self._lasting.get(index, self._opaque[index]) if lasting else self._opaque[index]
 
-    def _unpacked(self, bits: NDArray[np.uint8]) -> Mask:
+    def _unpacked(self, bits: Bytes) -> Mask:
         side = self._grid.tile_px
         return np.unpackbits(bits, count=side * side).reshape(side, side).view(bool)
 

@@ -4,11 +4,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from sorvolo.geometry.arrays import Floats, Matrix3, PointsM, Rows
+from sorvolo.geometry.arrays import Floats, Mask, Matrix3, PointsM, Rows
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import pose_from_homography, site_from_image_homography
 from sorvolo.geometry.level_ground import footprint
@@ -55,7 +54,7 @@ from sorvolo.survey.mosaic import Link
 _GROUPS = ((2,), (5, 6), (7,))  # of SHARED: altitude's zero, tilt, heading; judged together
 
 
-def shared_sigma(settings: PoseGraphSettings, as_reported: NDArray[np.bool_]) -> Floats:
+def shared_sigma(settings: PoseGraphSettings, as_reported: Mask) -> Floats:
     """(8,) prior sigma of each shared unknown; those taken as reported, (8,) bool, are held close to zero."""
     tilt, heading = np.radians([settings.tilt_offset_sigma_deg, settings.heading_offset_sigma_deg])
     sigma = np.array(
@@ -425,7 +424,7 @@ class PoseGraph:
             )
         return np.asarray(connected_components(ties, directed=False)[1], int)
 
-    def _held(self) -> NDArray[np.bool_]:
+    def _held(self) -> Mask:
         """(N,) nodes whose piece has a fix, a known keyframe or known ground: the others have a place by guess alone,
         such as a frame without links after telemetry's last fix."""
         anchored = np.isfinite(self._rows.stated_sigma_m[:, :2]).all(axis=1) | ~self._own()
@@ -443,7 +442,7 @@ class PoseGraph:
         """(N,) the keyframes' node indices."""
         return np.fromiter(map(self._ids.__getitem__, keyframe_ids), int, len(keyframe_ids))
 
-    def _own(self) -> NDArray[np.bool_]:
+    def _own(self) -> Mask:
         return self._rows.own
 
     def _state(self, at: Rows | slice = slice(None)) -> Nodes:
@@ -465,7 +464,7 @@ class PoseGraph:
             self._rows.centres_m[own, 2]
         )
 
-    def _solve(self, free: NDArray[np.bool_], *, shared: bool, iterations: int) -> Solution:
+    def _solve(self, free: Mask, *, shared: bool, iterations: int) -> Solution:
         sigma = shared_sigma(self._settings, self._as_reported) if shared else np.zeros(len(SHARED))
         solution = solve(
             self._state(),
@@ -484,7 +483,7 @@ class PoseGraph:
             self._shared = solution.shared
         return solution
 
-    def _solve_around(self, free: NDArray[np.bool_], iterations: int) -> Rows:
+    def _solve_around(self, free: Mask, iterations: int) -> Rows:
         """Move the free nodes, (N,) bool, among those that they have links with; the links (L,) that took part.
 
         It costs the same however long the flight is.
@@ -527,7 +526,7 @@ class PoseGraph:
         self._weigh_telemetry()
         return self._moved(np.flatnonzero(free))
 
-    def _around_newest(self, most: int) -> NDArray[np.bool_]:
+    def _around_newest(self, most: int) -> Mask:
         """(N,) the newest node and those that the fewest links part from it, the newer first, `most` in all."""
         old, new = self._links.old, self._links.new
         reached = np.zeros(len(self._nodes), bool)
@@ -612,7 +611,7 @@ class PoseGraph:
             self._dropped += int(false.sum())
             self._links.keep(~false)
 
-    def _weigh(self, links: Rows, noise: LinkNoise, chosen: NDArray[np.bool_]) -> None:
+    def _weigh(self, links: Rows, noise: LinkNoise, chosen: Mask) -> None:
         """Give `links` the noise of those that are `chosen`, their relief half their own and half that of most."""
         overall = float(np.median(noise.relief_m))
         self._links.relief_m[links] = np.clip(

@@ -21,6 +21,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from sorvolo import __version__
 from sorvolo.errors import SettingsError
+from sorvolo.paths import Json
 from sorvolo.station.collections import Findings, SiteCollections
 from sorvolo.station.crops import FlightVideos, crop_routes, video_routes
 from sorvolo.station.events import EventLog, event_routes
@@ -219,7 +220,7 @@ def station_app(
     return app
 
 
-_TILES: dict[int | str, dict[str, Any]] = {
+_TILES: dict[int | str, Json] = {
     200: {"description": "The tile", "content": {"image/webp": {}, "image/png": {}}},
     204: {"description": "Nothing of the map"},
 }
@@ -230,9 +231,7 @@ def _about_routes(station: Station) -> APIRouter:
     looked_s: dict[tuple[str, str], float] = {}  # by site and name, on the monotonic clock
 
     @router.get("/api/status")
-    def status(
-        request: Request, site: Annotated[str, Query(max_length=200)] = ""
-    ) -> dict[str, Any]:
+    def status(request: Request, site: Annotated[str, Query(max_length=200)] = "") -> Json:
         """The station at a glance; with the `site` that a page shows, also the names of all who look at it now."""
         free, memory = shutil.disk_usage(station.settings.root).free, memory_bytes()
         holder, now_s = holder_in(request), time.monotonic()
@@ -305,12 +304,12 @@ def _site_routes(station: Station) -> APIRouter:
     router = APIRouter(prefix="/api/sites", tags=["sites"], dependencies=[needs(Role.VIEW)])
 
     @router.get("")
-    def sites() -> list[dict[str, Any]]:
+    def sites() -> list[Json]:
         """Every site below the root."""
         return readable(station.shelf)
 
     @router.get("/{site}")
-    def one_site(request: Request, site: str) -> dict[str, Any]:
+    def one_site(request: Request, site: str) -> Json:
         """A site with its versions and flights, and the revision of its live map."""
         detail = site_detail(site, station.shelf.open(site))
         revision = (

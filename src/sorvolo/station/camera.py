@@ -9,17 +9,17 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from sorvolo.capture.live.addresses import is_live_address, without_secret
 from sorvolo.capture.live.growing import ENDED_SUFFIX
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.child_process import python_command
 from sorvolo.errors import InputError, SorvoloError
+from sorvolo.paths import JsonView
 from sorvolo.station.orders import RunOrder
 
 _SPOOL_BYTES = 512_000_000  # what waits for a station that is away
@@ -97,7 +97,7 @@ class _Camera:
             self._process.stdin.flush()
         self._path: Path | None = None
         self.left = 0
-        self._answers: queue.Queue[Mapping[str, Any]] = queue.Queue()
+        self._answers: queue.Queue[JsonView] = queue.Queue()
         self._listening = threading.Thread(target=self._listen, name="camera", daemon=True)
         self._listening.start()
 
@@ -138,7 +138,7 @@ class _Camera:
             self._listening.join(_TURN_S * 10)  # for its last lines
             shutil.rmtree(self._spool, ignore_errors=True)
 
-    def _answer(self) -> Mapping[str, Any]:
+    def _answer(self) -> JsonView:
         """What the process stated meanwhile; nothing where it did not."""
         try:
             return self._answers.get(timeout=_TURN_S)
@@ -215,7 +215,7 @@ def _send(job: CameraJob, stop: threading.Event) -> int:
     return 0
 
 
-def _state(answer: Mapping[str, Any]) -> None:
+def _state(answer: JsonView) -> None:
     with suppress(BrokenPipeError):  # the mission is gone
         sys.stdout.write(json.dumps(answer) + "\n")
         sys.stdout.flush()

@@ -9,7 +9,9 @@ import sys
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
-from typing import IO, Any
+from typing import IO
+
+from sorvolo.paths import Json
 
 _MEMORY_BYTES = (
     3 << 30
@@ -46,7 +48,7 @@ class UploadRefusal(Exception):
     """What is wrong with the upload."""
 
 
-def look(part: Path, target: Path, most_bytes: int, keep_free_bytes: int = 0) -> dict[str, Any]:
+def look(part: Path, target: Path, most_bytes: int, keep_free_bytes: int = 0) -> Json:
     """What an upload holds; photos are unpacked into the folder `target`, which no dot is in. Raises UploadRefusal."""
     ending = target.suffix.lower()
     if ending in _CONTAINERS:
@@ -62,7 +64,7 @@ def look(part: Path, target: Path, most_bytes: int, keep_free_bytes: int = 0) ->
     return {"kind": "text"}
 
 
-def _video(part: Path, container: str) -> dict[str, Any]:
+def _video(part: Path, container: str) -> Json:
     import av
 
     with part.open("rb") as file:
@@ -115,7 +117,7 @@ def _has_signature(head: bytes, container: str) -> bool:
     )
 
 
-def _photos(part: Path, target: Path, most_bytes: int, keep_free_bytes: int) -> dict[str, Any]:
+def _photos(part: Path, target: Path, most_bytes: int, keep_free_bytes: int) -> Json:
     taken: dict[str, Path] = {}
     try:
         with zipfile.ZipFile(part) as archive:
@@ -249,7 +251,7 @@ def main(part: str, target: str, most_bytes: str, keep_free_bytes: str) -> None:
     limit_process(_CPU_S)
     try:
         facts = look(Path(part), Path(target), int(most_bytes), int(keep_free_bytes))
-        answer: dict[str, Any] = {"error": None, "facts": facts}
+        answer: Json = {"error": None, "facts": facts}
     except UploadRefusal as refusal:
         answer = {"error": str(refusal), "facts": None}
     except MemoryError:

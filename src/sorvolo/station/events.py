@@ -5,15 +5,15 @@ import json
 import sqlite3
 import threading
 from collections import deque
-from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
 
 from fastapi import APIRouter, Header, Query, WebSocket
 from fastapi.responses import StreamingResponse
 from starlette.websockets import WebSocketDisconnect
 
+from sorvolo.paths import Json, JsonView
 from sorvolo.station.state import StationState, compact_json, utc_now
 
 _IN_MEMORY = 4000  # for browsers that come back after a break; older ones are read from the disk
@@ -27,7 +27,7 @@ class NewEvent:
     """An event before it has its number: its type, the site and the run that it is of, what it holds as plain JSON."""
 
     type: str
-    data: Mapping[str, Any]
+    data: JsonView
     site: str | None = None
     run: str | None = None
 
@@ -39,7 +39,7 @@ class EventLog:
         self._state, self._most_kept = state, most_kept
         self._lock = threading.Lock()
         rows = state.rows("SELECT * FROM events ORDER BY seq DESC LIMIT ?", (_IN_MEMORY,))
-        self._recent: deque[dict[str, Any]] = deque(
+        self._recent: deque[Json] = deque(
             (_event(row) for row in reversed(rows)), maxlen=_IN_MEMORY
         )
         last = state.rows("SELECT seq FROM sqlite_sequence WHERE name = 'events'")
@@ -63,7 +63,7 @@ class EventLog:
         at = utc_now()
         with self._lock:
             with self._state.changing() as connection:
-                made: list[dict[str, Any]] = []
+                made: list[Json] = []
                 for each in events:
                     cursor = connection.execute(
                         "INSERT INTO events (at, type, site, run, data) VALUES (?, ?, ?, ?, ?)",
@@ -84,7 +84,7 @@ class EventLog:
             except RuntimeError:  # the loop was closed: nobody waits there any more
                 self._waiting.discard((loop, event))
 
-    def after(self, seq: int) -> list[dict[str, Any]]:
+    def after(self, seq: int) -> list[Json]:
         """The events after a number, oldest first, some hundreds at most; what is lost is reported by one event."""
         with self._lock:
             recent, last = list(self._recent), self._last
@@ -100,7 +100,7 @@ class EventLog:
             found = [_lost(seq + 1, found[0]["seq"] - 1), *found]
         return found
 
-    def newest(self, kind: str, site: str) -> dict[str, Any] | None:
+    def newest(self, kind: str, site: str) -> Json | None:
         """The last event of a kind about a site; None where there was none, or none is kept."""
         rows = self._state.rows(
             "SELECT * FROM events WHERE type = ? AND site = ? ORDER BY seq DESC LIMIT 1",
@@ -108,7 +108,7 @@ class EventLog:
         )
         return _event(rows[0]) if rows else None
 
-    async def follow(self, seq: int, quiet_s: float = 15.0) -> AsyncIterator[list[dict[str, Any]]]:
+    async def follow(self, seq: int, quiet_s: float = 15.0) -> AsyncIterator[list[Json]]:
         """The events after a number as they come, for ever; an empty list where none came for a while."""
         loop, arrived = asyncio.get_running_loop(), asyncio.Event()
         self._waiting.add((loop, arrived))
@@ -133,12 +133,12 @@ class EventLog:
             self._waiting.discard((loop, arrived))
 
 
-def _lost(first: int, last: int) -> dict[str, Any]:
+def _lost(first: int, last: int) -> Json:
     data = {"from": first, "to": last}
     return {"seq": last, "at": utc_now(), **vars(NewEvent(LOST, data))}
 
 
-def _event(row: sqlite3.Row) -> dict[str, Any]:
+def _event(row: sqlite3.Row) -> Json:
     return {
         **{name: row[name] for name in ("seq", "at", "type", "site", "run")},
         "data": json.loads(row["data"]),

@@ -27,6 +27,7 @@ from titiler.core.factory import TilerFactory
 from titiler.core.utils import render_image
 
 from sorvolo.missions.heights.measure import measure_profile
+from sorvolo.paths import Json
 from sorvolo.station.collections import SEARCH_FOLDER, TITLES, SiteCollections
 from sorvolo.station.problems import Problem, problem_answer
 from sorvolo.station.security import address, needs
@@ -243,7 +244,7 @@ def export_routes(shelf: SiteShelf, collections: SiteCollections) -> APIRouter:
     )
 
     @router.get("/exports")
-    def listed(site: str) -> list[dict[str, Any]]:
+    def listed(site: str) -> list[Json]:
         """The files of a site that are there."""
         archive = shelf.open(site)
         rows = [
@@ -289,7 +290,7 @@ def export_routes(shelf: SiteShelf, collections: SiteCollections) -> APIRouter:
         site: str,
         line: str = Query(max_length=4000),
         step_m: float = Query(0, ge=0, le=1000),
-    ) -> dict[str, Any]:
+    ) -> Json:
         """Heights along a line, `LON,LAT;LON,LAT;...`; 404 where the site has no heights."""
         return _profile(shelf.open(site).folder, line, step_m)
 
@@ -317,7 +318,7 @@ def _size(archive: Archive, file: ExportFile) -> int | None:
         return None
 
 
-def _row(site: str, file: ExportFile, size: int | None) -> dict[str, Any]:
+def _row(site: str, file: ExportFile, size: int | None) -> Json:
     url = f"/api/sites/{quote(site, safe='')}/exports/{quote(file.id, safe='')}"
     return {
         "id": file.id,

@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
-from typing import Any
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from sorvolo.findings.register import (
     id_by,
 )
 from sorvolo.geometry.geodesy import Geodetic
+from sorvolo.paths import Json
 from sorvolo.store.exports.change_files import objects_geojson
 from sorvolo.store.exports.places import place_deg
 from sorvolo.store.exports.plain import feature, rounded, utc_text
@@ -25,8 +25,8 @@ from sorvolo.store.site.change_records import StoredObject
 from sorvolo.survey.flight import Site
 from sorvolo.survey.objects import PERSON
 
-Feature = dict[str, Any]
-Track = dict[str, Any]
+Feature = Json
+Track = Json
 _DATED_NS = 365 * 86_400 * 10**9  # times before are those of a clock without a date
 _UNKNOWN_SIGMA_M = 2.0  # of tracks of watches that state none
 
@@ -149,7 +149,7 @@ def _feature(
     of_map = next((objects[each] for each in ids if each in objects), None)
     of_watch = next((watched[each] for each in ids if each in watched), None)
     newest = found.newest
-    values: dict[str, Any] = {"score": newest.score, "length_m": rounded(newest.length_m, 2)}
+    values: Json = {"score": newest.score, "length_m": rounded(newest.length_m, 2)}
     changed = [each.id for each in found.sightings if each.origin is KnownBy.CHANGED]
     crop = ("change", changed[-1]) if changed else None
     if of_map is not None:

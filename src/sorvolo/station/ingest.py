@@ -4,7 +4,7 @@ import asyncio
 import json
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Any, Protocol
 from sorvolo.capture.live.growing import ENDED_SUFFIX
 from sorvolo.errors import InputError, StoreError
 from sorvolo.missions.worker import BOXES, MOTION
+from sorvolo.paths import Json, JsonView
 from sorvolo.station.messages import (
     BUSY_CODE,
     REFUSED_CODE,
@@ -75,7 +76,7 @@ class DroneLink(Protocol):
         """End the connection."""
 
 
-Announce = Callable[[str, Mapping[str, Any]], None]
+Announce = Callable[[str, JsonView], None]
 """Called with a stream's id and its state whenever that changes."""
 
 
@@ -138,7 +139,7 @@ class Ingest:
         hub = self._hubs.get(stream)
         return 0 if hub is None else hub.viewers
 
-    def streams(self) -> list[dict[str, Any]]:
+    def streams(self) -> list[Json]:
         """The state of every stream that was ever taken, by name."""
         names = (
             {each.name for each in self._folder.iterdir() if each.is_dir()}
@@ -147,7 +148,7 @@ class Ingest:
         )
         return [self.state(name) for name in sorted(names) if is_stream(name)]
 
-    def state(self, stream: str) -> dict[str, Any]:
+    def state(self, stream: str) -> Json:
         """A stream at a glance: its newest flights, in order, and what the one that is being sent does."""
         check_stream(stream)
         flight, files = self._flights.get(stream), self._files(stream)
@@ -199,7 +200,7 @@ class Ingest:
         if not any((self._folder / stream).iterdir()):
             (self._folder / stream).rmdir()
 
-    def show(self, kind: str, found: Mapping[str, Any]) -> None:
+    def show(self, kind: str, found: JsonView) -> None:
         """Give what a mission found in one frame, BOXES or MOTION, to whoever watches the stream; from any thread.
 
         Their times are UTC; the pictures' own times count from the flight's zero, which telemetry ties to UTC.
@@ -414,7 +415,7 @@ class Flight:
             self.is_open = False
             self._file.close()
 
-    def figures(self) -> dict[str, Any]:
+    def figures(self) -> Json:
         """What a crew wants to know."""
         span_s = self._taken_s[-1] - self._taken_s[0] if len(self._taken_s) > 1 else 0.0
         hello = self.hello
@@ -478,7 +479,7 @@ def _utc_us(text: Any) -> int:
     return round(datetime.fromisoformat(str(text)).timestamp() * 1e6)
 
 
-def _kept(path: Path) -> dict[str, Any]:
+def _kept(path: Path) -> Json:
     """A flight on the disk as it is listed."""
     return {"flight": path.stem, "bytes": path.stat().st_size, "is_over": _ended(path).exists()}
 

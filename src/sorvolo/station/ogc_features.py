@@ -1,14 +1,14 @@
 """OGC API Features over a site's collections: landing page, conformance, collections, items by place, time and more."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
-from typing import Any
 from urllib.parse import quote, urlencode
 
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import JSONResponse
 from shapely.geometry import box, mapping
 
+from sorvolo.paths import Json, JsonView
 from sorvolo.station.collections import TITLES, Collection, SiteCollections
 from sorvolo.station.exports import cogs_of, tilejson_address
 from sorvolo.station.found import Feature
@@ -55,13 +55,13 @@ def feature_routes(collections: SiteCollections, reviews: Reviews) -> APIRouter:
     )
 
     @router.get("/conformance")
-    def conformance(site: str) -> dict[str, Any]:
+    def conformance(site: str) -> Json:
         """Which classes of OGC API Features are fulfilled."""
         collections.get(site, "frames")
         return {"conformsTo": _CONFORMS}
 
     @router.get("/collections")
-    def list_collections(request: Request, site: str) -> dict[str, Any]:
+    def list_collections(request: Request, site: str) -> Json:
         """The collections of a site."""
         base = _base(request, site)
         return {
@@ -70,7 +70,7 @@ def feature_routes(collections: SiteCollections, reviews: Reviews) -> APIRouter:
         }
 
     @router.get("/collections/{name}")
-    def one_collection(request: Request, site: str, name: str) -> dict[str, Any]:
+    def one_collection(request: Request, site: str, name: str) -> Json:
         """One collection: its extent and links."""
         return _about(name, collections.get(site, name), _base(request, site))
 
@@ -119,7 +119,7 @@ def _base(request: Request, site: str) -> str:
     return address(request, f"/api/sites/{site}")
 
 
-def _about(name: str, collection: Collection, base: str) -> dict[str, Any]:
+def _about(name: str, collection: Collection, base: str) -> Json:
     extent = {}
     if collection.shapes:
         edges = [each.bounds for each in collection.shapes]
@@ -148,7 +148,7 @@ def _link(href: str, rel: str, kind: str, title: str) -> dict[str, str]:
     return {"href": href, "rel": rel, "type": kind, "title": title}
 
 
-def _page(request: Request, features: Sequence[Feature], limit: int, offset: int) -> dict[str, Any]:
+def _page(request: Request, features: Sequence[Feature], limit: int, offset: int) -> Json:
     shown = features[offset : offset + limit]
     path = address(request, request.url.path)
     links = [
@@ -263,7 +263,7 @@ def _filtered(
     flights: frozenset[str],
     verdicts: frozenset[str],
 ) -> list[Feature]:
-    def is_wanted(values: Mapping[str, Any]) -> bool:
+    def is_wanted(values: JsonView) -> bool:
         return (
             (
                 not labels
@@ -280,7 +280,7 @@ def _filtered(
     return [each for each in features if is_wanted(each["properties"] or {})]
 
 
-def _meets(values: Mapping[str, Any], interval: tuple[datetime | None, datetime | None]) -> bool:
+def _meets(values: JsonView, interval: tuple[datetime | None, datetime | None]) -> bool:
     start, end = interval
     if start is None and end is None:
         return True
@@ -291,7 +291,7 @@ def _meets(values: Mapping[str, Any], interval: tuple[datetime | None, datetime 
     return (start is None or _moment(str(last)) >= start) and (end is None or _moment(first) <= end)
 
 
-def _between(values: Mapping[str, Any], after: int | None, until: int | None) -> bool:
+def _between(values: JsonView, after: int | None, until: int | None) -> bool:
     """Whether a change came between two versions of the map: after the first, at the second or before it."""
     version = values.get("version") or 0
     low, high = min(after or 0, until or 2**62), max(after or 0, until or 2**62)
@@ -307,7 +307,7 @@ def stac_routes(shelf: SiteShelf) -> APIRouter:
     router = APIRouter(prefix="/api/stac", tags=["STAC"], dependencies=[needs(Role.VIEW)])
 
     @router.get("")
-    def catalogue(request: Request) -> dict[str, Any]:
+    def catalogue(request: Request) -> Json:
         """The sites of this station."""
         links = [_link_stac(request, "self", "/api/stac"), _link_stac(request, "root", "/api/stac")]
         return {
@@ -326,7 +326,7 @@ def stac_routes(shelf: SiteShelf) -> APIRouter:
         }
 
     @router.get("/{site}")
-    def collection(request: Request, site: str) -> dict[str, Any]:
+    def collection(request: Request, site: str) -> Json:
         """A site with its extent in space and time, and a link to each version."""
         archive = shelf.open(site)
         versions = archive.versions()
@@ -369,36 +369,7 @@ def stac_routes(shelf: SiteShelf) -> APIRouter:
                 404, f"the map has no version {version}; /api/stac/{site} links to those there are"
             )
         bbox = _bbox(archive, version)
-        is_newest = found.id == versions[-1].id
-        tiles = f"/api/sites/{site}/tiles/{found.id}/{{z}}/{{x}}/{{y}}.webp"
-        assets: dict[str, Any] = {
-            "tiles": {
-                "href": address(request, tiles),
-                "type": "image/webp",
-                "title": "XYZ tiles",
-                "roles": ["visual"],
-            }
-        }
-        for cog in cogs_of(archive).values():
-            belongs = (
-                is_newest if cog.id == "mosaic" else cog.id.partition(":")[2] == found.flight_id
-            )
-            if belongs:
-                assets[f"{cog.id}-tiles"] = {
-                    "href": address(request, tilejson_address(site, cog)),
-                    "type": "application/json",
-                    "title": f"{cog.title}, TileJSON",
-                    "roles": ["tiles"],
-                }
-                name = cog.file.rpartition("/")[2]
-                file = name if cog.id == "mosaic" else f"{found.flight_id}-{name}"
-                assets[cog.id] = {
-                    "href": address(request, f"/api/sites/{site}/exports/{file}"),
-                    "type": "image/tiff; application=geotiff; profile=cloud-optimized",
-                    "title": cog.title,
-                    "roles": ["data"],
-                    "proj:code": archive.site().crs,
-                }
+        assets = _assets(request, site, archive, found, is_newest=found.id == versions[-1].id)
         return GeoJsonResponse(
             {
                 "type": "Feature",
@@ -429,6 +400,39 @@ def stac_routes(shelf: SiteShelf) -> APIRouter:
         )
 
     return router
+
+
+def _assets(
+    request: Request, site: str, archive: Archive, version: VersionEntry, *, is_newest: bool
+) -> Json:
+    tiles = f"/api/sites/{site}/tiles/{version.id}/{{z}}/{{x}}/{{y}}.webp"
+    assets: Json = {
+        "tiles": {
+            "href": address(request, tiles),
+            "type": "image/webp",
+            "title": "XYZ tiles",
+            "roles": ["visual"],
+        }
+    }
+    for cog in cogs_of(archive).values():
+        belongs = is_newest if cog.id == "mosaic" else cog.id.partition(":")[2] == version.flight_id
+        if belongs:
+            assets[f"{cog.id}-tiles"] = {
+                "href": address(request, tilejson_address(site, cog)),
+                "type": "application/json",
+                "title": f"{cog.title}, TileJSON",
+                "roles": ["tiles"],
+            }
+            name = cog.file.rpartition("/")[2]
+            file = name if cog.id == "mosaic" else f"{version.flight_id}-{name}"
+            assets[cog.id] = {
+                "href": address(request, f"/api/sites/{site}/exports/{file}"),
+                "type": "image/tiff; application=geotiff; profile=cloud-optimized",
+                "title": cog.title,
+                "roles": ["data"],
+                "proj:code": archive.site().crs,
+            }
+    return assets
 
 
 def _bbox(archive: Archive, version: int | None) -> list[float] | None:

@@ -11,6 +11,7 @@ from typing import Any
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.units import M_PER_DEG_LATITUDE
 from sorvolo.missions.watch.cot_sender import CotSender, CotTls, check_host, cot_place
+from sorvolo.paths import JsonView
 from sorvolo.station.events import EventLog
 from sorvolo.station.ingest import Ingest
 from sorvolo.station.relays import (
@@ -161,7 +162,7 @@ class CotRelay(ThreadOwner):
         self._sender.close()
         self._drone_sender.close()
 
-    def send(self, event: Mapping[str, Any]) -> None:
+    def send(self, event: JsonView) -> None:
         """Send one event's things. Raises OSError where the connection fails, NotTaken for what has no place."""
         data, site = event.get("data") or {}, str(event.get("site") or "station")
         if event["type"] == "frame.placed":
@@ -176,7 +177,7 @@ class CotRelay(ThreadOwner):
             for feature in features_of(event):
                 self._spot(site, event, feature)
 
-    def _spot(self, site: str, event: Mapping[str, Any], feature: Mapping[str, Any]) -> None:
+    def _spot(self, site: str, event: JsonView, feature: JsonView) -> None:
         properties = feature.get("properties") or {}
         place = _middle(feature.get("geometry") or {})
         if place is None or (event.get("data") or {}).get("is_local"):
@@ -205,7 +206,7 @@ class CotRelay(ThreadOwner):
             )
         )
 
-    def _place(self, run: str, event: Mapping[str, Any], data: Mapping[str, Any]) -> None:
+    def _place(self, run: str, event: JsonView, data: JsonView) -> None:
         """A mission placed a frame: the drone is where its camera was, unless it sends that itself."""
         if (
             time.monotonic() - self._placed_s.get(run, -1e9) < _DRONE_EVERY_S
@@ -269,7 +270,7 @@ def view_of_sample(columns: Mapping[str, float], stated: Mapping[str, float]) ->
     )
 
 
-def view_of_frame(data: Mapping[str, Any]) -> DroneView | None:
+def view_of_frame(data: JsonView) -> DroneView | None:
     """A drone's place and view by a placed frame: its camera's position, and the angles at which it saw the corners.
 
     `footprint` is the frame's outline, longitude and latitude, from its top left corner clockwise. None where the
@@ -299,7 +300,7 @@ def view_of_frame(data: Mapping[str, Any]) -> DroneView | None:
     )
 
 
-def _remarks(name: str, score: Any, event: Mapping[str, Any]) -> str:
+def _remarks(name: str, score: Any, event: JsonView) -> str:
     scored = "" if score is None else f", score {float(score):.2f}"
     return f"{name}{scored}, found by Sorvolo at {event['at'][:19]}Z"
 
@@ -317,7 +318,7 @@ def _angle_deg(one: tuple[float, float], other: tuple[float, float], height_m: f
     return degrees(atan2(hypot(*cross), sum(x * y for x, y in zip(a, b))))
 
 
-def _middle(geometry: Mapping[str, Any]) -> tuple[float, float] | None:
+def _middle(geometry: JsonView) -> tuple[float, float] | None:
     """A point's place, or the mean of an outline's corners, longitude and latitude."""
     found = geometry.get("coordinates")
     while (

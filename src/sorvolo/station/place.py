@@ -15,6 +15,7 @@ from sorvolo.errors import StoreError
 from sorvolo.geometry.arrays import PointsM
 from sorvolo.geometry.units import M_PER_DEG_LATITUDE
 from sorvolo.missions.archive.index import update_site
+from sorvolo.paths import Json
 from sorvolo.station.collections import Collection, SiteCollections
 from sorvolo.station.crops import FlightVideos
 from sorvolo.station.found import Feature
@@ -125,7 +126,7 @@ def place_routes(
         lon: float = Query(ge=-360, le=360),
         lat: float = Query(ge=-90, le=90),
         within_m: float = Query(_NEAR_M, gt=0, le=10_000),
-    ) -> list[dict[str, Any]]:
+    ) -> list[Json]:
         """Every flight of every site that saw the place or found something within reach of it, in order of time.
 
         Sites without GPS have no place on Earth, and are left out. 503 where the index of the sites cannot be used.
@@ -142,7 +143,7 @@ def place_routes(
         lon: float = Query(ge=-360, le=360),
         lat: float = Query(ge=-90, le=90),
         most_per_flight: int = Query(12, ge=1, le=200),
-    ) -> list[dict[str, Any]]:
+    ) -> list[Json]:
         """Every frame that shows the place, in order of time, at most this many a flight: those that see it best.
 
         `crop_url` is a picture of the ground around it, north up; null where nothing was kept to cut it from.
@@ -191,7 +192,7 @@ def place_routes(
     return router
 
 
-def _flight_row(site_id: str, found: FoundFlight, reviews: Reviews) -> dict[str, Any]:
+def _flight_row(site_id: str, found: FoundFlight, reviews: Reviews) -> Json:
     """A flight that saw the place, of any site."""
     things = _things(site_id, found, reviews)
     return {
@@ -207,7 +208,7 @@ def _flight_row(site_id: str, found: FoundFlight, reviews: Reviews) -> dict[str,
     }
 
 
-def _things(site_id: str, found: FoundFlight, reviews: Reviews) -> list[dict[str, Any]]:
+def _things(site_id: str, found: FoundFlight, reviews: Reviews) -> list[Json]:
     """What a flight found at the place, by the index, with the verdicts on it."""
     verdicts = {
         kind: reviews.current(site_id, kind) for kind in {each.type for each in found.things}
@@ -229,11 +230,11 @@ def _things(site_id: str, found: FoundFlight, reviews: Reviews) -> list[dict[str
 
 def _near(
     site_id: str, place: Point, collections: SiteCollections, reviews: Reviews
-) -> Mapping[str, list[dict[str, Any]]]:
+) -> Mapping[str, list[Json]]:
     """What was found within reach of a place: changes and objects by flight, with the verdicts on them."""
     reach_deg = _NEAR_M / M_PER_DEG_LATITUDE / max(0.01, float(np.cos(np.radians(place.y))))
     ring = place.buffer(reach_deg)
-    result: dict[str, list[dict[str, Any]]] = {}
+    result: dict[str, list[Json]] = {}
     for name, kind in (("changes", "change"), ("objects", "object")):
         collection, verdicts = collections.get(site_id, name), reviews.current(site_id, kind)
         for number in sorted(collection.tree.query(ring, predicate="intersects")):
@@ -254,7 +255,7 @@ def _near(
     return result
 
 
-def _review(review: Review | None) -> dict[str, Any] | None:
+def _review(review: Review | None) -> Json | None:
     if review is None:
         return None
     return {
@@ -308,8 +309,8 @@ def _row(
     place_m: PointsM,
     kept: set[tuple[str, int]],
     film: _Film,
-    found: Mapping[str, list[dict[str, Any]]],
-) -> dict[str, Any]:
+    found: Mapping[str, list[Json]],
+) -> Json:
     """A frame that shows the place; `base` is the site's address."""
     values = frame["properties"]
     flight, name = values["flight"], values.get("frame")
@@ -337,7 +338,7 @@ def _row(
     }
 
 
-def _found_here(found: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+def _found_here(found: Sequence[Json]) -> dict[str, list[Json]]:
     """What a flight found at the place, by kind, and the verdicts on it."""
     return {
         "changes": [each for each in found if each["type"] == "change"],

@@ -22,6 +22,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 from sorvolo.capture.live.reconnect import Backoff
 from sorvolo.errors import SettingsError, StoreError
 from sorvolo.missions.watch.cot_sender import trusting
+from sorvolo.paths import JsonView
 from sorvolo.station.events import EventLog
 from sorvolo.station.state import ThreadOwner
 from sorvolo.store.atomic import atomic_write_bytes
@@ -49,7 +50,7 @@ class NotTaken(Exception):
     """A receiver's answer that stays the same however often an event is sent to it."""
 
 
-Send = Callable[[Mapping[str, Any]], None]
+Send = Callable[[JsonView], None]
 """Sends one event. Raises NotTaken where the receiver will never have it, any other error where it may later."""
 
 
@@ -105,7 +106,7 @@ class Relay(ThreadOwner):
             else:
                 self._ending.wait(_TURN_S)
 
-    def _deliver(self, event: Mapping[str, Any]) -> bool:
+    def _deliver(self, event: JsonView) -> bool:
         """Send until it is taken, refused or too old; False where the station ends meanwhile."""
         while not self._ending.is_set():
             try:
@@ -131,7 +132,7 @@ class Relay(ThreadOwner):
                 return True
         return False
 
-    def _lose(self, event: Mapping[str, Any], why: str) -> None:
+    def _lose(self, event: JsonView, why: str) -> None:
         self._lost += 1
         self._words = why
         _LOG.warning(
@@ -150,7 +151,7 @@ class Relay(ThreadOwner):
             _LOG.warning("cannot note what %s got: %s", self.name, error)
 
 
-def features_of(event: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+def features_of(event: JsonView) -> Iterator[JsonView]:
     """The GeoJSON features in an event's data."""
     data = event.get("data") or {}
     for each in (data.get("feature"), *(data.get("features") or ())):
@@ -166,7 +167,7 @@ def _place_in(path: Path, last: int) -> int:
     return min(seq, last)
 
 
-def _age_s(event: Mapping[str, Any]) -> float:
+def _age_s(event: JsonView) -> float:
     try:
         at = datetime.fromisoformat(str(event["at"]))
     except (KeyError, ValueError):
@@ -199,7 +200,7 @@ def webhook(url: str, secret: str = "") -> Send:
         )
     opener = urllib.request.build_opener(_NoRedirect)
 
-    def post(event: Mapping[str, Any]) -> None:
+    def post(event: JsonView) -> None:
         body = json.dumps(event, separators=(",", ":")).encode()
         headers = {"Content-Type": "application/json", "User-Agent": "sorvolo"}
         if secret:
@@ -308,7 +309,7 @@ class MqttSender:
             self._client.tls_set_context(trusting(authority, "--mqtt-ca"))
         self._is_begun = False
 
-    def send(self, event: Mapping[str, Any]) -> None:
+    def send(self, event: JsonView) -> None:
         """Publish one event. Raises OSError where the broker does not acknowledge it."""
         self._demand_connection()
         topic = (

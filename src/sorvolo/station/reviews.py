@@ -7,13 +7,14 @@ import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Query
 from pydantic import Field, Strict
 
 from sorvolo.errors import SorvoloError, StoreError
 from sorvolo.missions.site.review import review_changes, withdraw_reviews
+from sorvolo.paths import Json
 from sorvolo.station.collections import FINDINGS, SiteCollections
 from sorvolo.station.events import EventLog, NewEvent
 from sorvolo.station.orders import Wish
@@ -262,12 +263,12 @@ def review_routes(reviews: Reviews, shelf: SiteShelf) -> APIRouter:
         site: str,
         kind: Literal["", "object", "change"] = "",
         id: str = Query("", max_length=400),
-    ) -> list[dict[str, Any]]:
+    ) -> list[Json]:
         """Every vote of the site with who gave it and when, newest first."""
         return [asdict(each) for each in reviews.history(site, kind, id)[:5000]]
 
     @router.post("", status_code=201)
-    def give(site: str, wish: ReviewWish, holder: Holder = needs(Role.REVIEW)) -> dict[str, Any]:
+    def give(site: str, wish: ReviewWish, holder: Holder = needs(Role.REVIEW)) -> Json:
         """Vote on an object or a change, or withdraw one's own vote; how all votes stand then. None is overwritten."""
         return asdict(reviews.give(site, wish, holder.name))
 
@@ -346,7 +347,7 @@ class Drawings:
         self._folder, self._shelf, self._events = settings.state_folder / _FOLDER, shelf, events
         self._lock = threading.Lock()
 
-    def get(self, site_id: str) -> dict[str, Any]:
+    def get(self, site_id: str) -> Json:
         """The drawings of a site with their revision. Raises Problem (404)."""
         kept = self._kept(site_id, self._shelf.open(site_id).created_utc)
         return {
@@ -355,7 +356,7 @@ class Drawings:
             "features": kept.get("features", []),
         }
 
-    def found(self, site_id: str) -> list[dict[str, Any]]:
+    def found(self, site_id: str) -> list[Json]:
         """What people marked as found. Raises Problem (404)."""
         return [
             {"id": each["id"], "lonlat": each["geometry"]["coordinates"], **each["properties"]}
@@ -363,7 +364,7 @@ class Drawings:
             if each["properties"]["purpose"] == "found" and each["geometry"]["type"] == "Point"
         ]
 
-    def put(self, site_id: str, wish: DrawingsWish, who: str) -> dict[str, Any]:
+    def put(self, site_id: str, wish: DrawingsWish, who: str) -> Json:
         """Keep a site's drawings; new ones as drawn by `who`. Raises Problem (404; 409 where somebody drew meanwhile), StoreError."""
         with self._lock:
             made_utc = self._shelf.open(site_id).created_utc
@@ -392,10 +393,10 @@ class Drawings:
         with self._lock:
             self._path(site_id).unlink(missing_ok=True)
 
-    def _kept(self, site_id: str, made_utc: str) -> dict[str, Any]:
+    def _kept(self, site_id: str, made_utc: str) -> Json:
         """What is kept for the site that was made then; nothing of a deleted one that had its name."""
         try:
-            kept: dict[str, Any] = json.loads(self._path(site_id).read_bytes())
+            kept: Json = json.loads(self._path(site_id).read_bytes())
         except (FileNotFoundError, ValueError):
             return {}
         return kept if kept.get("made_utc") in ("", made_utc) else {}  # "": before its first map
@@ -409,12 +410,12 @@ def drawing_routes(drawings: Drawings) -> APIRouter:
     router = APIRouter(prefix="/api/sites/{site}/drawings", tags=["drawings"])
 
     @router.get("", dependencies=[needs(Role.VIEW)])
-    def get(site: str) -> dict[str, Any]:
+    def get(site: str) -> Json:
         """Areas of interest, alert zones, waypoints and measures of a site."""
         return drawings.get(site)
 
     @router.put("")
-    def put(site: str, wish: DrawingsWish, holder: Holder = needs(Role.REVIEW)) -> dict[str, Any]:
+    def put(site: str, wish: DrawingsWish, holder: Holder = needs(Role.REVIEW)) -> Json:
         """Put all drawings of a site; 409 where they changed since they were read."""
         return drawings.put(site, wish, holder.name)
 

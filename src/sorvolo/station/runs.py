@@ -13,17 +13,17 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 from urllib.parse import urlsplit
 
 from fastapi import APIRouter, Query
 
 from sorvolo.child_process import python_command
 from sorvolo.missions.worker import BOXES, MOTION, TO_CHECK
+from sorvolo.paths import Json, JsonView
 from sorvolo.station.collections import SEARCH_FOLDER
 from sorvolo.station.events import EventLog, NewEvent
 from sorvolo.station.ingest import Ingest
@@ -91,9 +91,9 @@ class Run:
     who: str
     started_at: str
     ended_at: str | None = None
-    input: Mapping[str, Any] | None = None
-    options: Mapping[str, Any] | None = None
-    progress: Mapping[str, Any] | None = None
+    input: JsonView | None = None
+    options: JsonView | None = None
+    progress: JsonView | None = None
     headline: str | None = None
     exit_code: int | None = None
     error: str | None = None
@@ -113,7 +113,7 @@ class Runs(ThreadOwner):
         shelf: SiteShelf,
         events: EventLog,
         inputs: Inputs,
-        show: Callable[[str, Mapping[str, Any]], None] = lambda *_: None,
+        show: Callable[[str, JsonView], None] = lambda *_: None,
     ) -> None:
         self._show = show
         self._settings, self._state, self._shelf, self._events, self._inputs = (
@@ -424,7 +424,7 @@ class Runs(ThreadOwner):
             _kill(run.pid)
         return run
 
-    def _advanced(self, run: Run, lines: Sequence[Mapping[str, Any]]) -> tuple[Run, list[NewEvent]]:
+    def _advanced(self, run: Run, lines: Sequence[JsonView]) -> tuple[Run, list[NewEvent]]:
         """The run after lines of its journal, and the events that they become."""
         events = []
         for line in lines:
@@ -485,7 +485,7 @@ class Runs(ThreadOwner):
             )
 
 
-def run_row(run: Run) -> dict[str, Any]:
+def run_row(run: Run) -> Json:
     """A run as the API gives it: without what is of no use to a browser."""
     return {name: value for name, value in asdict(run).items() if name not in ("pid", "kill_at")}
 
@@ -498,11 +498,11 @@ def _busy(status: int, run: Run, words: str) -> Problem:
     )
 
 
-def _event(kind: str, run: Run, data: Mapping[str, Any]) -> NewEvent:
+def _event(kind: str, run: Run, data: JsonView) -> NewEvent:
     return NewEvent(kind, data, run.site, run.id)
 
 
-def _taken(run: Run, line: Mapping[str, Any]) -> tuple[Run, NewEvent]:
+def _taken(run: Run, line: JsonView) -> tuple[Run, NewEvent]:
     """The run after a line of its journal, and the event that the line becomes."""
     kind, data = str(line["type"]), line["data"]
     if kind == "run.progress":
@@ -605,7 +605,7 @@ def _has_ended(folder: Path) -> bool:
         os.close(lock)
 
 
-def _new_lines(path: Path, offset: int) -> tuple[list[dict[str, Any]], int]:
+def _new_lines(path: Path, offset: int) -> tuple[list[Json], int]:
     """The whole lines of a journal from an offset on, and where they end."""
     try:
         with path.open("rb") as file:
@@ -648,7 +648,7 @@ def run_routes(runs: Runs, inputs: Inputs, ingest: Ingest) -> APIRouter:
     router = APIRouter(tags=["runs"])
 
     @router.get("/api/inputs", dependencies=[needs(Role.VIEW)])
-    def list_inputs() -> list[dict[str, Any]]:
+    def list_inputs() -> list[Json]:
         """Videos, folders of photos, telemetry and camera files below the station's folder."""
         return [input_row(each) for each in inputs.all()]
 
@@ -656,22 +656,22 @@ def run_routes(runs: Runs, inputs: Inputs, ingest: Ingest) -> APIRouter:
     def all_runs(
         site: str = Query("", max_length=200),
         limit: int = Query(200, ge=1, le=1000),
-    ) -> list[dict[str, Any]]:
+    ) -> list[Json]:
         """The newest missions first, of all sites or of one."""
         return [run_row(each) for each in runs.all(limit, site)]
 
     @router.post("/api/runs", status_code=201)
-    def start(wish: RunWish, holder: Holder = needs(Role.OPERATE)) -> dict[str, Any]:
+    def start(wish: RunWish, holder: Holder = needs(Role.OPERATE)) -> Json:
         """Start a mission: map, compare, watch or search. 409 while another one writes into the site."""
         return run_row(runs.start(wish, holder.name))
 
     @router.get("/api/runs/{run_id}", dependencies=[needs(Role.VIEW)])
-    def one(run_id: str) -> dict[str, Any]:
+    def one(run_id: str) -> Json:
         """A mission: its state (running, finished, incomplete, failed, stopped, lost), how far it is, how it ended."""
         return run_row(runs.get(run_id))
 
     @router.post("/api/runs/{run_id}/stop", dependencies=[needs(Role.OPERATE)])
-    def stop(run_id: str) -> dict[str, Any]:
+    def stop(run_id: str) -> Json:
         """Ask it to end: a live flight is finished and kept, a recorded one is left out."""
         return run_row(runs.stop(run_id))
 

@@ -39,17 +39,6 @@ class StationLimits:
     finish_within_s: float = 3600.0  # a live flight that was stopped is finished first
     away_s: float = 900.0  # a mission waits so long for a drone or camera of which nothing comes
 
-    def __post_init__(self) -> None:
-        counts = (
-            self.most_connections,
-            self.most_live_per_address,
-            self.most_missions,
-            self.most_streams,
-            self.most_uploads,
-        )
-        if min(counts) < 1 or min(self.stop_within_s, self.finish_within_s, self.away_s) <= 0:
-            raise SettingsError("limits of a station are counts from 1 and seconds above 0")
-
 
 @dataclass(frozen=True)
 class StationSettings:

@@ -7,13 +7,13 @@ import secrets
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Header, Response
 
 from sorvolo.errors import StoreError
+from sorvolo.paths import Json
 from sorvolo.station.problems import Problem
 from sorvolo.station.reviews import Drawings, Reviews
 from sorvolo.station.runs import Runs
@@ -23,31 +23,6 @@ from sorvolo.station.tokens import Role
 from sorvolo.store.atomic import writing
 from sorvolo.store.site.catalogue_place import CATALOGUE, catalogue_file
 from sorvolo.store.site.files import COPYING, ORIGIN, BusyError, lock_folder
-
-
-@dataclass(frozen=True)
-class SiteLoss:
-    """What goes with a site: its folder with all that lies in it, and what the station keeps of it.
-
-    `flights` and `versions` are None for a site that cannot be read. `missions` are records of missions that are over,
-    with what watches found.
-    """
-
-    site: str
-    flights: int | None
-    versions: int | None
-    files: int
-    bytes: int
-    missions: int
-
-
-@dataclass(frozen=True)
-class _Known:
-    """What a site's catalogue holds, None where it cannot be read; another mark after each flight."""
-
-    flights: int | None
-    versions: int | None
-    mark: str
 
 
 class SiteDeletion:
@@ -64,18 +39,30 @@ class SiteDeletion:
         self._shelf, self._runs, self._reviews, self._drawings = shelf, runs, reviews, drawings
         self._bin = bin_folder
 
-    def loss(self, site_id: str) -> tuple[SiteLoss, str]:
-        """What would be lost, and the mark of what was counted, with which it can be deleted.
+    def loss(self, site_id: str) -> Json:
+        """What would be lost: the site's folder with all that lies in it, and what the station keeps of it.
 
+        `etag` is the mark of what was counted, with which it can be deleted; `flights` and `versions` are None for a
+        site that cannot be read; `missions` are records of missions that are over, with what watches found.
         Raises Problem: 404, 409 where it cannot be deleted now, with the reason.
         """
         with self._free(site_id) as folder:
-            known = self._known(site_id, folder)
-        sizes = [each.lstat().st_size for each in _files_below(folder)]
-        missions = len(self._runs.of_site(site_id))
-        return SiteLoss(
-            site_id, known.flights, known.versions, len(sizes), sum(sizes), missions
-        ), known.mark
+            flights, versions, mark = self._known(site_id, folder)
+        # every file of the folder, links as they are and not followed
+        sizes = [
+            Path(place, name).lstat().st_size
+            for place, _, names in os.walk(folder)
+            for name in names
+        ]
+        return {
+            "site": site_id,
+            "flights": flights,
+            "versions": versions,
+            "files": len(sizes),
+            "bytes": sum(sizes),
+            "missions": len(self._runs.of_site(site_id)),
+            "etag": f'"{mark}"',
+        }
 
     def delete(self, site_id: str, mark: str) -> None:
         """Delete the site as `loss` counted it.
@@ -84,7 +71,7 @@ class SiteDeletion:
         be moved.
         """
         with self._free(site_id) as folder:
-            if mark != self._known(site_id, folder).mark:
+            if mark != self._known(site_id, folder)[2]:
                 raise Problem(
                     412, f"the site {site_id!r} has changed since; look again at what would be lost"
                 )
@@ -154,8 +141,11 @@ class SiteDeletion:
             finally:
                 os.close(lock)
 
-    def _known(self, site_id: str, folder: Path) -> "_Known":
-        """What the site's catalogue holds. Raises Problem (410) where the folder goes meanwhile."""
+    def _known(self, site_id: str, folder: Path) -> tuple[int | None, int | None, str]:
+        """Flights and versions of the site's catalogue, None where it cannot be read; another mark after each flight.
+
+        Raises Problem (410) where the folder goes meanwhile.
+        """
         try:
             about = (folder / CATALOGUE).stat()
         except OSError as error:
@@ -168,14 +158,10 @@ class SiteDeletion:
             StoreError,
             Problem,
         ):  # damaged, or a stranger's with links in it: all the more it may go
-            return _Known(None, None, _mark(about.st_dev, about.st_ino))
-        flights, newest = (
-            {each.flight_id for each in complete},
-            max((each.id for each in complete), default=0),
-        )
-        return _Known(
-            len(flights), len(complete), _mark(about.st_dev, about.st_ino, len(flights), newest)
-        )
+            return None, None, _mark(about.st_dev, about.st_ino)
+        flights = len({each.flight_id for each in complete})
+        newest = max((each.id for each in complete), default=0)
+        return flights, len(complete), _mark(about.st_dev, about.st_ino, flights, newest)
 
 
 def site_deletion_routes(deletion: SiteDeletion) -> APIRouter:
@@ -183,12 +169,12 @@ def site_deletion_routes(deletion: SiteDeletion) -> APIRouter:
     router = APIRouter(prefix="/api/sites", tags=["sites"], dependencies=[needs(Role.OPERATE)])
 
     @router.get("/{site}/deletion")
-    def loss(site: str, response: Response) -> dict[str, Any]:
+    def loss(site: str, response: Response) -> Json:
         """What would be lost with the site; `etag`, the answer's ETag, is what its deletion needs. 409: why it cannot
         be deleted now."""
-        found, mark = deletion.loss(site)
-        response.headers["etag"] = f'"{mark}"'
-        return {**asdict(found), "etag": f'"{mark}"'}
+        found = deletion.loss(site)
+        response.headers["etag"] = found["etag"]
+        return found
 
     @router.delete("/{site}", status_code=204)
     def delete(site: str, if_match: Annotated[str, Header(max_length=100)] = "") -> Response:
@@ -203,12 +189,6 @@ def site_deletion_routes(deletion: SiteDeletion) -> APIRouter:
         return Response(status_code=204)
 
     return router
-
-
-def _files_below(folder: Path) -> Iterator[Path]:
-    """Every file of a folder, links as they are and not followed."""
-    for place, _, names in os.walk(folder):
-        yield from (Path(place) / name for name in names)
 
 
 def _mark(*parts: int) -> str:

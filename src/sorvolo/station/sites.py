@@ -8,12 +8,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sorvolo.errors import StoreError
 from sorvolo.geometry.grid import SiteGrid, TileIndex
+from sorvolo.paths import Json, JsonView
 from sorvolo.station.problems import Problem, below
 from sorvolo.station.settings import STATE_FOLDER, STREAMS_FOLDER
 from sorvolo.store.site.archive import Archive
@@ -135,7 +135,7 @@ def bounds_lonlat(tiles: Sequence[TileIndex], grid: SiteGrid) -> list[float] | N
     return [round(float(each), 8) for each in (*corners.min(axis=0), *corners.max(axis=0))]
 
 
-def site_summary(site_id: str, archive: Archive) -> dict[str, Any]:
+def site_summary(site_id: str, archive: Archive) -> Json:
     """A site as the list of sites has it."""
     site, complete, bounds = None, archive.versions(), None
     if archive.has_site:
@@ -154,7 +154,7 @@ def site_summary(site_id: str, archive: Archive) -> dict[str, Any]:
     }
 
 
-def site_detail(site_id: str, archive: Archive) -> dict[str, Any]:
+def site_detail(site_id: str, archive: Archive) -> Json:
     """A site with its versions and flights, and whether a flight of it has heights."""
     versions, comparisons = archive.versions(), archive.comparisons()
     compared = {each.flight_id for each in versions if each.id in comparisons}
@@ -180,8 +180,8 @@ def site_detail(site_id: str, archive: Archive) -> dict[str, Any]:
 
 def _flight_row(
     flight: FlightEntry, archive: Archive, versions: Sequence[VersionEntry], compared: set[str]
-) -> dict[str, Any]:
-    frames: Mapping[str, Any] = archive.report(flight.id).get("frames") or {}
+) -> Json:
+    frames: JsonView = archive.report(flight.id).get("frames") or {}
     flown = next(
         (each.flown_utc for each in reversed(versions) if each.flight_id == flight.id),
         "",
@@ -200,7 +200,7 @@ def _flight_row(
     }
 
 
-def readable(shelf: SiteShelf) -> list[dict[str, Any]]:
+def readable(shelf: SiteShelf) -> list[Json]:
     """All sites; one that cannot be read is listed with its error instead of its figures."""
     rows = []
     for site_id in sorted(shelf.folders()):

@@ -5,10 +5,9 @@ import logging
 import os
 import socket
 import time
-from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Query, WebSocket
 from starlette.websockets import WebSocketDisconnect, WebSocketState
@@ -16,6 +15,7 @@ from websockets.asyncio.server import Server, ServerConnection, unix_serve
 from websockets.exceptions import ConnectionClosed
 
 from sorvolo.errors import InputError
+from sorvolo.paths import Json, JsonView
 from sorvolo.station.events import EventLog, NewEvent
 from sorvolo.station.ingest import Announce, Ingest, LinkClosed
 from sorvolo.station.messages import REFUSED_CODE
@@ -30,12 +30,12 @@ def stream_routes(ingest: Ingest, runs: Runs) -> APIRouter:
     router = APIRouter(tags=["streams"])
 
     @router.get("/api/streams", dependencies=[needs(Role.VIEW)])
-    def streams() -> list[dict[str, Any]]:
+    def streams() -> list[Json]:
         """Every stream of which flights are kept, how many bytes those are, and what those do that are being sent."""
         return [each | {"bytes": ingest.kept_bytes(each["stream"])} for each in ingest.streams()]
 
     @router.get("/api/streams/{stream}", dependencies=[needs(Role.VIEW)])
-    def one_stream(stream: str) -> dict[str, Any]:
+    def one_stream(stream: str) -> Json:
         """One stream: its flights, and how the one goes that is being sent."""
         kept = {"viewers": ingest.viewers(stream), "bytes": ingest.kept_bytes(stream)}
         return ingest.state(stream) | kept | {"time_us": time.time_ns() // 1000}
@@ -101,7 +101,7 @@ def announcing(events: EventLog) -> Announce:
         1, thread_name_prefix="stream states"
     )  # two threads could swap coming and going
 
-    def announce(stream: str, state: Mapping[str, Any]) -> None:
+    def announce(stream: str, state: JsonView) -> None:
         event = NewEvent(
             "stream.state", {**state, "stream": stream, "flights": list(state["flights"])[-1:]}
         )

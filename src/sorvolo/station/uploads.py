@@ -9,18 +9,18 @@ import shutil
 import subprocess
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path, PureWindowsPath
-from typing import Any
 
 import anyio
 from fastapi import APIRouter, Header, Request, Response
 from starlette.requests import ClientDisconnect
 
 from sorvolo.child_process import python_command
+from sorvolo.paths import Json, JsonView
 from sorvolo.station.events import EventLog, NewEvent
 from sorvolo.station.problems import Problem, demand_room
 from sorvolo.station.security import needs
@@ -76,7 +76,7 @@ class Upload:
     who: str
     state: str = "receiving"
     why: str | None = None
-    facts: Mapping[str, Any] | None = None
+    facts: JsonView | None = None
 
     @property
     def kind(self) -> str:
@@ -345,7 +345,7 @@ def checked_apart(
     most_bytes: int,
     keep_free_bytes: int,
     run: Callable[[Sequence[str], float], bytes],
-) -> tuple[str | None, Mapping[str, Any] | None]:
+) -> tuple[str | None, JsonView | None]:
     """What is wrong with an upload (None: nothing), and what it holds, found in a process with limits of its own."""
     command = python_command(
         "sorvolo.station.check_upload",
@@ -435,7 +435,7 @@ def upload_routes(
         )
 
     @router.get("")
-    def all_uploads() -> list[dict[str, Any]]:
+    def all_uploads() -> list[Json]:
         """Every upload with how much of it is here and whether it can be used."""
         return [_row(uploads, each) for each in uploads.all()]
 
@@ -450,7 +450,7 @@ def upload_routes(
         return _answer(201, {"Location": f"/api/uploads/{made.id}", "Upload-Offset": "0"})
 
     @router.get("/{upload_id}")
-    def one(upload_id: str, answer: Response) -> dict[str, Any]:
+    def one(upload_id: str, answer: Response) -> Json:
         """An upload: its state (receiving, checking, ready, refused and why); its head says how much of it is here."""
         row = _row(uploads, uploads.get(upload_id))
         here = {"Upload-Offset": str(row["offset"]), "Upload-Length": str(row["bytes"])}
@@ -488,5 +488,5 @@ def _answer(status: int, headers: dict[str, str]) -> Response:
     return Response(status_code=status, headers={"Tus-Resumable": _VERSION, **headers})
 
 
-def _row(uploads: Uploads, upload: Upload) -> dict[str, Any]:
+def _row(uploads: Uploads, upload: Upload) -> Json:
     return {**asdict(upload), "kind": upload.kind, "offset": uploads.offset(upload)}

@@ -20,6 +20,7 @@ from sorvolo.lab.datasets.parsed import (
     pictures_below,
     read_text,
 )
+from sorvolo.paths import Json, JsonView
 
 FORM = "COCO"
 _VIDEO_FIELDS = ("video_id", "video", "flight", "sequence", "seq_id", "clip")
@@ -131,7 +132,7 @@ def _is_cut(text: str) -> bool:
     return not text.rstrip().endswith("}")
 
 
-def _loaded(path: Path) -> dict[str, Any]:
+def _loaded(path: Path) -> Json:
     text = read_text(path)
     try:
         whole = json.loads(text)
@@ -153,7 +154,7 @@ def _loaded(path: Path) -> dict[str, Any]:
     return whole
 
 
-def _rows(whole: Mapping[str, Any], key: str, path: Path) -> list[dict[str, Any]]:
+def _rows(whole: JsonView, key: str, path: Path) -> list[Json]:
     rows = whole[key]
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
         raise InputError(f"{path}: COCO's {key} must be a list of objects")
@@ -168,7 +169,7 @@ def _rows(whole: Mapping[str, Any], key: str, path: Path) -> list[dict[str, Any]
     return rows
 
 
-def _box(row: Mapping[str, Any], categories: Mapping[Any, str]) -> ParsedBox | None:
+def _box(row: JsonView, categories: Mapping[Any, str]) -> ParsedBox | None:
     """The annotation's box, else the one around its polygons; None when it has none."""
     edges = _edges(row)
     if edges is None:
@@ -178,7 +179,7 @@ def _box(row: Mapping[str, Any], categories: Mapping[Any, str]) -> ParsedBox | N
     return ParsedBox(categories.get(category, str(category)), *edges, is_ignored)
 
 
-def _edges(row: Mapping[str, Any]) -> tuple[float, float, float, float] | None:
+def _edges(row: JsonView) -> tuple[float, float, float, float] | None:
     """Left, top, right, bottom; None without a box and without polygons."""
     numbers = _finite(row.get("bbox"))
     if len(numbers) == 4:
@@ -212,7 +213,7 @@ def _found(
     return found
 
 
-def _video(row: Mapping[str, Any]) -> str:
+def _video(row: JsonView) -> str:
     """The name of the video that the picture is of; empty where the file names none."""
     return next(
         (str(row[field]) for field in _VIDEO_FIELDS if row.get(field) not in (None, "")), ""
@@ -252,7 +253,7 @@ def _by_name(folder: Path) -> dict[str, list[Path]]:
     return found
 
 
-def _no_picture(path: Path, images: Mapping[Any, Mapping[str, Any]]) -> InputError:
+def _no_picture(path: Path, images: Mapping[Any, JsonView]) -> InputError:
     names = [str(row.get("file_name", "")) for row in images.values()]
     for folder in _folders(path):
         videos = [

@@ -8,7 +8,6 @@ from typing import TypeVar
 import cv2
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, Mask, PointsM, TimesNs, frozen
@@ -277,7 +276,7 @@ def match_events(
     )
 
 
-def _chosen(events: Sequence[_Event], which: NDArray[np.bool_]) -> tuple[_Event, ...]:
+def _chosen(events: Sequence[_Event], which: Mask) -> tuple[_Event, ...]:
     return tuple(each for each, is_chosen in zip(events, which, strict=True) if is_chosen)
 
 

@@ -5,7 +5,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import Matrix3, PointsM, floats
@@ -32,7 +31,7 @@ from sorvolo.lab.evaluation.frame_rows import (
 )
 from sorvolo.lab.evaluation.mask_folders import MaskScores, compare_mask_folders, has_masks
 from sorvolo.mosaic.paired_flights import PairedFlights
-from sorvolo.paths import AnyPath
+from sorvolo.paths import AnyPath, Json, JsonView
 from sorvolo.store.exports.plain import features_path, plain_json
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.findings import ChangeKind
@@ -123,7 +122,7 @@ def _masks_alone(name: str, found: Path, true: Path, least_px: int) -> MeasuredC
     )
 
 
-def as_json(measured: Sequence[MeasuredChanges]) -> list[dict[str, Any]]:
+def as_json(measured: Sequence[MeasuredChanges]) -> list[Json]:
     """The measures with all their rates, as JSON can hold them."""
     written = []
     for each in measured:
@@ -159,7 +158,7 @@ def _rates(counts: Counts) -> dict[str, float | int | None]:
     return {name: plain_json(getattr(counts, name)) for name in names}
 
 
-def _lists(match: EventMatch) -> dict[str, Any]:
+def _lists(match: EventMatch) -> Json:
     return {
         "found": [
             {
@@ -333,14 +332,14 @@ def _class_counts(match: EventMatch, found: Path, true: Path) -> ClassCounts | N
     return ClassCounts(**counts)
 
 
-def _classes_of(feature: Mapping[str, Any]) -> tuple[str, str]:
+def _classes_of(feature: JsonView) -> tuple[str, str]:
     """What was there, and what is; of what moves only what it is."""
     properties = feature["properties"]
     before = "" if properties["kind"] == ChangeKind.MOVING else properties.get("class_before") or ""
     return before, properties.get("class_after") or ""
 
 
-def _event_name(properties: Mapping[str, Any]) -> str:
+def _event_name(properties: JsonView) -> str:
     return f"{properties['number']} {properties['class_before'] or properties['class_after']}"
 
 
@@ -385,7 +384,7 @@ def _known(stated: float | None) -> float:
     return math.nan if stated is None else float(stated)
 
 
-def _ring(feature: Mapping[str, Any], described: Site, path: Path) -> PointsM:
+def _ring(feature: JsonView, described: Site, path: Path) -> PointsM:
     corners = feature["geometry"]["coordinates"][0][:-1]
     ring_m = described.frame.ground_from_lonlat(corners)
     if len(ring_m) < 3 or not is_on_ground(ring_m):

@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from itertools import chain, pairwise
-from typing import Any
 
 import numpy as np
 from pycocotools.coco import COCO
@@ -23,6 +22,7 @@ from sorvolo.geometry.arrays import Counts as CountTable
 from sorvolo.geometry.box_overlap import iou_matrix
 from sorvolo.geometry.summary import CalibrationBin, calibration_bins
 from sorvolo.lab.evaluation.change_metrics import Counts
+from sorvolo.paths import Json
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import Detections
 
@@ -152,7 +152,7 @@ def match_pictures(
             f"{labelled.name}: {len(labelled)} pictures, but detections in {len(found)}"
         )
     # COCO's records of the labels, and of each label that counts its picture and box by id
-    annotations: list[dict[str, Any]] = []
+    annotations: list[Json] = []
     rows: dict[int, tuple[int, BoxesPx]] = {}
     category = {labelled.classes.index(name): k for k, name in enumerate(judged)}
     for index, picture in enumerate(labelled.pictures):
@@ -349,8 +349,8 @@ def _wrong_detection(
     return Mistake("false alarm", picture, _tuple(box), match.label, score, overlap=near), None
 
 
-def _candidates(found: Sequence[Detections], judged: Sequence[str]) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = []
+def _candidates(found: Sequence[Detections], judged: Sequence[str]) -> list[Json]:
+    rows: list[Json] = []
     for index, detections in enumerate(found):
         for box, score, name in zip(
             detections.boxes_px, detections.scores.tolist(), detections.names
@@ -362,7 +362,7 @@ def _candidates(found: Sequence[Detections], judged: Sequence[str]) -> list[dict
     return rows
 
 
-def _annotation(row_id: int, picture: int, category: int, box: BoxesPx) -> dict[str, Any]:
+def _annotation(row_id: int, picture: int, category: int, box: BoxesPx) -> Json:
     left, top, right, bottom = (float(edge) for edge in box)
     return {
         "id": row_id,
@@ -374,7 +374,7 @@ def _annotation(row_id: int, picture: int, category: int, box: BoxesPx) -> dict[
     }
 
 
-def _image(index: int, picture: LabelledPicture) -> dict[str, Any]:
+def _image(index: int, picture: LabelledPicture) -> Json:
     return {
         "id": index,
         "width": picture.width_px,
@@ -383,7 +383,7 @@ def _image(index: int, picture: LabelledPicture) -> dict[str, Any]:
     }
 
 
-def _indexed(dataset: dict[str, Any]) -> COCO:
+def _indexed(dataset: Json) -> COCO:
     records = COCO()
     records.dataset = dataset
     records.createIndex()
@@ -404,7 +404,7 @@ def _numbers(precision: Floats) -> CocoNumbers:
 
 def _class_match(
     name: str,
-    rows: Sequence[dict[str, Any] | None],
+    rows: Sequence[Json | None],
     judge: COCOeval,
     truth_rows: Mapping[int, tuple[int, BoxesPx]],
 ) -> ClassMatch:
@@ -446,7 +446,7 @@ def _class_match(
     )
 
 
-def _by_iou(rows: Sequence[dict[str, Any]], key: str) -> Floats:
+def _by_iou(rows: Sequence[Json], key: str) -> Floats:
     """(10, D) one of COCO's results for the detections of all pictures, at each of IOUS."""
     return np.concatenate(
         [np.zeros((len(IOUS), 0)), *(np.reshape(row[key], (len(IOUS), -1)) for row in rows)], axis=1

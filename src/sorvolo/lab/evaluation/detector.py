@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, Unpack
+from typing import Literal, Unpack
 
 import cv2
 import numpy as np
@@ -28,7 +28,7 @@ from sorvolo.lab.evaluation.detection_scores import (
     score_set,
 )
 from sorvolo.lab.evaluation.detector_page import detector_page
-from sorvolo.paths import AnyPath, Inputs, listed
+from sorvolo.paths import AnyPath, Inputs, Json, JsonView, listed
 from sorvolo.store.atomic import atomic_write_bytes, make_folder
 from sorvolo.store.exports.plain import json_bytes
 from sorvolo.survey.flight import Notice
@@ -139,7 +139,7 @@ def mistake_picture(
     return np.asarray(crop, np.uint8)
 
 
-def _detections(row: Mapping[str, Any], classes: tuple[str, ...]) -> Detections:
+def _detections(row: JsonView, classes: tuple[str, ...]) -> Detections:
     boxes = np.array(row["boxes_px"], np.float32).reshape(-1, 4)
     return Detections(
         boxes, np.array(row["scores"], float), np.array(row["labels"], np.int64), classes
@@ -284,7 +284,7 @@ def _seen_by_all(
 
 
 def write_evaluation(
-    evaluation: DetectorEvaluation, folder: AnyPath, description: Mapping[str, Any]
+    evaluation: DetectorEvaluation, folder: AnyPath, description: JsonView
 ) -> None:
     """Write detector.html, detector.json and detections.json; `description` is what was measured on what.
 
@@ -304,9 +304,7 @@ def write_evaluation(
     atomic_write_bytes(folder / PAGE, page.encode())
 
 
-def evaluation_numbers(
-    evaluation: DetectorEvaluation, description: Mapping[str, Any]
-) -> dict[str, Any]:
+def evaluation_numbers(evaluation: DetectorEvaluation, description: JsonView) -> Json:
     """The content of detector.json: all numbers, without the list of every mistake."""
     return {
         "made_by": "sorvolo evaluate detector",

@@ -8,6 +8,7 @@ import numpy as np
 from markupsafe import Markup
 
 from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.paths import Json, JsonView
 from sorvolo.store.pages.plots import (
     SIDE_PX,
     Line,
@@ -57,7 +58,7 @@ def detector_page(
     sets: Sequence[Any],
     comparisons: Sequence[Any],
     worst: Mapping[str, Sequence[tuple[Any, str, ImageRGB]]],
-    description: Mapping[str, Any],
+    description: JsonView,
 ) -> str:
     """detector.html: `sets` and `comparisons` have the fields of detection.scores.SetScores and SetComparison.
 
@@ -104,7 +105,7 @@ def detector_page(
     return str(page)
 
 
-def _set(scores: Any, worst: Sequence[tuple[Any, str, ImageRGB]]) -> dict[str, Any]:
+def _set(scores: Any, worst: Sequence[tuple[Any, str, ImageRGB]]) -> Json:
     labels = [row.label for row in scores.classes]
     tables = []
     for found_by_label, unit, words in (
@@ -188,7 +189,7 @@ def _class_words(classes: Sequence[Any]) -> str:
     )
 
 
-def _comparison(each: Any) -> dict[str, Any]:
+def _comparison(each: Any) -> Json:
     first = each.arms[0]
     names = [name for name, value in first.mean.items() if math.isfinite(value)]
     labels = ", ".join(f"{count} {name}" for name, count in each.labels.items())
@@ -216,7 +217,7 @@ def _comparison_row(each: Any, name: str) -> list[Any]:
     return row
 
 
-def _curves(scores: Any) -> dict[str, Any] | None:
+def _curves(scores: Any) -> Json | None:
     shown = [row for row in scores.classes if len(row.curve) and row.labels]
     if not shown:
         return None
@@ -234,7 +235,7 @@ def _curves(scores: Any) -> dict[str, Any] | None:
     }
 
 
-def _by_score(scores: Any) -> dict[str, Any] | None:
+def _by_score(scores: Any) -> Json | None:
     """Which share of reports of each score is right: drawn, and as rows."""
     shown = [(row, each) for row in scores.classes if row.labels for each in row.by_score]
     if not shown:

@@ -1,14 +1,13 @@
 """The frames of flights, as a map's or a truth's frames.geojson has them, in the site's metres."""
 
 import json
-from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 from sorvolo.errors import InputError
 from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.mosaic.paired_flights import PairedFlights, true_names
+from sorvolo.paths import Json, JsonView
 from sorvolo.store.site.catalogue_place import is_site
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import FrameRow
@@ -61,7 +60,7 @@ def truth_file(truth: Path) -> Path:
     )
 
 
-def read_features(path: Path) -> list[dict[str, Any]]:
+def read_features(path: Path) -> list[Json]:
     """A GeoJSON file's features; raises InputError for one that cannot be read."""
     try:
         features = json.loads(path.read_text(encoding="utf-8"))["features"]
@@ -72,7 +71,7 @@ def read_features(path: Path) -> list[dict[str, Any]]:
     return features
 
 
-def frame_row(feature: Mapping[str, Any], frame: LocalFrame, path: Path) -> FrameRow:
+def frame_row(feature: JsonView, frame: LocalFrame, path: Path) -> FrameRow:
     """One feature as a row; raises InputError, naming `path`, where it is not as docs/formats.md has it."""
     try:
         properties, geometry = feature["properties"], feature["geometry"]
@@ -110,6 +109,6 @@ def time_ns_of(text: str) -> int:
     return (since.days * 86400 + since.seconds) * 10**9 + since.microseconds * 1000
 
 
-def _number(properties: Mapping[str, Any], name: str) -> float:
+def _number(properties: JsonView, name: str) -> float:
     value = properties.get(name)
     return float("nan") if value is None else float(value)

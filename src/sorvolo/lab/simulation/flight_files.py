@@ -27,6 +27,7 @@ from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import ImageGray, ImageRGB
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.units import KNOT_M_S
+from sorvolo.paths import Json, JsonView
 from sorvolo.store.atomic import atomic_path, atomic_write_bytes, writing
 from sorvolo.store.rasters.geotiff import open_raster
 from sorvolo.survey.flight import Frame, Telemetry
@@ -505,7 +506,7 @@ _MADE_BY = "sorvolo simulate"
 
 
 @contextmanager
-def simulation_folder(folder: Path, mark: str, description: Mapping[str, Any]) -> Iterator[Path]:
+def simulation_folder(folder: Path, mark: str, description: JsonView) -> Iterator[Path]:
     """A hidden folder beside `folder`, holding the file `mark` with the description; renamed when the block ends well.
 
     Raises SettingsError for a folder that holds anything but an earlier simulation, StoreError for a full disk.
@@ -533,7 +534,7 @@ def simulation_folder(folder: Path, mark: str, description: Mapping[str, Any]) -
         shutil.rmtree(old, ignore_errors=True)
 
 
-def simulation_description(settings: Mapping[str, Any]) -> dict[str, Any]:
+def simulation_description(settings: JsonView) -> Json:
     """What made the simulation: settings, seed and versions, by which it can be made again."""
     return {
         "made_by": _MADE_BY,

@@ -7,6 +7,7 @@ from typing import TypeAlias
 
 import cv2
 import numpy as np
+from numpy.random import Generator
 
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, ImageRGB
@@ -69,7 +70,7 @@ def orthophoto_ground(rgb: ImageRGB, m_per_px: float) -> PaintedGround:
 
 
 def paint_ground(
-    kind: GroundKind, area: GroundArea, m_per_px: float, rng: np.random.Generator
+    kind: GroundKind, area: GroundArea, m_per_px: float, rng: Generator
 ) -> PaintedGround:
     """Paint `area` at `m_per_px`; the same `rng` state gives the same ground."""
     canvas = GroundCanvas.over(area, m_per_px, rng)
@@ -294,7 +295,7 @@ def _paint_blocks(
         canvas.lay(rim, (168, 164, 156), 0.06, 0.04 * field(3, 0.8))
 
 
-def _city_blocks(area: GroundArea, rng: np.random.Generator) -> list[_Block]:
+def _city_blocks(area: GroundArea, rng: Generator) -> list[_Block]:
     """West, south, east, north of the blocks that roads leave between them."""
 
     def cuts(low: float, high: float) -> list[tuple[float, float]]:

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from numpy.random import Generator
 
 from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB
 from sorvolo.search.drawing.noise import FieldF32, fractal, layer
@@ -82,7 +83,7 @@ class GroundCanvas:
     """The ground while it is painted: a coarse mix of materials first, then fine strokes on the full raster."""
 
     def __init__(
-        self, area: GroundArea, m_per_px: float, size_px: tuple[int, int], rng: np.random.Generator
+        self, area: GroundArea, m_per_px: float, size_px: tuple[int, int], rng: Generator
     ) -> None:
         self.area, self.m_per_px, self.size_px, self.rng = area, m_per_px, size_px, rng
         self.coarse_shape = (-(-size_px[1] // _COARSE), -(-size_px[0] // _COARSE))
@@ -98,7 +99,7 @@ class GroundCanvas:
         self.north = area.north_m - (rows + 0.5) * step
 
     @classmethod
-    def over(cls, area: GroundArea, m_per_px: float, rng: np.random.Generator) -> "GroundCanvas":
+    def over(cls, area: GroundArea, m_per_px: float, rng: Generator) -> "GroundCanvas":
         """An empty canvas over this area."""
         width_m, height_m = area.size_m
         return cls(

@@ -4,12 +4,12 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.random import Generator
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
 from sorvolo.errors import SettingsError
-from sorvolo.geometry.arrays import Floats, PointsM, TimesNs
+from sorvolo.geometry.arrays import Floats, Mask, PointsM, TimesNs
 from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.geometry.pose import (
     Pose,
@@ -98,7 +98,7 @@ def planned_waypoints(settings: PathSettings) -> PointsM:
     return local[:, :1] * forward + local[:, 1:] * right
 
 
-def fly(path: PathSettings, motion: MotionSettings, rng: np.random.Generator) -> FlownPath:
+def fly(path: PathSettings, motion: MotionSettings, rng: Generator) -> FlownPath:
     """Fly the plan at constant speed, corners rounded, with smooth random departures from it.
 
     A rotor drone's speed is that over the ground, a fixed wing's that through the air: wind makes it faster or slower
@@ -223,7 +223,7 @@ class Observation:
 
     telemetry: Telemetry
     true_s: Floats
-    is_sound: NDArray[np.bool_]
+    is_sound: Mask
     corrupt: frozenset[int]
 
     def fix_at(self, time_s: Floats) -> tuple[Floats, Floats]:
@@ -246,7 +246,7 @@ def observe(
     started_ns: int,
     settings: SensorSettings,
     format_name: str,
-    rng: np.random.Generator,
+    rng: Generator,
     at_s: Floats | None = None,
 ) -> Observation:
     """Sample the flown path as an instrument of this format does.
@@ -333,7 +333,7 @@ def _ns(time_s: Floats) -> TimesNs:
     return np.round(time_s * 1e9).astype(np.int64)
 
 
-def _motion(path: FlownPath, time_s: Floats, rng: np.random.Generator) -> dict[str, Floats]:
+def _motion(path: FlownPath, time_s: Floats, rng: Generator) -> dict[str, Floats]:
     velocity = path.velocity_m_s(time_s)[:, :2] + rng.standard_normal((len(time_s), 2)) * 0.1
     return {
         "course_deg": np.degrees(np.arctan2(velocity[:, 0], velocity[:, 1])) % 360.0,

@@ -5,10 +5,10 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
+from numpy.random import Generator
 
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, ImageRGB
@@ -33,7 +33,7 @@ from sorvolo.lab.simulation.rendering import render, render_labels
 from sorvolo.lab.simulation.settings import LaterSettings, SimulationSettings, WeatherSettings
 from sorvolo.lab.simulation.truth import box_rows, coco_categories
 from sorvolo.lab.simulation.world import Day, World, build_day, is_free, scenery
-from sorvolo.paths import AnyPath
+from sorvolo.paths import AnyPath, Json
 from sorvolo.search.drawing.noise import layer
 from sorvolo.search.drawing.objects import (
     GROUND_LEVEL,
@@ -51,7 +51,7 @@ from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.images import jpeg_from_image
 
 
-def photographed(image: ImageRGB, gains: Floats, rng: np.random.Generator) -> ImageRGB:
+def photographed(image: ImageRGB, gains: Floats, rng: Generator) -> ImageRGB:
     """The rendered picture as a camera records it; `gains` (3,) is the light's colour and strength.
 
     In the dark the camera turns its own gain up, and its noise with it.
@@ -78,7 +78,7 @@ def photographed(image: ImageRGB, gains: Floats, rng: np.random.Generator) -> Im
     return recompressed(np.round(bent).astype(np.uint8), rng)
 
 
-def recompressed(image: ImageRGB, rng: np.random.Generator) -> ImageRGB:
+def recompressed(image: ImageRGB, rng: Generator) -> ImageRGB:
     """The picture after lossy compression, colour at half its resolution as in videos."""
     quality = int(rng.integers(45, 96))
     _, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
@@ -86,7 +86,7 @@ def recompressed(image: ImageRGB, rng: np.random.Generator) -> ImageRGB:
 
 
 def _blurred(
-    image: np.ndarray[tuple[int, ...], np.dtype[np.float32]], rng: np.random.Generator
+    image: np.ndarray[tuple[int, ...], np.dtype[np.float32]], rng: Generator
 ) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
     """Out of focus a little, and in a third of the pictures moved during the exposure."""
     sigma_px = rng.uniform(0.0, 1.1)
@@ -99,7 +99,7 @@ def _blurred(
     return image
 
 
-def warm_day(day: Day, bare: GroundRaster, rng: np.random.Generator) -> Day:
+def warm_day(day: Day, bare: GroundRaster, rng: Generator) -> Day:
     """The day with warmth for colour, the same in its three channels; `bare` is its ground without shadows.
 
     By day the sun's shadows are cool; by night they are gone. Two cars in three have a warm engine.
@@ -115,7 +115,7 @@ def warm_day(day: Day, bare: GroundRaster, rng: np.random.Generator) -> Day:
     return replace(day, ground=ground, bodies=bodies)
 
 
-def heat_picture(image: ImageRGB, rng: np.random.Generator) -> ImageRGB:
+def heat_picture(image: ImageRGB, rng: Generator) -> ImageRGB:
     """The rendered warmth as a thermal camera shows it: soft, noisy, striped, stretched to its own range."""
     warmth = image[..., 0].astype(np.float32)
     warmth = np.asarray(cv2.GaussianBlur(warmth, (0, 0), rng.uniform(0.5, 1.3)), np.float32)
@@ -196,7 +196,7 @@ class SimulatedPicture:
     m_per_px: float
     ground: str
     is_thermal: bool
-    boxes: tuple[dict[str, Any], ...]
+    boxes: tuple[Json, ...]
 
 
 def simulate_picture(settings: PictureSettings, index: int) -> SimulatedPicture:
@@ -238,14 +238,12 @@ def simulate_picture(settings: PictureSettings, index: int) -> SimulatedPicture:
     return SimulatedPicture(index, image, camera, pose, m_per_px, ground, is_thermal, boxes)
 
 
-def _judged(row: dict[str, Any]) -> dict[str, Any]:
+def _judged(row: Json) -> Json:
     is_seen = max(row["bbox"][2:]) >= SMALLEST_PX and row["visibility"] >= LEAST_VISIBLE
     return row | {"iscrowd": 0 if is_seen else 1}
 
 
-def _new_shot(
-    settings: PictureSettings, is_thermal: bool, rng: np.random.Generator
-) -> tuple[Camera, Pose]:
+def _new_shot(settings: PictureSettings, is_thermal: bool, rng: Generator) -> tuple[Camera, Pose]:
     """A camera without distortion somewhere above the site's origin."""
     for _ in range(2000):
         width_px, height_px = (
@@ -281,7 +279,7 @@ def _targets(
     layout: GroundLayout,
     camera: Camera,
     pose: Pose,
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> tuple[Thing, ...]:
     """People, cars and small objects in sight, as many as a lonely field, a street or a crowd has."""
     ground_m2 = polygon_area([footprint(camera, pose)])
@@ -317,7 +315,7 @@ def _targets(
     return tuple(placed)
 
 
-def _person(rng: np.random.Generator) -> str:
+def _person(rng: Generator) -> str:
     """A kind of person: mostly one drawn limb by limb, else the plain figures of simulated flights."""
     if rng.uniform() < 0.25:
         return LYING if rng.uniform() < 0.2 else str(ThingLabel.PERSON)
@@ -330,7 +328,7 @@ def _place(
     layout: GroundLayout,
     camera: Camera,
     pose: Pose,
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> tuple[float, float, float]:
     """East, north and yaw of a likely place: anywhere in the picture, on a parking lot, or beside another thing."""
     if label is ThingLabel.CAR and len(layout.parkings) and rng.uniform() < 0.6:
@@ -375,8 +373,8 @@ def simulate_pictures(folder: AnyPath, settings: PictureSettings) -> Iterator[Pi
     folder = Path(folder)
     started = time.monotonic()
     info = simulation_description(asdict(settings))
-    images: list[dict[str, Any]] = []
-    annotations: list[dict[str, Any]] = []
+    images: list[Json] = []
+    annotations: list[Json] = []
     counted = 0
     with simulation_folder(folder, PICTURES_MARK, {"info": info}) as partial:
         with writing(folder):

@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
 
 import cv2
 import numpy as np
@@ -18,6 +17,7 @@ from sorvolo.lab.simulation.flight import SimulatedFlight, has_changed
 from sorvolo.lab.simulation.ground_painting import GroundRaster
 from sorvolo.lab.simulation.rendering import Labels, render_labels
 from sorvolo.lab.simulation.world import World
+from sorvolo.paths import Json
 from sorvolo.search.drawing.objects import Body, Thing, ThingLabel
 
 CATEGORIES = (ThingLabel.PERSON, ThingLabel.CAR, ThingLabel.SMALL)
@@ -29,7 +29,7 @@ DEGREE_DECIMALS = 11
 _FEWEST_PX = 4  # less of an object is no answer to anything
 
 
-def frame_features(flight: SimulatedFlight) -> list[dict[str, Any]]:
+def frame_features(flight: SimulatedFlight) -> list[Json]:
     """One GeoJSON feature per frame: its image's corners on the ground and its camera's pose."""
     observation = flight.observation()
     if observation is None:
@@ -75,7 +75,7 @@ def _outline_m(flight: SimulatedFlight, pose: Pose) -> PointsM:
     return flight.world.relief.met(pose.translation_m, rays)[:, :2]
 
 
-def object_features(world: World, site: LocalFrame) -> list[dict[str, Any]]:
+def object_features(world: World, site: LocalFrame) -> list[Json]:
     """One GeoJSON feature per object and place: what moved between flights has a feature for each place."""
     features = []
     first_seen: dict[tuple[object, ...], tuple[Thing, list[int]]] = {}
@@ -106,7 +106,7 @@ def object_features(world: World, site: LocalFrame) -> list[dict[str, Any]]:
     return features
 
 
-def feature_collection(features: Iterable[dict[str, Any]], site: LocalFrame) -> dict[str, Any]:
+def feature_collection(features: Iterable[Json], site: LocalFrame) -> Json:
     """A GeoJSON collection with the site's origin as foreign member."""
     origin = site.origin
     return {
@@ -120,11 +120,11 @@ def feature_collection(features: Iterable[dict[str, Any]], site: LocalFrame) -> 
     }
 
 
-def coco_boxes(flight: SimulatedFlight, frames: Iterable[int]) -> dict[str, Any]:
+def coco_boxes(flight: SimulatedFlight, frames: Iterable[int]) -> Json:
     """COCO annotations of these frames. A box holds the pixels that show the object; `visibility` is the
     share of the object that nothing hides within the picture, `area` its visible pixels."""
-    images: list[dict[str, Any]] = []
-    annotations: list[dict[str, Any]] = []
+    images: list[Json] = []
+    annotations: list[Json] = []
     for index in frames:
         images.append(
             {
@@ -153,16 +153,16 @@ def coco_boxes(flight: SimulatedFlight, frames: Iterable[int]) -> dict[str, Any]
     }
 
 
-def coco_categories() -> list[dict[str, Any]]:
+def coco_categories() -> list[Json]:
     """COCO's rows of the classes."""
     return [{"id": i, "name": str(label)} for i, label in enumerate(CATEGORIES, start=1)]
 
 
 def box_rows(
     things: Iterable[Thing], labels: Labels, totals: Mapping[int, int], image_id: int, first_id: int
-) -> list[dict[str, Any]]:
+) -> list[Json]:
     """COCO's annotations of one picture whose `labels` and `totals` are those of `render_labels`."""
-    rows: list[dict[str, Any]] = []
+    rows: list[Json] = []
     targets = {thing.id: thing for thing in things if thing.label.is_target}
     for thing_id in np.unique(labels):
         thing = targets.get(int(thing_id))
@@ -248,7 +248,7 @@ def _degrees_or_null(value: float) -> float | None:
     return round(float(value), DEGREE_DECIMALS) if np.isfinite(value) else None
 
 
-def polygon_geometry(outline_m: PointsM, site: LocalFrame) -> dict[str, Any] | None:
+def polygon_geometry(outline_m: PointsM, site: LocalFrame) -> Json | None:
     """A ring of ground points, (N, 2), as a GeoJSON polygon in WGS84; None where a point is not known."""
     if not np.isfinite(outline_m).all():
         return None
@@ -347,14 +347,14 @@ def _departure(flight: SimulatedFlight, thing: Thing, movers: Sequence[Thing]) -
     return TruthEvent("disappeared", thing, None, thing.footprint_m(), views, places)
 
 
-def event_features(flight: SimulatedFlight) -> list[dict[str, Any]]:
+def event_features(flight: SimulatedFlight) -> list[Json]:
     """`true_events` as GeoJSON features, numbered from 1."""
     return [
         _feature(number, event, flight) for number, event in enumerate(true_events(flight), start=1)
     ]
 
 
-def _feature(number: int, event: TruthEvent, flight: SimulatedFlight) -> dict[str, Any]:
+def _feature(number: int, event: TruthEvent, flight: SimulatedFlight) -> Json:
     thing = event.after or event.before
     assert thing is not None
     times_ns = flight.frame_times_ns

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from numpy.random import Generator
 
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, Floats32, PointsM, Vector3
@@ -106,9 +107,7 @@ class Relief:
     middle_m: float = 0.0
 
     @classmethod
-    def hills(
-        cls, relief_m: float, flight_m: float, area: GroundArea, rng: np.random.Generator
-    ) -> "Relief":
+    def hills(cls, relief_m: float, flight_m: float, area: GroundArea, rng: Generator) -> "Relief":
         """Hills of `relief_m` from the lowest to the highest ground of an area, half of it above height 0."""
         if not relief_m:
             return LEVEL
@@ -355,7 +354,7 @@ def build_day(world: World, settings: SimulationSettings, flight: int, m_per_px:
     return Day(ground, things, bodies, shadows, light, gains, cloud_shade, world.relief)
 
 
-def _gains(weather: WeatherSettings, rng: np.random.Generator) -> Floats:
+def _gains(weather: WeatherSettings, rng: Generator) -> Floats:
     """The camera's gains, (3,), on a day."""
     is_other = weather.has_other_light
     warmth = rng.uniform(-0.06, 0.06) if is_other else 0.0
@@ -363,7 +362,7 @@ def _gains(weather: WeatherSettings, rng: np.random.Generator) -> Floats:
     return np.asarray(gains * weather.brightness)
 
 
-def scenery(ground: str, layout: GroundLayout, rng: np.random.Generator) -> tuple[Thing, ...]:
+def scenery(ground: str, layout: GroundLayout, rng: Generator) -> tuple[Thing, ...]:
     """The houses, trees and bushes of a layout, ids from 1; towns have flat roofs."""
     roof = "flat roof" if ground == GroundKind.URBAN else "gable roof"
     things: list[Thing] = []
@@ -441,7 +440,7 @@ def _place(
     layout: GroundLayout,
     waypoints_m: Floats,
     settings: SimulationSettings,
-    rng: np.random.Generator,
+    rng: Generator,
 ) -> Thing:
     """A new target near the flown path, free of what stands there already."""
     kind = (
@@ -476,7 +475,7 @@ def _place(
     return thing  # on a crowded site the last try stands: two boxes may touch
 
 
-def _set_off(thing: Thing, others: list[Thing], rng: np.random.Generator) -> Thing:
+def _set_off(thing: Thing, others: list[Thing], rng: Generator) -> Thing:
     """The thing on its way: a person walks anywhere, a car drives straight on, where no scenery is in the way."""
     is_car = thing.label is ThingLabel.CAR
     speed = rng.uniform(2.0, 4.0) if is_car else rng.uniform(0.7, 1.5)
@@ -504,7 +503,7 @@ def _distance_to_path(point_m: Floats, waypoints_m: Floats) -> float:
     return float(np.hypot(*(start + share[:, None] * along - point_m).T).min())
 
 
-def _blown(ground: GroundRaster, wind_m: float, rng: np.random.Generator) -> GroundRaster:
+def _blown(ground: GroundRaster, wind_m: float, rng: Generator) -> GroundRaster:
     """The ground after its plants have moved by about `wind_m`, each tuft its own way."""
     if not ground.vegetation.any():
         return ground
@@ -538,7 +537,7 @@ def _blown(ground: GroundRaster, wind_m: float, rng: np.random.Generator) -> Gro
     return replace(ground, rgb=moved)
 
 
-def _snowed_in(ground: GroundRaster, share: float, rng: np.random.Generator) -> GroundRaster:
+def _snowed_in(ground: GroundRaster, share: float, rng: Generator) -> GroundRaster:
     """The ground with snow on about this share of it, almost without texture; what stands on it stays bare."""
     shape = ground.rgb.shape[:2]
     drifts = fractal(rng, shape, ground.m_per_px[0], (0.5, 2.0, 6.0), (0.4, 0.8, 1.0))

@@ -15,12 +15,12 @@ from sorvolo import kernels
 from sorvolo.change.compare import Comparison, checked_pair
 from sorvolo.change.robust import as_bgr
 from sorvolo.errors import SettingsError
-from sorvolo.geometry.arrays import Boxes, Floats, ImageGray, Mask
+from sorvolo.geometry.arrays import Boxes, Bytes, Floats, ImageGray, Mask
 from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 
 _TABLE_LEVEL, _TABLE_SHARE = 40, 0.3  # T_gray and T_H of Table 4.2
 
-Picture = NDArray[np.uint8]
+Picture = Bytes
 """(height, width, 3) uint8, red green blue."""
 
 
@@ -103,8 +103,8 @@ class ThesisReference:
 
     picture: Picture
     known: ImageGray | None
-    tables: NDArray[np.uint8]
-    planes: NDArray[np.uint8]
+    tables: Bytes
+    planes: Bytes
     gray: ImageGray
     averaging_px: tuple[int, int]
 
@@ -123,7 +123,7 @@ class ThesisSteps:
     highlighted: Picture  # N applied to the query
     boxes: Boxes
 
-    def pictures(self) -> dict[str, NDArray[np.uint8]]:
+    def pictures(self) -> dict[str, Bytes]:
         """The pictures by name, such as "a-reference-equalised", in the figure's order; RGB or gray."""
         shown = [each.name for each in fields(self) if each.name != "boxes"]
         return {
@@ -307,8 +307,6 @@ class ThesisComparison:
         """The changes between two aligned RGB pictures (h, w, 3)."""
         return compare_thesis(reference, query, valid, self.settings)
 
-    def steps(
-        self, reference: Picture, query: Picture, valid: Mask
-    ) -> Mapping[str, NDArray[np.uint8]]:
+    def steps(self, reference: Picture, query: Picture, valid: Mask) -> Mapping[str, Bytes]:
         """The pictures of Figure 3.14 by name."""
         return thesis_steps(reference, query, valid, self.settings).pictures()

@@ -3,7 +3,7 @@
 import shutil
 import time
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -20,6 +20,7 @@ from sorvolo.lab.thesis.stitching import RoiStitcher, RoiStitchingSettings
 from sorvolo.lab.thesis.video_input import VideoInput
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
+from sorvolo.paths import Json
 from sorvolo.registration.features import gray_from_rgb
 from sorvolo.registration.lens import at_most
 from sorvolo.store.atomic import writing
@@ -35,7 +36,7 @@ Transform = Literal["similarity", "homography"]
 
 def map_video(
     flight: VideoInput, site: Path, method: str, transform: Transform = "similarity"
-) -> dict[str, Any]:
+) -> Json:
     """A row of Table 4.1: one video mapped into a new site folder, and the deviation of section 4.1.1.
 
     Raises InputError and StoreError as `map_flights`.
@@ -83,7 +84,7 @@ def example_jpegs(site: Path) -> dict[str, bytes]:
     return {name: jpeg_from_image(each, FIGURE_PX) for name, each in vars(shown).items()}
 
 
-def distortion_of(site: Path) -> dict[str, Any]:
+def distortion_of(site: Path) -> Json:
     """Figure 3.12 in numbers, over the frames that lie on the map.
 
     `sides` is the largest ratio of two opposite sides (1: none is a trapezium), `areas` the largest area over the
@@ -112,7 +113,7 @@ def distortion_of(site: Path) -> dict[str, Any]:
     }
 
 
-def correlation_of(site: Path, mosaic: Path) -> dict[str, Any]:
+def correlation_of(site: Path, mosaic: Path) -> Json:
     """Eq. 4.1 of a flight's map and another mosaic of it. A GeoTIFF is compared as it lies and after the shift between
     them; a picture without coordinates is laid over the map by the thesis's own features.
 

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from sorvolo.lab.thesis.sheets import Sheet
+from sorvolo.paths import Json, JsonView
 from sorvolo.store.pages.plots import Bar, bar_plot, colour_class
 from sorvolo.store.pages.words import jpeg_uri, render
 
@@ -18,9 +19,7 @@ Picture = Callable[[str], bytes]
 """A row's picture by its file's name, as a JPEG."""
 
 
-def reproduction_page(
-    document: Mapping[str, Any], sheets: Sequence[Sheet], picture: Picture
-) -> str:
+def reproduction_page(document: JsonView, sheets: Sequence[Sheet], picture: Picture) -> str:
     """reproduction.html of reproduction.json's content and its sheets. All text is escaped."""
     tables, rows, missing = document["tables"], document["rows"], document["missing"]
     lost = f"; {len(missing)} could not be made" if missing else ""
@@ -53,7 +52,7 @@ def reproduction_page(
     return str(page)
 
 
-def _rates(title: str, table: Mapping[str, Any]) -> dict[str, Any]:
+def _rates(title: str, table: JsonView) -> Json:
     """Bars of precision, recall and F1 by method, the printed ones first."""
     published = table["published"]
     printed = published if isinstance(published, Mapping) else published[-1]
@@ -70,7 +69,7 @@ def _rates(title: str, table: Mapping[str, Any]) -> dict[str, Any]:
     )
 
 
-def _histogram(rows: Iterable[Mapping[str, Any]]) -> dict[str, Any] | None:
+def _histogram(rows: Iterable[JsonView]) -> Json | None:
     """The mean histogram of the deviation of frames and maps, by method (section 4.1.1)."""
     found: dict[str, list[Any]] = {}
     for row in rows:
@@ -88,7 +87,7 @@ def _histogram(rows: Iterable[Mapping[str, Any]]) -> dict[str, Any] | None:
     return _bars("Pixels of the frames by their gray levels' difference from the map", groups)
 
 
-def _bars(title: str, groups: Mapping[str, Mapping[str, float | None]]) -> dict[str, Any]:
+def _bars(title: str, groups: Mapping[str, Mapping[str, float | None]]) -> Json:
     """A plot of shares by group and by name, with a key of the names."""
     names = list(next(iter(groups.values())))
     bars = [
@@ -108,7 +107,7 @@ def _bars(title: str, groups: Mapping[str, Mapping[str, float | None]]) -> dict[
     }
 
 
-def _shown_of(row: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
+def _shown_of(row: JsonView) -> Iterator[tuple[str, str, str]]:
     """Which figure each of a row's pictures belongs to, with its words."""
     kind, values = row["kind"], row["values"]
     for name, file in row["pictures"].items():

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from sorvolo.paths import JsonView
 from sorvolo.survey.wording import counted
 
 
@@ -41,7 +42,7 @@ class Sheet:
         return "\n".join([*lines, "", *(f"- {note}" for note in self.notes)]).rstrip() + "\n"
 
 
-def reproduction_sheets(tables: Mapping[str, Any]) -> list[Sheet]:
+def reproduction_sheets(tables: JsonView) -> list[Sheet]:
     """The sheets of what `tables_of` gives, in the order of the thesis's chapter."""
     table = tables["figure_3_12"]
     rows = [
@@ -91,7 +92,7 @@ def _number(value: float | None, decimals: int) -> str | None:
     return None if value is None else f"{value:.{decimals}f}"
 
 
-def _times(table: Mapping[str, Any]) -> list[Sheet]:
+def _times(table: JsonView) -> list[Sheet]:
     printed = [
         (*each.values(), f"{60 * each['proposed'] / each['keyframes']:.2f}")
         for each in table["published"]
@@ -126,7 +127,7 @@ def _times(table: Mapping[str, Any]) -> list[Sheet]:
     ]
 
 
-def _deviations(table: Mapping[str, Any]) -> Sheet:
+def _deviations(table: JsonView) -> Sheet:
     printed, ours = table["published"], table["ours"]
     rows: list[Sequence[Any]] = [
         (
@@ -156,10 +157,10 @@ def _deviations(table: Mapping[str, Any]) -> Sheet:
     )
 
 
-def _counted(table: Mapping[str, Any], name: str, title: str) -> Sheet:
+def _counted(table: JsonView, name: str, title: str) -> Sheet:
     published = table["published"]
     printed = [published] if isinstance(published, Mapping) else published
-    shown: list[tuple[str, str, Mapping[str, Any]]] = [
+    shown: list[tuple[str, str, JsonView]] = [
         ("printed", "13871 frames" if each["method"] == "thesis" else "-", each) for each in printed
     ] + [
         ("here", f"{each['compared']} views of {counted(each['videos'], 'video')}", each)
@@ -181,7 +182,7 @@ def _counted(table: Mapping[str, Any], name: str, title: str) -> Sheet:
     return _sheet(name, title, columns, rows, table["differences"])
 
 
-def _seconds(table: Mapping[str, Any]) -> Sheet:
+def _seconds(table: JsonView) -> Sheet:
     printed = table["published"]
     rows = [
         (
@@ -210,7 +211,7 @@ def _seconds(table: Mapping[str, Any]) -> Sheet:
     )
 
 
-def _precisions(table: Mapping[str, Any]) -> Sheet:
+def _precisions(table: JsonView) -> Sheet:
     rows = [
         (
             f"{model} Faster R-CNN, printed",

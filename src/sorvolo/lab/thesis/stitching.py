@@ -10,12 +10,12 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import lil_array
 from scipy.sparse.linalg import spsolve
 
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import (
+    Bytes,
     Descriptors,
     Floats,
     ImageGray,
@@ -195,9 +195,7 @@ class RoiStitcher:
             float(np.sqrt((miss**2).sum(axis=1).mean())),
         )
 
-    def _roi(
-        self, centre_px: Floats, width: int, height: int
-    ) -> tuple[ImageGray, NDArray[np.uint8], Floats]:
+    def _roi(self, centre_px: Floats, width: int, height: int) -> tuple[ImageGray, Bytes, Floats]:
         """The mosaic around a point as gray, where it is painted, and its origin in mosaic coordinates."""
         half = _ROI_FRAMES * np.array([width, height]) / 2
         low = np.floor(centre_px - half)

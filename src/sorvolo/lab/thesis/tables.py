@@ -1,6 +1,6 @@
 """The rows put together to the thesis's tables, the published figures beside ours."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -20,16 +20,17 @@ from sorvolo.lab.thesis.published import (
 )
 from sorvolo.lab.thesis.rows import Row
 from sorvolo.lab.thesis.settings import BENCHMARK, COMPARISONS, MAP_METHODS, PUBLISHED
+from sorvolo.paths import Json, JsonView
 
 
-def tables_of(rows: Sequence[Row]) -> dict[str, Any]:
+def tables_of(rows: Sequence[Row]) -> Json:
     """Tables 4.1 and 4.3 to 4.6, sections 4.1.1 and 4.2.2 and Figure 3.12, each `published` and `ours`.
 
     A rate that nothing was there to divide by is None. A table whose rows are all missing has an empty `ours`.
     """
     made = [row for row in rows if not row.missing]
 
-    def of_kind(kind: str) -> list[dict[str, Any]]:
+    def of_kind(kind: str) -> list[Json]:
         return [
             {name: value for name, value in row.values.items() if name != "histogram"}
             for row in made
@@ -43,7 +44,7 @@ def tables_of(rows: Sequence[Row]) -> dict[str, Any]:
     for method in MAP_METHODS:
         own = [row for row in made if row.values.get("method") == method]
         umcd = [row for row in own if row.values.get("environment") != ENVIRONMENT]
-        result: dict[str, Any] = {"method": method}
+        result: Json = {"method": method}
         for name, count, values in (
             ("deviation", "videos", _values(umcd, "mosaic", "deviation")),
             ("correlation", "correlated", _values(made, "correlation", "correlation")),
@@ -53,7 +54,7 @@ def tables_of(rows: Sequence[Row]) -> dict[str, Any]:
             result |= {name: _mean(values), count: len(values)}
         if result["videos"] or result["published"]:
             found.append(result)
-    pairs: dict[str, tuple[Any, list[dict[str, Any]]]] = {
+    pairs: dict[str, tuple[Any, list[Json]]] = {
         "table_4_1": (TABLE_4_1, of_kind("mosaic")),
         "section_4_1_1": (SECTION_4_1_1, found),
         "figure_3_12": (FIGURES["3.12"], of_kind("transform")),
@@ -65,7 +66,7 @@ def tables_of(rows: Sequence[Row]) -> dict[str, Any]:
         "section_4_2_2": (SECTION_4_2_2, of_kind("seconds")),
         "table_4_6": (TABLE_4_6, of_kind("detector")),
     }
-    tables: dict[str, Any] = {
+    tables: Json = {
         name: {"published": published, "ours": ours} for name, (published, ours) in pairs.items()
     }
     for name, texts in DIFFERENCES.items():
@@ -82,9 +83,9 @@ def _mean(values: Sequence[float]) -> float | None:
     return sum(values) / len(values) if values else None
 
 
-def _pooled(rows: Iterable[Row], kind: str) -> list[dict[str, Any]]:
+def _pooled(rows: Iterable[Row], kind: str) -> list[Json]:
     """Counts of all videos together and the rates of section 4.2.1, by method and by what they were judged by."""
-    groups: dict[tuple[str, str], list[Mapping[str, Any]]] = {
+    groups: dict[tuple[str, str], list[JsonView]] = {
         (title, judged_by): [] for title in COMPARISONS for judged_by in (MASKS, TIMES, TABLE)
     }
     for row in rows:

@@ -2,15 +2,13 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from math import ceil, floor
-from typing import Any
 
 from sorvolo.lab.datasets.checking import DEFAULT_CLASSES, plain
 from sorvolo.lab.datasets.umcd import ROUNDED_S, UmcdMetadata
+from sorvolo.paths import JsonView
 
 
-def umcd_metadata(
-    fps: float, objects: Iterable[Mapping[str, Any]], boxes: Mapping[str, Any], flight: int
-) -> str:
+def umcd_metadata(fps: float, objects: Iterable[JsonView], boxes: JsonView, flight: int) -> str:
     """The text: each object that came with a later flight, when it is in view, and its boxes (ours, `Box:` lines).
 
     `objects` are the features of a simulation's objects.geojson, `boxes` the COCO content of the flight's boxes.json,
@@ -51,7 +49,7 @@ def placed_metadata(
 
 
 def _block(
-    number: int, properties: Mapping[str, Any], views: list[tuple[int, list[float]]], fps: float
+    number: int, properties: JsonView, views: list[tuple[int, list[float]]], fps: float
 ) -> list[str]:
     name = (
         properties["subtype"]

@@ -24,7 +24,7 @@ from sorvolo.heights.figures import (
 )
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.orthophoto import paint_orthophoto
-from sorvolo.heights.surface import Surface, SurfaceSettings, sweep_surface
+from sorvolo.heights.surface import Surface, sizes_m, sweep_surface
 from sorvolo.heights.terrain import terrain
 from sorvolo.heights.views import View, fix_from_residual, ground_outlines_m, pixels_wide
 from sorvolo.missions.flight.headline import contradicts_itself
@@ -336,7 +336,7 @@ def _sweep(
     low_m = min(0.0, float(np.percentile(solved.points_m[:, 2], 0.5)))  # low ground is seen farther
     lattice = _lattice(site, solved.views, cell_m, low_m)
 
-    small = SmallPictures(pictures, solved.views, SurfaceSettings().sizes_m(lattice.cell_m))
+    small = SmallPictures(pictures, solved.views, sizes_m(lattice.cell_m))
     for each in sweep_surface(
         lattice, solved.views, small.gray, solved.points_m, solved.height_sigma
     ):
