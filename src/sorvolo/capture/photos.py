@@ -223,6 +223,9 @@ def read_album(
         if not photo.problem and photo.metadata.used_size_px == (width_px, height_px)
     )
     telemetry, gps_notices = _telemetry_of(photos)
+    used = [photo.metadata for photo in photos if not photo.problem]
+    cameras = {(metadata.make, metadata.model) for metadata in used}
+    focal_mm = {metadata.focal_length_mm for metadata in used if metadata.focal_length_mm > 0}
     return Album(
         tuple(photos),
         width_px,
@@ -236,7 +239,36 @@ def read_album(
             *place_notices,
             *time_notices,
             *gps_notices,
-            *_picture_notices(photos, width_px, height_px),
+            *[
+                *notice(
+                    "duplicate_photo",
+                    sum(photo.fault is PhotoFault.DUPLICATE for photo in photos),
+                    "photos that are exact copies of others, not used twice: {}",
+                ),
+                *notice(
+                    "unreadable_photo",
+                    sum(not photo.metadata.width_px for photo in photos),
+                    "files named like pictures that cannot be read: {}",
+                ),
+                *_size_notices(photos, used, (width_px, height_px)),
+                *notice(
+                    "unreadable_metadata",
+                    sum(bool(metadata.unreadable) for metadata in used),
+                    "photos with damaged EXIF or XMP, which is not used: {}",
+                ),
+                *[
+                    *notice(
+                        "mixed_cameras",
+                        len(cameras) if len(cameras) > 1 else 0,
+                        "different cameras, mapped as if they were one: {}",
+                    ),
+                    *notice(
+                        "zoom",
+                        len(focal_mm) if len(focal_mm) > 1 else 0,
+                        "different focal lengths, mapped as if they were one: {}",
+                    ),
+                ],
+            ],
         ),
     )
 
@@ -532,42 +564,6 @@ def _telemetry_of(photos: Sequence[Photo]) -> tuple[Telemetry, list[Notice]]:
     if not cleaned.has_fixes:
         return no_telemetry(), [*missing, *cleaned.notices]
     return replace(cleaned, notices=(*missing, *cleaned.notices), is_per_photo=True), []
-
-
-def _picture_notices(photos: Sequence[Photo], width_px: int, height_px: int) -> list[Notice]:
-    used = [photo.metadata for photo in photos if not photo.problem]
-    cameras = {(metadata.make, metadata.model) for metadata in used}
-    focal_mm = {metadata.focal_length_mm for metadata in used if metadata.focal_length_mm > 0}
-    return [
-        *notice(
-            "duplicate_photo",
-            sum(photo.fault is PhotoFault.DUPLICATE for photo in photos),
-            "photos that are exact copies of others, not used twice: {}",
-        ),
-        *notice(
-            "unreadable_photo",
-            sum(not photo.metadata.width_px for photo in photos),
-            "files named like pictures that cannot be read: {}",
-        ),
-        *_size_notices(photos, used, (width_px, height_px)),
-        *notice(
-            "unreadable_metadata",
-            sum(bool(metadata.unreadable) for metadata in used),
-            "photos with damaged EXIF or XMP, which is not used: {}",
-        ),
-        *[
-            *notice(
-                "mixed_cameras",
-                len(cameras) if len(cameras) > 1 else 0,
-                "different cameras, mapped as if they were one: {}",
-            ),
-            *notice(
-                "zoom",
-                len(focal_mm) if len(focal_mm) > 1 else 0,
-                "different focal lengths, mapped as if they were one: {}",
-            ),
-        ],
-    ]
 
 
 def _size_notices(

@@ -261,7 +261,15 @@ def read_video_info(path: Path) -> VideoInfo:
     Raises InputError when the file is missing, empty, no video, cut so that nothing can be read, or its
     frames are larger than PIXEL_LIMIT.
     """
-    _check_file(path)
+    if not path.is_file():
+        raise InputError(f"no such file: {path}; give a video, or a folder of photos")
+    if path.stat().st_size == 0:
+        raise InputError(f"{path.name} is empty (0 bytes); copy it again from the drone")
+    with path.open("rb") as file:
+        if is_heif(file.read(12)):
+            raise InputError(
+                f"{path.name} is a HEIC picture, not a video; rename it to {path.stem}.heic"
+            )
     with opened_video(path) as container:
         stream = video_stream(container, path)
         size_px = stream.codec_context.width, stream.codec_context.height
@@ -343,18 +351,6 @@ class _Sizes:
             ),
             *notice("other_shape", self.lost, "frames of another shape, not used: {}"),
         ]
-
-
-def _check_file(path: Path) -> None:
-    if not path.is_file():
-        raise InputError(f"no such file: {path}; give a video, or a folder of photos")
-    if path.stat().st_size == 0:
-        raise InputError(f"{path.name} is empty (0 bytes); copy it again from the drone")
-    with path.open("rb") as file:
-        if is_heif(file.read(12)):
-            raise InputError(
-                f"{path.name} is a HEIC picture, not a video; rename it to {path.stem}.heic"
-            )
 
 
 def _turn_of(frame: av.VideoFrame) -> tuple[bool, bool, bool]:

@@ -243,7 +243,38 @@ def show_results(
     from sorvolo.store.exports.plain import features_path
 
     for result in results:
-        _show_result(result, console, form, sort, least_m)
+        comparison, features = result["comparison"], result["changes"]["features"]
+        dark = " (too dark: most changes would be missed)" if comparison.get("most_missed") else ""
+        console.print(
+            f"Flight {escape(result['flight'])}: {comparison['headline']['text']}{dark}",
+            style="bold",
+        )
+        is_local = result["changes"].get("crs", "WGS84") is None  # no place on Earth, no metres
+        if features:
+            console.print(escape(comparison["in_short"]), soft_wrap=True)
+            _show_changes(_in_rows(features, sort, least_m), console, form, is_local=is_local)
+        views = comparison["views"]
+        console.print(
+            f"{views['compared']:,} of {counted(sum(views.values()), 'view')} compared in {result['seconds']:.1f} s; "
+            f"memory at most {result['peak_memory_mb']:,.0f} MB",
+        )
+        _show_coverage(comparison["coverage"], console, is_local=is_local)
+        extension = comparison.get("extension") or {}
+        if extension.get("frames"):
+            more = extension["shown_as_well"]
+            same = f"; {counted(more, 'more frame')} {plural('shows', more)} the same ground"
+            console.print(
+                f"the map grew by {extension['area_m2']:,.0f} m2 from {counted(extension['frames'], 'frame')}"
+                f"{same if more else ''}",
+            )
+        if result["withdrawn"]:
+            console.print(
+                f"withdrawn (not confirmed by the whole flight): {', '.join(result['withdrawn'])}",
+                markup=False,
+            )
+        for reason, count in list(comparison["reasons"].items())[:_MAX_REASONS]:
+            console.print(f"  {counted(count, 'view')}: {escape(reason)}")
+        show_notices_and_warnings(result, console)
         announce_people(result, site, console)
         folder = site / "flights" / result["flight"]
         show_path("page", folder / "changes.html", console)
@@ -289,43 +320,6 @@ def _class_words(kind: str, before: str | None, after: str | None) -> str:
     """What stood there and stands there: "car", "car to person"; "" for changed ground."""
     words = " to ".join(escape(name) for name in (before, after) if name)
     return words or ("" if kind == "area" else "unknown object")
-
-
-def _show_result(
-    result: JsonView, console: Console, form: PlaceFormat, sort: str, least_m: float
-) -> None:
-    comparison, features = result["comparison"], result["changes"]["features"]
-    dark = " (too dark: most changes would be missed)" if comparison.get("most_missed") else ""
-    console.print(
-        f"Flight {escape(result['flight'])}: {comparison['headline']['text']}{dark}",
-        style="bold",
-    )
-    is_local = result["changes"].get("crs", "WGS84") is None  # no place on Earth, no metres
-    if features:
-        console.print(escape(comparison["in_short"]), soft_wrap=True)
-        _show_changes(_in_rows(features, sort, least_m), console, form, is_local=is_local)
-    views = comparison["views"]
-    console.print(
-        f"{views['compared']:,} of {counted(sum(views.values()), 'view')} compared in {result['seconds']:.1f} s; "
-        f"memory at most {result['peak_memory_mb']:,.0f} MB",
-    )
-    _show_coverage(comparison["coverage"], console, is_local=is_local)
-    extension = comparison.get("extension") or {}
-    if extension.get("frames"):
-        more = extension["shown_as_well"]
-        same = f"; {counted(more, 'more frame')} {plural('shows', more)} the same ground"
-        console.print(
-            f"the map grew by {extension['area_m2']:,.0f} m2 from {counted(extension['frames'], 'frame')}"
-            f"{same if more else ''}",
-        )
-    if result["withdrawn"]:
-        console.print(
-            f"withdrawn (not confirmed by the whole flight): {', '.join(result['withdrawn'])}",
-            markup=False,
-        )
-    for reason, count in list(comparison["reasons"].items())[:_MAX_REASONS]:
-        console.print(f"  {counted(count, 'view')}: {escape(reason)}")
-    show_notices_and_warnings(result, console)
 
 
 def _show_coverage(coverage: JsonView, console: Console, *, is_local: bool) -> None:

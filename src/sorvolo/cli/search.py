@@ -36,7 +36,7 @@ from sorvolo.cli.printing import (
 from sorvolo.cli.progress import ProgressReport, show_progress
 from sorvolo.cli.sites import ended_by_signal, opened_site, run_on_site
 from sorvolo.errors import SettingsError
-from sorvolo.paths import Json, JsonView
+from sorvolo.paths import Json
 
 if TYPE_CHECKING:
     from sorvolo.cli.sites import OpenedSite
@@ -186,7 +186,39 @@ def search_command(
         ):
             show_path(name, outputs.folder / file, console)
     else:
-        _show(report, outputs.folder, outputs.refly, Console())
+        console = Console()
+        text = report["headline"]["text"]
+        console.print(escape(text[:1].upper() + text[1:]), style="bold", soft_wrap=True)
+        table = Table("class", "POD", "90 % interval", "area", "seen", "sweep width", "coverage")
+        for label, row in report["classes"].items():
+            width = "" if row["sweep_width_m"] is None else f"{row['sweep_width_m']:.1f} m"
+            table.add_row(
+                escape(label),
+                f"{row['pod']:.2f}",
+                f"{row['pod_low']:.2f} to {row['pod_high']:.2f}",
+                f"{row['area_m2']:,.0f} m2",
+                f"{row['seen_m2']:,.0f} m2",
+                width,
+                f"{row['coverage']:.2f}",
+            )
+        console.print(table)
+        if report["segments"]:
+            segments = Table("segment", "POA", "POD", "POS", "left")
+            for segment in report["segments"]:
+                segments.add_row(
+                    escape(segment["name"]),
+                    *(f"{segment[key]:.2f}" for key in ("poa", "pod", "pos", "left")),
+                )
+            console.print(segments)
+        show_notices_and_warnings(report, console)
+        for name, file in (
+            ("page", "search.html"),
+            ("GeoTIFF", "pod.tif"),
+            ("areas", "pod.geojson"),
+        ):
+            show_path(name, outputs.folder / file, console)
+        for path in outputs.refly if report["refly"] else ():
+            show_path("re-fly", path, console)
     if pdf:
         page = "under_trees.html" if through_trees else "search.html"
         write_pdfs([outputs.folder / page], Console(stderr=as_json))
@@ -269,34 +301,3 @@ def _map_of(inputs: Sequence[str]) -> str:
     raise SettingsError(
         f"{found}; give the folder of a map, or flights and --site FOLDER to map them into"
     )
-
-
-def _show(report: JsonView, folder: Path, refly: tuple[Path, ...], console: Console) -> None:
-    text = report["headline"]["text"]
-    console.print(escape(text[:1].upper() + text[1:]), style="bold", soft_wrap=True)
-    table = Table("class", "POD", "90 % interval", "area", "seen", "sweep width", "coverage")
-    for label, row in report["classes"].items():
-        width = "" if row["sweep_width_m"] is None else f"{row['sweep_width_m']:.1f} m"
-        table.add_row(
-            escape(label),
-            f"{row['pod']:.2f}",
-            f"{row['pod_low']:.2f} to {row['pod_high']:.2f}",
-            f"{row['area_m2']:,.0f} m2",
-            f"{row['seen_m2']:,.0f} m2",
-            width,
-            f"{row['coverage']:.2f}",
-        )
-    console.print(table)
-    if report["segments"]:
-        segments = Table("segment", "POA", "POD", "POS", "left")
-        for segment in report["segments"]:
-            segments.add_row(
-                escape(segment["name"]),
-                *(f"{segment[key]:.2f}" for key in ("poa", "pod", "pos", "left")),
-            )
-        console.print(segments)
-    show_notices_and_warnings(report, console)
-    for name, file in (("page", "search.html"), ("GeoTIFF", "pod.tif"), ("areas", "pod.geojson")):
-        show_path(name, folder / file, console)
-    for path in refly if report["refly"] else ():
-        show_path("re-fly", path, console)

@@ -126,7 +126,14 @@ def watch_command(
         alert_url=alert_url,
         cot_tls=CotTls(cot_ca, cot_cert),
     )
-    warn_of_interpreted(alert_command)
+    # print a warning where an alert's program would run a placeholder's text as code of its
+    # own
+    from sorvolo.missions.watch.alerts import interpreted_placeholder, interpreted_words
+
+    if name := interpreted_placeholder(alert_command):
+        Console(stderr=True).print(
+            f"[yellow]warning[/yellow]  {escape(interpreted_words(name))}", soft_wrap=True
+        )
     # before the first frame there is nothing to keep
     words = "landed: the frames that wait are searched; press Ctrl-C again to stop at once"
     stop = SignalStop(is_running=False, words=words if is_live_address(source) else "")
@@ -182,16 +189,6 @@ def watch_command(
         Console(stderr=True).print("stopped before the first frame was searched")
     if not results or not all(each["headline"]["complete"] for each in results):
         raise typer.Exit(TO_CHECK)
-
-
-def warn_of_interpreted(alert_command: str) -> None:
-    """Print a warning where an alert's program would run a placeholder's text as code of its own."""
-    from sorvolo.missions.watch.alerts import interpreted_placeholder, interpreted_words
-
-    if name := interpreted_placeholder(alert_command):
-        Console(stderr=True).print(
-            f"[yellow]warning[/yellow]  {escape(interpreted_words(name))}", soft_wrap=True
-        )
 
 
 def _show_progress(

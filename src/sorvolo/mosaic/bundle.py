@@ -360,40 +360,7 @@ def _normal_equations(problem: _Problem, nodes: Nodes, shared: Floats) -> Normal
         into.add(
             jacobian * root[..., None], residual * root, (problem.position[problem.ground.node],)
         )
-    _add_telemetry(into, nodes, shared, problem.position)
-    held = problem.shared_sigma <= 0
-    prior = np.where(held, 1e12, 1 / np.maximum(problem.shared_sigma, 1e-12) ** 2)
-    into.add_shared(np.diag(prior), np.where(held, 0.0, -prior * shared))
-    into.hold_shared(held)
-    into.cost += float(np.where(held, 0.0, prior * shared**2).sum())
-    return into
-
-
-def _add_links(
-    into: NormalEquations,
-    nodes: Nodes,
-    pairs: Linked,
-    shared: Floats,
-    position: Rows,
-) -> None:
-    for some in pairs.batches():
-        line = linearise(nodes, some, shared)
-        white = whiten(line, some)
-        residual = np.einsum("lkij,lkj->lki", white, line.residual_px)
-        weight = some.weight * line.seen
-        squared = (residual**2).sum(-1) / ROBUST_SIGMAS**2
-        into.cost += float((weight * np.log1p(squared)).sum()) * ROBUST_SIGMAS**2
-        root = np.sqrt(weight / (1 + squared))[..., None]
-        residual = (residual * root).reshape(len(some.old), -1)
-        jacobian = np.concatenate([line.by_old, line.by_new, line.by_shared], axis=-1)
-        jacobian = (white @ jacobian * root[..., None]).reshape(
-            len(some.old), residual.shape[1], -1
-        )
-        into.add(jacobian, residual, (position[some.old], position[some.new]))
-
-
-def _add_telemetry(into: NormalEquations, nodes: Nodes, shared: Floats, position: Rows) -> None:
-    index = np.flatnonzero(position >= 0)  # in the order of their positions
+    index = np.flatnonzero(problem.position >= 0)  # in the order of their positions
     blocks, coupling = np.zeros((len(index), 6, 6)), np.zeros((len(index), 6, len(SHARED)))
     own, shared_pull = np.zeros((len(SHARED), len(SHARED))), np.zeros(len(SHARED))
     # place: GPS belongs to the camera, up to the offsets that the flight shares
@@ -426,6 +393,35 @@ def _add_telemetry(into: NormalEquations, nodes: Nodes, shared: Floats, position
     shared_pull[5:] = (information * error).sum(axis=0)
     into.add_cameras(blocks, coupling, np.concatenate([turn_pull, shift_pull], axis=1))
     into.add_shared(own, shared_pull)
+    held = problem.shared_sigma <= 0
+    prior = np.where(held, 1e12, 1 / np.maximum(problem.shared_sigma, 1e-12) ** 2)
+    into.add_shared(np.diag(prior), np.where(held, 0.0, -prior * shared))
+    into.hold_shared(held)
+    into.cost += float(np.where(held, 0.0, prior * shared**2).sum())
+    return into
+
+
+def _add_links(
+    into: NormalEquations,
+    nodes: Nodes,
+    pairs: Linked,
+    shared: Floats,
+    position: Rows,
+) -> None:
+    for some in pairs.batches():
+        line = linearise(nodes, some, shared)
+        white = whiten(line, some)
+        residual = np.einsum("lkij,lkj->lki", white, line.residual_px)
+        weight = some.weight * line.seen
+        squared = (residual**2).sum(-1) / ROBUST_SIGMAS**2
+        into.cost += float((weight * np.log1p(squared)).sum()) * ROBUST_SIGMAS**2
+        root = np.sqrt(weight / (1 + squared))[..., None]
+        residual = (residual * root).reshape(len(some.old), -1)
+        jacobian = np.concatenate([line.by_old, line.by_new, line.by_shared], axis=-1)
+        jacobian = (white @ jacobian * root[..., None]).reshape(
+            len(some.old), residual.shape[1], -1
+        )
+        into.add(jacobian, residual, (position[some.old], position[some.new]))
 
 
 def _advance(nodes: Nodes, shared: Floats, step: Floats, position: Rows) -> tuple[Nodes, Floats]:

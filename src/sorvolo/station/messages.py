@@ -281,11 +281,9 @@ def codec_string(codec: str, data: bytes) -> str | None:
     sps = next((unit for unit in nal_units(data) if nal_type(codec, unit) == _SPS[codec]), b"")
     if codec == "h264":
         return f"avc1.{sps[1:4].hex()}" if len(sps) > 3 else None
-    return _hevc_string(sps.replace(b"\x00\x00\x03", b"\x00\x00"))
-
-
-def _hevc_string(sps: bytes) -> str | None:
-    """ISO 14496-15, E.3: profile, compatibility flags in reverse bit order, tier and level, constraint bytes."""
+    # ISO 14496-15, E.3: profile, compatibility flags in reverse bit order, tier and level,
+    # constraint bytes
+    sps = sps.replace(b"\x00\x00\x03", b"\x00\x00")
     if len(sps) < 15:
         return None
     profile, compatible = sps[3], int.from_bytes(sps[4:8], "big")

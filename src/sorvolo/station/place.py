@@ -78,17 +78,14 @@ class PlaceIndex:
             if old:
                 self._update({site_id: archives[site_id] for site_id in old})
                 self._marks |= {site_id: marks[site_id] for site_id in old}
-            return self._opened().find(place)
-
-    def _opened(self) -> ArchiveIndex:
-        """The index to read from, kept open; another one where it was made anew."""
-        root = self._shelf.root
-        file = root / INDEX
-        about = file.stat().st_ino if file.is_file() else 0
-        if self._open is None or self._open[0] != about:
-            self.close()
-            self._open = about, ArchiveIndex.open(root, write=False)
-        return self._open[1]
+            # the index to read from, kept open; another one where it was made anew
+            root = self._shelf.root
+            file = root / INDEX
+            about = file.stat().st_ino if file.is_file() else 0
+            if self._open is None or self._open[0] != about:
+                self.close()
+                self._open = about, ArchiveIndex.open(root, write=False)
+            return self._open[1].find(place)
 
     def close(self) -> None:
         """Let go of the index."""

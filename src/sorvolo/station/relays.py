@@ -311,7 +311,14 @@ class MqttSender:
 
     def send(self, event: JsonView) -> None:
         """Publish one event. Raises OSError where the broker does not acknowledge it."""
-        self._demand_connection()
+        # wait for the connection, which the library makes anew by itself once it stood.
+        # Raises OSError
+        if not self._is_begun:
+            self._client.connect(self._place.host, self._place.port, _KEEPALIVE_S)
+            self._client.loop_start()
+            self._is_begun = True
+        if not self._connected.wait(_CONNECT_S):
+            raise OSError(self._reason or "no connection to the broker")
         topic = (
             f"{self._place.prefix}/{_level(event.get('site') or 'station')}/{_level(event['type'])}"
         )
@@ -331,15 +338,6 @@ class MqttSender:
             ).wait_for_publish(1.0)
         self._client.disconnect()
         self._client.loop_stop()
-
-    def _demand_connection(self) -> None:
-        """Wait for the connection, which the library makes anew by itself once it stood. Raises OSError."""
-        if not self._is_begun:
-            self._client.connect(self._place.host, self._place.port, _KEEPALIVE_S)
-            self._client.loop_start()
-            self._is_begun = True
-        if not self._connected.wait(_CONNECT_S):
-            raise OSError(self._reason or "no connection to the broker")
 
     def _on_connect(self, client: Client, _: Any, __: Any, reason: Any, ___: Any) -> None:
         if reason != CONNACK_ACCEPTED:

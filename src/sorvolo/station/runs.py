@@ -268,7 +268,16 @@ class Runs(ThreadOwner):
         count = 0
         for run, offset in self._running():
             count += self._look_at(run, offset).state == RUNNING
-        self._reap()
+        # take the exit codes of processes whose runs are over; kill those that state the
+        # end and do not come to it
+        for run_id, since_s in list(self._lingering_s.items()):
+            process = self._processes.get(run_id)
+            if process is not None and process.poll() is None:
+                if time.monotonic() - since_s > self._settings.limits.stop_within_s:
+                    _kill(process.pid)
+                continue
+            self._processes.pop(run_id, None)
+            del self._lingering_s[run_id]
         return count
 
     def delete(self, run_id: str) -> Run:
@@ -442,17 +451,6 @@ class Runs(ThreadOwner):
         """Whether a run that counts as running, and whose lock is free, has no process any more; never waits."""
         process = self._processes.get(run.id)
         return run.state == RUNNING and (process is None or process.poll() is not None)
-
-    def _reap(self) -> None:
-        """Take the exit codes of processes whose runs are over; kill those that state the end and do not come to it."""
-        for run_id, since_s in list(self._lingering_s.items()):
-            process = self._processes.get(run_id)
-            if process is not None and process.poll() is None:
-                if time.monotonic() - since_s > self._settings.limits.stop_within_s:
-                    _kill(process.pid)
-                continue
-            self._processes.pop(run_id, None)
-            del self._lingering_s[run_id]
 
     def _mark_lost(self, run: Run, folder: Path) -> tuple[Run, NewEvent]:
         """A run whose process ended without its last line: killed, crashed, or switched off with the machine."""

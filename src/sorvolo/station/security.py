@@ -236,16 +236,16 @@ def check_origin(connection: HTTPConnection, public_origin: str, *, is_websocket
     if connection.scope.get("method") in ("GET", "HEAD") and not is_websocket and origin != "null":
         # reading is kept from other origins by the browser: no answer allows them to read it
         return
-    if origin.lower() not in (public_origin, _own_origin(connection)) or not origin:
-        raise Problem(403, f"a page of {origin[:100]} asked; open the station's own page")
-
-
-def _own_origin(connection: HTTPConnection) -> str:
-    """The origin of pages that came from the address that was asked, lower case."""
+    # the origin of pages that came from the address that was asked, lower case
     scheme = {"ws": "http", "wss": "https"}.get(
         connection.scope["scheme"], connection.scope["scheme"]
     )
-    return f"{scheme}://{connection.headers.get('host', '').lower()}"
+    if (
+        origin.lower()
+        not in (public_origin, (f"{scheme}://{connection.headers.get('host', '').lower()}"))
+        or not origin
+    ):
+        raise Problem(403, f"a page of {origin[:100]} asked; open the station's own page")
 
 
 def _host_name(host: str) -> str:

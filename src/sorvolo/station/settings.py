@@ -78,9 +78,32 @@ class StationSettings:
             if each is not None and not each.is_file():
                 raise SettingsError(f"no such file: {each}; a PEM file was needed")
         for text in self.stream_ranges:
-            _check_range(text)
+            try:
+                ipaddress.ip_network(text, strict=False)
+            except ValueError as error:
+                raise SettingsError(
+                    f"--stream-from {text!r}: a network such as 192.168.1.0/24 was needed"
+                ) from error
         if self.public_url:
-            _check_public(self.public_url)
+            # raise SettingsError unless it is the address of a proxy that passes a whole
+            # host on
+            try:
+                parts = urlsplit(self.public_url)
+                is_right = (
+                    parts.scheme == "https" and bool(parts.hostname) and (parts.port or 1) > 0
+                )
+            except ValueError:
+                is_right = False
+            if (
+                not is_right
+                or parts.path not in ("", "/")
+                or parts.query
+                or parts.fragment
+                or "@" in parts.netloc
+            ):
+                raise SettingsError(
+                    f"--public-url {self.public_url!r}: the address of a TLS proxy was needed, without a path: https://maps.example"
+                )
         if self.base_map is not None and not _is_pmtiles(self.base_map):
             raise SettingsError(
                 f"--base-map {self.base_map}: a PMTiles file (version 3) was needed"
@@ -160,34 +183,6 @@ def check_exposure(settings: StationSettings, *, has_tokens: bool) -> None:
         raise SettingsError(
             f"{where}, and without TLS tokens could be read on the way; give --tls-cert and --tls-key, or "
             "--insecure-lan in a network that you trust"
-        )
-
-
-def _check_range(text: str) -> None:
-    try:
-        ipaddress.ip_network(text, strict=False)
-    except ValueError as error:
-        raise SettingsError(
-            f"--stream-from {text!r}: a network such as 192.168.1.0/24 was needed"
-        ) from error
-
-
-def _check_public(url: str) -> None:
-    """Raise SettingsError unless it is the address of a proxy that passes a whole host on."""
-    try:
-        parts = urlsplit(url)
-        is_right = parts.scheme == "https" and bool(parts.hostname) and (parts.port or 1) > 0
-    except ValueError:
-        is_right = False
-    if (
-        not is_right
-        or parts.path not in ("", "/")
-        or parts.query
-        or parts.fragment
-        or "@" in parts.netloc
-    ):
-        raise SettingsError(
-            f"--public-url {url!r}: the address of a TLS proxy was needed, without a path: https://maps.example"
         )
 
 

@@ -70,7 +70,20 @@ class Spool:
         self.failure = ""  # why the disk took no message, last
         self.last_seq, self.last_pts_us, self.last_taken_ns = 0, -1, 0
         self._segment = 0
-        self._load()
+        # take up what an earlier run left; a record that was cut ends its file
+        numbers = sorted(
+            int(each.stem) for each in self._folder.glob("*.spool") if each.stem.isdigit()
+        )
+        self._segment = numbers[-1] + 1 if numbers else 0  # never behind a record that was cut
+        for number in numbers:
+            for message, taken_ns, offset, length in _records(self._path(number).read_bytes()):
+                is_video = message.kind is Kind.VIDEO
+                self._keep(
+                    _Stored(message.seq, is_video, message.is_key, taken_ns, number, offset, length)
+                )
+                self.last_seq, self.last_taken_ns = message.seq, taken_ns
+                self.last_pts_us = max(self.last_pts_us, message.pts_us)
+            self._remove_if_done(number)
         self._file: BinaryIO = self._path(self._segment).open("ab", buffering=0)
         self.flight = self._flight()
 
@@ -268,22 +281,6 @@ class Spool:
 
     def _path(self, segment: int) -> Path:
         return self._folder / f"{segment:08d}.spool"
-
-    def _load(self) -> None:
-        """Take up what an earlier run left; a record that was cut ends its file."""
-        numbers = sorted(
-            int(each.stem) for each in self._folder.glob("*.spool") if each.stem.isdigit()
-        )
-        self._segment = numbers[-1] + 1 if numbers else 0  # never behind a record that was cut
-        for number in numbers:
-            for message, taken_ns, offset, length in _records(self._path(number).read_bytes()):
-                is_video = message.kind is Kind.VIDEO
-                self._keep(
-                    _Stored(message.seq, is_video, message.is_key, taken_ns, number, offset, length)
-                )
-                self.last_seq, self.last_taken_ns = message.seq, taken_ns
-                self.last_pts_us = max(self.last_pts_us, message.pts_us)
-            self._remove_if_done(number)
 
     def _flight(self) -> str:
         """The flight's id: the same for every run that goes on with this spool."""

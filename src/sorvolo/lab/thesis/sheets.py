@@ -56,6 +56,24 @@ def reproduction_sheets(tables: JsonView) -> list[Sheet]:
         )
         for each in table["ours"]
     ]
+    table = tables["table_4_1"]
+    printed = [
+        (*each.values(), f"{60 * each['proposed'] / each['keyframes']:.2f}")
+        for each in table["published"]
+    ]
+    ours = [
+        (
+            each["sequence"] + ("" if each["has_telemetry"] else " (no telemetry)"),
+            *(each[name] for name in ("method", "frames", "keyframes", "matched")),
+            *(
+                _number(each[name], 2)
+                for name in ("minutes", "cpu_minutes", "seconds_per_keyframe")
+            ),
+            _percent(each["deviation"]),
+            each["quality"],
+        )
+        for each in table["ours"]
+    ]
     return [
         _sheet(
             "figure_3_12",
@@ -67,7 +85,21 @@ def reproduction_sheets(tables: JsonView) -> list[Sheet]:
                 "distance from the chord between its ends, over the chord; wind and drift bend it, too.",
             ),
         ),
-        *_times(tables["table_4_1"]),
+        *[
+            _sheet(
+                "table_4_1_printed",
+                "Table 4.1 as printed: minutes",
+                "sequence; frames; KFs; thesis; Bu et al.; Pix4D; Photoscan; thesis: s a KF",
+                printed,
+            ),
+            _sheet(
+                "table_4_1",
+                "Table 4.1 here",
+                "sequence; method; frames; KFs; matched; minutes; processor minutes; processor s a KF; deviation, %; quality",
+                ours,
+                table["differences"],
+            ),
+        ],
         _deviations(tables["section_4_1_1"]),
         _counted(tables["tables_4_3_and_4_4"], "tables_4_3_and_4_4", "Tables 4.3 and 4.4: frames"),
         _counted(tables["table_4_5"], "table_4_5", "Table 4.5: pixels"),
@@ -90,41 +122,6 @@ def _percent(share: float | None) -> str | None:
 
 def _number(value: float | None, decimals: int) -> str | None:
     return None if value is None else f"{value:.{decimals}f}"
-
-
-def _times(table: JsonView) -> list[Sheet]:
-    printed = [
-        (*each.values(), f"{60 * each['proposed'] / each['keyframes']:.2f}")
-        for each in table["published"]
-    ]
-    ours = [
-        (
-            each["sequence"] + ("" if each["has_telemetry"] else " (no telemetry)"),
-            *(each[name] for name in ("method", "frames", "keyframes", "matched")),
-            *(
-                _number(each[name], 2)
-                for name in ("minutes", "cpu_minutes", "seconds_per_keyframe")
-            ),
-            _percent(each["deviation"]),
-            each["quality"],
-        )
-        for each in table["ours"]
-    ]
-    return [
-        _sheet(
-            "table_4_1_printed",
-            "Table 4.1 as printed: minutes",
-            "sequence; frames; KFs; thesis; Bu et al.; Pix4D; Photoscan; thesis: s a KF",
-            printed,
-        ),
-        _sheet(
-            "table_4_1",
-            "Table 4.1 here",
-            "sequence; method; frames; KFs; matched; minutes; processor minutes; processor s a KF; deviation, %; quality",
-            ours,
-            table["differences"],
-        ),
-    ]
 
 
 def _deviations(table: JsonView) -> Sheet:
