@@ -205,7 +205,8 @@ def _from_geojson(path: Path, text: str) -> list[Rings]:
     except (
         ValueError,
         RecursionError,
-    ) as error:  # a whole number of thousands of digits is a plain ValueError
+    ) as error:
+        # a whole number of thousands of digits is a plain ValueError
         raise InputError(f"{path}: broken GeoJSON: {error}") from error
     except (KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: GeoJSON without the expected member: {error}") from error

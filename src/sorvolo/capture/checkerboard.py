@@ -14,12 +14,10 @@ from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 
 FEWEST_VIEWS = 8  # views of the board; all six by choice
 MOST_VIEWS = 40  # views: more cost time alone
-LEAST_TILT_SPREAD_DEG = (
-    10.0  # between the boards' tilts: boards that all lie alike fix no focal length
-)
-LEAST_COVERAGE = (
-    0.4  # share of the picture that the boards fill together: distortion shows at its rim
-)
+# between the boards' tilts: boards that all lie alike fix no focal length
+LEAST_TILT_SPREAD_DEG = 10.0
+# share of the picture that the boards fill together: distortion shows at its rim
+LEAST_COVERAGE = 0.4
 LARGEST_ERROR_PX = 2.0  # rms of the corners
 LARGEST_FOCAL_SIGMA = 0.02  # relative
 

@@ -262,9 +262,8 @@ def _offset_sigma_s(times_s: Floats, fixes_m: PointsM, places_m: PointsM) -> flo
     at_s, places, misses = times_s[rows], places_m[rows], (fixes_m - places_m)[rows].T.ravel()
     similar = _similar(places)
     taken_up, *_ = np.linalg.lstsq(similar, velocity_m_s.T.ravel(), rcond=None)
-    motion = (
-        velocity_m_s.T.ravel() - similar @ taken_up
-    )  # m/s, that no similarity of the path can stand in for
+    # m/s, that no similarity of the path can stand in for
+    motion = velocity_m_s.T.ravel() - similar @ taken_up
     if motion @ motion <= 1e-9 * len(rows) or len(motion) <= similar.shape[1] + 1:
         return float("inf")
     model = np.column_stack([similar, motion])
@@ -290,10 +289,8 @@ def _offset_sigma_s(times_s: Floats, fixes_m: PointsM, places_m: PointsM) -> flo
             freedom = len(misses) - model.shape[1]
             of_noise = 4 * float(np.log(np.diag(root)).sum())  # of both axes
             of_model = float(np.linalg.slogdet(normal)[1])
-            likelihood, noise = (
-                -0.5 * (freedom * float(np.log(left_over)) + of_noise + of_model),
-                left_over / freedom,
-            )
+            likelihood = -0.5 * (freedom * float(np.log(left_over)) + of_noise + of_model)
+            noise = left_over / freedom
             likelihoods.append(likelihood)
             pull = motion.reshape(2, -1)
             variances.append(

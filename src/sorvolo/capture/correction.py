@@ -21,9 +21,8 @@ _FAR_SIGMAS = 6.0  # from its fix: of thousands of frames chance leaves none the
 _UNKNOWN = Bias(float("nan"), float("nan"), float("nan"))
 
 
-_COMPASS_OUTLYING_DEG = (
-    15.0  # beside the flight's usual error: a map does not use angles that are so far off, either
-)
+# beside the flight's usual error: a map does not use angles that are so far off, either
+_COMPASS_OUTLYING_DEG = 15.0
 _COMPASS_AGREEING = 2 / 3  # share of the frames that must be off alike; by choice
 
 

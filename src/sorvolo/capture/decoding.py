@@ -224,9 +224,8 @@ def _open_dng(data: bytes, name: str) -> Any:
         ) from error
     try:
         return rawpy.imread(BytesIO(data))
-    except (
-        Exception
-    ) as error:  # LibRawError has many children, and OSError for what is no raw picture
+    except Exception as error:
+        # LibRawError has many children, and OSError for what is no raw picture
         raise InputError(
             f"{name} is damaged or no raw picture that is known; copy it again"
         ) from error

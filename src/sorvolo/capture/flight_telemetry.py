@@ -22,15 +22,13 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.survey.flight import CameraPrior, Notice, Telemetry
 
-_SLOWEST_M_S = (
-    0.3  # of a flight: the speed of one that hovers would ask for no second frame; by choice
-)
+# of a flight: the speed of one that hovers would ask for no second frame; by choice
+_SLOWEST_M_S = 0.3
 _LOWEST_M = 2.0  # above ground: a height of zero, as before take-off, would divide by nothing
 _PLACES_ASKED = 200  # of a flight
-_SEARCHED_SIGMAS, _SEARCHED_AGAIN_S = (
-    4,
-    1.0,
-)  # how far a clock offset is searched, first and after one was found
+# how far a clock offset is searched, first and after one was found
+_SEARCHED_SIGMAS = 4
+_SEARCHED_AGAIN_S = 1.0
 _LARGELY = 0.5  # share of samples that have a height: then it is the one that the flight counts in
 
 
@@ -77,9 +75,8 @@ class FlightTelemetry:
             return
         self.version, self.samples = source.telemetry_version, source.latest_telemetry
         if np.isfinite(self.samples["latitude_deg"]).mean() < _LARGELY:
-            self.samples = (
-                source.telemetry
-            )  # fixes failed for minutes: heights are tied to what was before
+            # fixes failed for minutes: heights are tied to what was before
+            self.samples = source.telemetry
         self.clock = tied_clock(source, self.samples, self._offset_s)
         self.track = _continued(self.track, self._laid(self.samples, self.clock)[0])
 

@@ -150,9 +150,8 @@ _SIZE_KEYS = ("imagesize", "imgsize", "framesize", "size", "resolution")
 _LARGEST_TANGENTIAL = 0.02
 """Lenses are centred well enough that |p1| and |p2| stay below this; a third coefficient above it is a k3."""
 
-_CALIBRATED_SIGMA = (
-    0.003  # relative, of a calibrated focal length, where the file states none; by choice
-)
+# relative, of a calibrated focal length, where the file states none; by choice
+_CALIBRATED_SIGMA = 0.003
 _RESIZED_SIGMA = 0.01
 """A video mode may use a part of the sensor of the same shape, which no file states."""
 

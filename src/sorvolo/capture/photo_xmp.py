@@ -257,17 +257,13 @@ def _sigma_columns(properties: Mapping[str, str]) -> dict[str, float]:
     horizontal_m = _first(properties, "camera:GPSXYAccuracy")
     vertical_m = _first(properties, "camera:GPSZAccuracy")
     for maker in ("dji", "autel"):
-        east_m, north_m = (
-            number(properties, f"{maker}:RtkStdLon"),
-            number(properties, f"{maker}:RtkStdLat"),
-        )
+        east_m = number(properties, f"{maker}:RtkStdLon")
+        north_m = number(properties, f"{maker}:RtkStdLat")
         if isfinite(east_m) and isfinite(north_m):
             horizontal_m = hypot(east_m, north_m) / 2**0.5
             vertical_m = number(properties, f"{maker}:RtkStdHgt")
-    pitch_deg, roll_deg = (
-        number(properties, "camera:IMUPitchAccuracy"),
-        number(properties, "camera:IMURollAccuracy"),
-    )
+    pitch_deg = number(properties, "camera:IMUPitchAccuracy")
+    roll_deg = number(properties, "camera:IMURollAccuracy")
     columns = {
         "horizontal_sigma_m": horizontal_m,
         "vertical_sigma_m": vertical_m,

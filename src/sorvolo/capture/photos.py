@@ -39,17 +39,14 @@ from sorvolo.survey.flight import (
 )
 
 _LOOK_AHEAD = 1  # photos decoded while one is worked on; each takes tens of megabytes
-_SAME_CLOCK_NS = (
-    600 * SECOND_NS
-)  # that a camera's clock is off its receiver's by more or less; by choice
+# that a camera's clock is off its receiver's by more or less; by choice
+_SAME_CLOCK_NS = 600 * SECOND_NS
 _STEP_NS = 1_000_000  # between photos of the same second
-_UNTIMED_STEP_NS = (
-    1_000_000_000  # between photos that state no time: their order is kept, a second each by choice
-)
+# between photos that state no time: their order is kept, a second each by choice
+_UNTIMED_STEP_NS = 1_000_000_000
 _QUARTER_TURN = 6  # EXIF's number for clockwise
-_EDGE_BYTES = (
-    65_536  # of a photo's beginning and end, by which a copy of it is recognised; by choice
-)
+# of a photo's beginning and end, by which a copy of it is recognised; by choice
+_EDGE_BYTES = 65_536
 _ONE_LENS = 1.05  # ratio of focal lengths up to which photos are of one lens; by choice
 _NAMED = 5  # photos of another camera, of those that have no common name
 _THERMAL_NAME = re.compile(r"(?:_t|^irx?_.*)$", re.IGNORECASE)  # DJI's and Autel's

@@ -239,10 +239,8 @@ def flight_facts(telemetry: Telemetry, camera: Camera, frames: FrameFacts) -> Fl
     interval_s = forward = side = math.nan
     strips = find_strips(points_m)
     if height_m > 0.5:
-        footprint_m, gsd_m = (
-            footprint_size_m(camera, height_m),
-            1 / px_per_m(height_m, camera.fx_px),
-        )
+        footprint_m = footprint_size_m(camera, height_m)
+        gsd_m = 1 / px_per_m(height_m, camera.fx_px)
         across_m, along_m = _across_and_along(footprint_m, telemetry, strips.bearing_deg)
         if speed_m_s > _MOVING_M_S:
             interval_s = 1 / minimum_frame_rate(speed_m_s, along_m, WANTED_OVERLAP)

@@ -29,11 +29,12 @@ Measured on a senseFly survey of 2013: 0.35 s, which is 3 to 5 m at its speed.
 DEFAULT_HORIZONTAL_SIGMA_M = 1.5  # the thesis's DJI Phantom 3, section 2.2
 _LONGEST_DELAY_S = 4 * FIX_DELAY_S  # that a photo's own fix is moved along the flight's path
 STARTS_TIED = "first sample tied to first frame"
+# by which clocks are set to a wrong time zone, the commonest first ...
 _ZONES_S = (
     3600,
     1800,
     900,
-)  # by which clocks are set to a wrong time zone, the commonest first ...
+)
 _FARTHEST_ZONE_S = 14 * 3600  # ... and by how much at most
 DATED_NS = 3650 * 86_400 * 10**9
 """Ten years after 1970: an earlier clock was never set."""
@@ -368,9 +369,8 @@ def track_from_telemetry(
     times = clock.sample_s[known]
     interval_s = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     changes = np.any(np.diff(east_north[known], axis=0) != 0, axis=1)
-    if (
-        not clock.is_per_photo and changes.any()
-    ):  # a 1 Hz fix repeated at frame rate is still a 1 Hz fix
+    # a 1 Hz fix repeated at frame rate is still a 1 Hz fix
+    if not clock.is_per_photo and changes.any():
         moments = times[1:][changes]
         interval_s = max(
             interval_s, float(np.median(np.diff(moments))) if len(moments) > 1 else interval_s

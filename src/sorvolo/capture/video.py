@@ -196,10 +196,8 @@ class VideoSource:
         damage: DecodingDamage,
     ) -> Frame | LostFrame:
         """A decoded picture as a frame; what is odd of it is counted."""
-        own_px, flight_px = (
-            _upright_size_px(decoded, self.info.turn),
-            (self.info.width_px, self.info.height_px),
-        )
+        own_px = _upright_size_px(decoded, self.info.turn)
+        flight_px = (self.info.width_px, self.info.height_px)
         if not is_same_shape(own_px, flight_px):
             sizes.lost += 1
             return LostFrame(index, str(index), time_ns, other_size(own_px, flight_px))

@@ -72,9 +72,8 @@ class SparseVideo:
         self._path, self._clock, self._sparse, self._deliver = path, clock, sparse, deliver
         self.decoded = self.pictures = self.last_ns = 0
         self.passed = -1, -1
-        self._key: tuple[int, Frame | LostFrame] | None = (
-            None  # the key frame that was decoded last, by its number
-        )
+        # the key frame that was decoded last, by its number
+        self._key: tuple[int, Frame | LostFrame] | None = None
 
     def frames(self) -> Iterator[Frame | LostFrame]:
         """The wanted frames, in order. Raises UnevenStreamError where only a full reading gives them."""
@@ -147,10 +146,8 @@ class SparseVideo:
     def _is_enough(self, span: Span, stream: av.VideoStream) -> bool:
         if span.next is None:
             return False
-        before, after = (
-            self._key_frame(span, span.first, stream),
-            self._key_frame(span, span.next, stream),
-        )
+        before = self._key_frame(span, span.first, stream)
+        after = self._key_frame(span, span.next, stream)
         return (
             isinstance(before, Frame)
             and isinstance(after, Frame)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from sorvolo.cli.options import AsJson, CatalogueAddress, OutFile, wanted_classes
+from sorvolo.cli.options import AsJson, CatalogueAddress, OutFile, argument, option, wanted_classes
 from sorvolo.cli.printing import FAILED, Console, new_table, print_json
 from sorvolo.cli.progress import shown_work
 from sorvolo.cli.sites import show_copy
@@ -21,7 +21,7 @@ site_app = typer.Typer(no_args_is_help=True)
 
 _MAX_FAULTS = 20  # lines on a terminal; by choice
 
-Root = Annotated[Path, typer.Argument(help="The folder that holds the site folders.")]
+Root = Annotated[Path, argument("The folder that holds the site folders.")]
 
 
 @archive_app.callback()
@@ -68,18 +68,14 @@ def index_command(
 @archive_app.command("find")
 def find_command(
     root: Root,
-    at: Annotated[str, typer.Option(help="The place: LATITUDE,LONGITUDE in degrees (WGS84).")],
-    first: Annotated[str, typer.Option("--from", help="From this date or time (UTC) on.")] = "",
-    last: Annotated[str, typer.Option("--to", help="Up to this date or time (UTC).")] = "",
+    at: Annotated[str, option("The place: LATITUDE,LONGITUDE in degrees (WGS84).")],
+    first: Annotated[str, option("From this date or time (UTC) on.", "--from")] = "",
+    last: Annotated[str, option("Up to this date or time (UTC).", "--to")] = "",
     classes: Annotated[
         str | None,
-        typer.Option(
-            "--class", help="Only flights that found one of these there, such as car,appeared."
-        ),
+        option("Only flights that found one of these there, such as car,appeared.", "--class"),
     ] = None,
-    within: Annotated[
-        float, typer.Option(help="How near a finding must be to count as there, m.")
-    ] = 2.0,
+    within: Annotated[float, option("How near a finding must be to count as there, m.")] = 2.0,
     as_json: AsJson = False,
 ) -> None:
     """List the flights that saw a place, in order of time, and what they found there.
@@ -133,7 +129,7 @@ def _words(thing: "FoundThing") -> str:
 @archive_app.command("export")
 def export_command(
     root: Annotated[
-        str, typer.Argument(help="The folder that holds the site folders, or s3://BUCKET/PREFIX.")
+        str, argument("The folder that holds the site folders, or s3://BUCKET/PREFIX.")
     ],
     out: OutFile,
     as_json: AsJson = False,
@@ -172,13 +168,13 @@ def site() -> None:
 
 @site_app.command("copy")
 def copy_command(
-    source: Annotated[str, typer.Argument(help="Folder of the map, or s3://BUCKET/NAME.")],
+    source: Annotated[str, argument("Folder of the map, or s3://BUCKET/NAME.")],
     target: Annotated[
         str,
-        typer.Argument(help="A new or empty folder or s3:// place, or that of an earlier copy."),
+        argument("A new or empty folder or s3:// place, or that of an earlier copy."),
     ],
     verify: Annotated[
-        bool, typer.Option("--verify", help="Copy nothing: compare the copy with the map.")
+        bool, option("Copy nothing: compare the copy with the map.", "--verify")
     ] = False,
     catalogue: CatalogueAddress = "",
     as_json: AsJson = False,
@@ -229,11 +225,11 @@ def copy_command(
 
 @site_app.command("prune")
 def prune_command(
-    place: Annotated[str, typer.Argument(help="The site in a store: s3://BUCKET/NAME.")],
+    place: Annotated[str, argument("The site in a store: s3://BUCKET/NAME.")],
     keep_days: Annotated[
-        float, typer.Option(min=0.0, help="Keep what was stored less than this many days ago.")
+        float, option("Keep what was stored less than this many days ago.", min=0.0)
     ] = 7.0,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Remove nothing: count.")] = False,
+    dry_run: Annotated[bool, option("Remove nothing: count.", "--dry-run")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Remove what a site in a store no longer uses: earlier maps, pictures of flights that were mapped again.

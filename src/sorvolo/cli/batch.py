@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 from rich.markup import escape
 
-from sorvolo.cli.options import AsJson, Camera, Model, Resolution
+from sorvolo.cli.options import AsJson, Camera, Model, Resolution, argument, option
 from sorvolo.cli.printing import FAILED, TO_CHECK, Console, new_table, print_json, show_path
 from sorvolo.cli.progress import ProgressReport, shown_work
 from sorvolo.errors import SettingsError
@@ -28,39 +28,37 @@ _COLOURS = {
 
 def batch(
     context: typer.Context,
-    places: Annotated[
-        list[Path], typer.Argument(help="Folders with flights, however deep, or videos.")
-    ],
+    places: Annotated[list[Path], argument("Folders with flights, however deep, or videos.")],
     root: Annotated[
         Path,
-        typer.Option(help="Folder for the results: one folder for each site, or for each watch."),
+        option("Folder for the results: one folder for each site, or for each watch."),
     ],
     mission: Annotated[
         Literal["map", "compare", "search", "watch"],
-        typer.Option(help="What to do with each flight."),
+        option("What to do with each flight."),
     ] = "map",
     site_by: Annotated[
         Literal["flight", "place"] | None,
-        typer.Option(
-            help="flight: each flight has a site of its own. place: flights near each other share one.",
+        option(
+            "flight: each flight has a site of its own. place: flights near each other share one.",
             show_default="flight; place for compare",
         ),
     ] = None,
     executor: Annotated[
         str,
-        typer.Option(
-            help="local: this machine. ray://HOST:PORT: a Ray cluster. ray: this machine's Ray, or a new one."
+        option(
+            "local: this machine. ray://HOST:PORT: a Ray cluster. ray: this machine's Ray, or a new one."
         ),
     ] = "local",
     workers: Annotated[
         int | None,
-        typer.Option(help="Flights at once, at most.", show_default="one for each core"),
+        option("Flights at once, at most.", show_default="one for each core"),
     ] = None,
     camera: Camera = "",
     gsd: Resolution = None,
     model: Model = "default",
     retry: Annotated[
-        bool, typer.Option("--retry", help="Also try flights again that were set aside.")
+        bool, option("Also try flights again that were set aside.", "--retry")
     ] = False,
     as_json: AsJson = False,
 ) -> None:

@@ -3,10 +3,9 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
 from rich.table import Table
 
-from sorvolo.cli.options import AsJson, OutFile
+from sorvolo.cli.options import AsJson, OutFile, argument, option
 from sorvolo.cli.printing import Console, print_json
 from sorvolo.survey.wording import counted
 
@@ -15,12 +14,8 @@ if TYPE_CHECKING:
 
 
 def calibrate(
-    inputs: Annotated[
-        list[Path], typer.Argument(help="Photos of the board, a folder of photos, or a video.")
-    ],
-    board: Annotated[
-        str, typer.Option(help="Inner corners of the board, such as 9x6 for 10 x 7 squares.")
-    ],
+    inputs: Annotated[list[Path], argument("Photos of the board, a folder of photos, or a video.")],
+    board: Annotated[str, option("Inner corners of the board, such as 9x6 for 10 x 7 squares.")],
     out: OutFile = Path("camera.xml"),
     as_json: AsJson = False,
 ) -> None:

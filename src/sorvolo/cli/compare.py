@@ -24,6 +24,7 @@ from sorvolo.cli.options import (
     PlaceFormatOption,
     SiteOption,
     Telemetry,
+    option,
     wanted_classes,
 )
 from sorvolo.cli.pdf import Pdf, write_pdfs
@@ -63,32 +64,30 @@ _MIN_GAP = 0.01  # of the compared ground: smaller gaps are in the report alone
 
 MethodOption = Annotated[
     Literal["robust", "thesis"],
-    typer.Option(help="robust: copes with light, shadows and wind. thesis: the baseline."),
+    option("robust: copes with light, shadows and wind. thesis: the baseline."),
 ]
-MasksFolder = Annotated[
-    Path | None, typer.Option(help="Folder for each frame's change mask and boxes.")
-]
+MasksFolder = Annotated[Path | None, option("Folder for each frame's change mask and boxes.")]
 StepsFolder = Annotated[
     Path | None,
-    typer.Option(help="Folder for pictures of method thesis's eight steps (4-8 MB a view)."),
+    option("Folder for pictures of method thesis's eight steps (4-8 MB a view)."),
 ]
 Votes = Annotated[
-    int, typer.Option(min=1, max=6, help="Views, of the last two more, that must show a change.")
+    int, option("Views, of the last two more, that must show a change.", min=1, max=6)
 ]
 UpdatesMap = Annotated[
     bool,
-    typer.Option("--update/--no-update", help="Update the map where the ground changed or is new."),
+    option("Update the map where the ground changed or is new.", "--update/--no-update"),
 ]
 Sort = Annotated[
     Literal["importance", "size", "score"],
-    typer.Option(help="Order of the printed changes; importance: people, vehicles, large things."),
+    option("Order of the printed changes; importance: people, vehicles, large things."),
 ]
 Least = Annotated[
     float,
-    typer.Option(min=0, help="Print only changes of this length or more, m, and what has a class."),
+    option("Print only changes of this length or more, m, and what has a class.", min=0),
 ]
 TrustsMap = Annotated[
-    bool, typer.Option("--trust-map", help="Compare even with a map that contradicts itself.")
+    bool, option("Compare even with a map that contradicts itself.", "--trust-map")
 ]
 
 

@@ -18,8 +18,10 @@ from sorvolo.cli.options import (
     SiteArgument,
     Truth,
     UnlabelledClasses,
+    argument,
     class_names,
     names,
+    option,
 )
 from sorvolo.cli.printing import Console, new_table, print_json
 from sorvolo.cli.progress import ProgressReport
@@ -41,13 +43,11 @@ evaluate_app = typer.Typer(no_args_is_help=True)
 
 ComparedModels = Annotated[
     list[str] | None,
-    typer.Option(help="Another model to compare on the same pictures. Can be repeated."),
+    option("Another model to compare on the same pictures. Can be repeated."),
 ]
 FromAbove = Annotated[
     bool,
-    typer.Option(
-        "--from-above", help="The pictures look straight down: models that want it look twice."
-    ),
+    option("The pictures look straight down: models that want it look twice.", "--from-above"),
 ]
 
 
@@ -60,11 +60,9 @@ def evaluate() -> None:
 def detector(
     model: Annotated[
         str,
-        typer.Argument(
-            help="A model's name or file, or detections.json; several seeds separated by commas."
-        ),
+        argument("A model's name or file, or detections.json; several seeds separated by commas."),
     ],
-    data: Annotated[list[Path], typer.Argument(help="Labelled pictures: folders or label files.")],
+    data: Annotated[list[Path], argument("Labelled pictures: folders or label files.")],
     compare: ComparedModels = None,
     classes: LabelClasses = None,
     ignore: IgnoredClasses = "",
@@ -168,11 +166,11 @@ def mosaic(
     site: SiteArgument,
     truth: Truth = None,
     reference: Annotated[
-        Path | None, typer.Option(help="A reference map: a GeoTIFF of the same ground.")
+        Path | None, option("A reference map: a GeoTIFF of the same ground.")
     ] = None,
     positions: Annotated[
         Path | None,
-        typer.Option(help="CSV of camera positions: frame,longitude_deg,latitude_deg[,height_m]."),
+        option("CSV of camera positions: frame,longitude_deg,latitude_deg[,height_m]."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -198,9 +196,7 @@ def mosaic(
 def changes(
     found: Annotated[
         str,
-        typer.Argument(
-            help="Folder of a map that was compared, or s3://BUCKET/NAME; or a folder of masks."
-        ),
+        argument("Folder of a map that was compared, or s3://BUCKET/NAME; or a folder of masks."),
     ],
     truth: Truth,
     flight: OnlyFlight = None,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from sorvolo.cli.options import Area, AsJson, Flight, OutFile, SiteArgument
+from sorvolo.cli.options import Area, AsJson, Flight, OutFile, SiteArgument, option
 from sorvolo.cli.printing import (
     TO_CHECK,
     Console,
@@ -36,9 +36,7 @@ def heights(
     flight: Flight = "",
     cell: Annotated[
         float | None,
-        typer.Option(
-            help="Side of the height model's cells, m.", show_default="3 to 6 pixels of the map"
-        ),
+        option("Side of the height model's cells, m.", show_default="3 to 6 pixels of the map"),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -71,9 +69,7 @@ def volume(
     area: Area,
     since: Annotated[
         str,
-        typer.Option(
-            help="Earlier flight to compare with.", show_default="the ground around the area"
-        ),
+        option("Earlier flight to compare with.", show_default="the ground around the area"),
     ] = "",
     flight: Flight = "",
     as_json: AsJson = False,
@@ -100,9 +96,7 @@ def volume(
 @measure_app.command()
 def profile(
     site: SiteArgument,
-    at: Annotated[
-        list[str], typer.Option(help="A place of the line, LAT,LON in degrees; give two or more.")
-    ],
+    at: Annotated[list[str], option("A place of the line, LAT,LON in degrees; give two or more.")],
     flight: Flight = "",
 ) -> None:
     """Print heights along a line as CSV: way, place, surface with its sigma, and bare ground, m.
@@ -131,7 +125,7 @@ def profile(
 def contours(
     site: SiteArgument,
     out: OutFile,
-    interval: Annotated[float, typer.Option(help="Difference in height between lines, m.")] = 1.0,
+    interval: Annotated[float, option("Difference in height between lines, m.")] = 1.0,
     flight: Flight = "",
 ) -> None:
     """Write contour lines of the bare ground.

@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.markup import escape
 
-from sorvolo.cli.options import AsJson, OnlyFlight, PlaceFormat, PlaceFormatOption, SiteArgument
+from sorvolo.cli.options import (
+    AsJson,
+    OnlyFlight,
+    PlaceFormat,
+    PlaceFormatOption,
+    SiteArgument,
+    argument,
+    option,
+)
 from sorvolo.cli.printing import Console, new_table, place_heading, place_words, print_json, site_of
 from sorvolo.cli.sites import opened_site
 from sorvolo.errors import SettingsError
@@ -25,12 +33,12 @@ def history(
     site: SiteArgument,
     at: Annotated[
         str | None,
-        typer.Option(help="Version number, or a date or time (UTC): the newest version by then."),
+        option("Version number, or a date or time (UTC): the newest version by then."),
     ] = None,
     export: Annotated[
         Path | None,
-        typer.Option(
-            help="Write the map as it was: FILE.tif, .png, .kmz, .mbtiles or .pdf; or its heights: .laz."
+        option(
+            "Write the map as it was: FILE.tif, .png, .kmz, .mbtiles or .pdf; or its heights: .laz."
         ),
     ] = None,
     coordinates: PlaceFormatOption = "latlon",
@@ -116,19 +124,17 @@ def review(
     site: SiteArgument,
     ids: Annotated[
         list[str] | None,
-        typer.Argument(
-            help="Changes to judge: their ids, or numbers with --flight.",
+        argument(
+            "Changes to judge: their ids, or numbers with --flight.",
             show_default="list all changes",
         ),
     ] = None,
-    confirm: Annotated[bool, typer.Option("--confirm", help="These changes are real.")] = False,
+    confirm: Annotated[bool, option("These changes are real.", "--confirm")] = False,
     reject: Annotated[
         bool,
-        typer.Option(
-            "--reject", help="These are no changes; later flights will not report them again."
-        ),
+        option("These are no changes; later flights will not report them again.", "--reject"),
     ] = False,
-    note: Annotated[str, typer.Option(help="Why, in your own words.")] = "",
+    note: Annotated[str, option("Why, in your own words.")] = "",
     flight: OnlyFlight = None,
     coordinates: PlaceFormatOption = "latlon",
     as_json: AsJson = False,

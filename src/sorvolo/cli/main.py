@@ -28,6 +28,7 @@ from sorvolo.cli.history import history, review
 from sorvolo.cli.inspect import inspect
 from sorvolo.cli.map import map_command
 from sorvolo.cli.models import models_app
+from sorvolo.cli.options import option
 from sorvolo.cli.plan import plan
 from sorvolo.cli.printing import FAILED, STOPPED
 from sorvolo.cli.progress import IS_QUIET
@@ -154,22 +155,20 @@ def options(
     context: typer.Context,
     version: Annotated[
         bool,
-        typer.Option(
-            "--version", callback=_print_version, is_eager=True, help="Print the version and stop."
-        ),
+        option("Print the version and stop.", "--version", callback=_print_version, is_eager=True),
     ] = False,
     debug: Annotated[
-        bool, typer.Option("--debug", help="Show where in the program an error occurred.")
+        bool, option("Show where in the program an error occurred.", "--debug")
     ] = False,
     quiet: Annotated[
-        bool, typer.Option("--quiet", help="Show no progress; results, warnings and errors stay.")
+        bool, option("Show no progress; results, warnings and errors stay.", "--quiet")
     ] = False,
     verbose: Annotated[
-        bool, typer.Option("--verbose", help="Log each step to stderr, in place of bars.")
+        bool, option("Log each step to stderr, in place of bars.", "--verbose")
     ] = False,
     config: Annotated[
         Path | None,
-        typer.Option(help="A TOML file with a table of options for each command, such as `map`."),
+        option("A TOML file with a table of options for each command, such as `map`."),
     ] = None,
 ) -> None:
     """Maps from small drones: geo-referenced, compared with earlier flights, searched for people and cars.

@@ -26,6 +26,7 @@ from sorvolo.cli.options import (
     SiteOption,
     Telemetry,
     names,
+    option,
     wanted_classes,
 )
 from sorvolo.cli.pdf import Pdf, write_pdfs
@@ -53,36 +54,30 @@ _MAX_REASONS = 6  # of frames that are not on the map, the commonest first
 
 MethodOption = Annotated[
     Literal["planar", "thesis"],
-    typer.Option(help="planar: all frames fitted together. thesis: the baseline, frame by frame."),
+    option("planar: all frames fitted together. thesis: the baseline, frame by frame."),
 ]
 CoordinateSystem = Annotated[
     str,
-    typer.Option(
-        help="Coordinate system of mosaic.tif, such as EPSG:25832.", show_default="the UTM zone"
-    ),
+    option("Coordinate system of mosaic.tif, such as EPSG:25832.", show_default="the UTM zone"),
 ]
 ControlPoints = Annotated[
     Path | None,
-    typer.Option(help="Ground control points: a gcp_list.txt, as OpenDroneMap reads it."),
+    option("Ground control points: a gcp_list.txt, as OpenDroneMap reads it."),
 ]
-ControlAccuracy = Annotated[
-    float, typer.Option(help="Accuracy of the control points, m (1 sigma).")
-]
+ControlAccuracy = Annotated[float, option("Accuracy of the control points, m (1 sigma).")]
 CheckPoints = Annotated[
     str,
-    typer.Option(
-        help="Control points held back to measure the map: labels with commas; CP* for a prefix."
-    ),
+    option("Control points held back to measure the map: labels with commas; CP* for a prefix."),
 ]
 BaseMap = Annotated[
     Path | None,
-    typer.Option(help="Tie the map to this one: a GeoTIFF, or the folder of an earlier map."),
+    option("Tie the map to this one: a GeoTIFF, or the folder of an earlier map."),
 ]
 WithHeights = Annotated[
     bool | None,
-    typer.Option(
+    option(
+        "True orthophoto over measured heights, or a flat map.",
         "--heights/--flat",
-        help="True orthophoto over measured heights, or a flat map.",
         show_default="heights where the ground is not level",
     ),
 ]

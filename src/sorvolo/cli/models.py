@@ -9,7 +9,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from sorvolo.cli.options import AsJson
+from sorvolo.cli.options import AsJson, argument, option
 from sorvolo.cli.printing import FAILED, Console, facts_table, new_table, print_json
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.paths import Json, JsonView
@@ -82,7 +82,7 @@ def _show_hidden() -> None:
 
 @models_app.command()
 def show(
-    model: Annotated[str, typer.Argument(help="A model's name, or a .onnx file.")] = "default",
+    model: Annotated[str, argument("A model's name, or a .onnx file.")] = "default",
     as_json: AsJson = False,
 ) -> None:
     """Show a model: its classes, score thresholds and object sizes, licence, card.
@@ -125,11 +125,9 @@ def show(
 @models_app.command()
 def verify(
     model: Annotated[
-        str, typer.Argument(help="A model's name, or a .onnx file.", show_default="all installed")
+        str, argument("A model's name, or a .onnx file.", show_default="all installed")
     ] = "",
-    sha256: Annotated[
-        str, typer.Option(help="Expected SHA-256.", show_default="the recorded one")
-    ] = "",
+    sha256: Annotated[str, option("Expected SHA-256.", show_default="the recorded one")] = "",
 ) -> None:
     """Check that models are complete, unchanged and can run. The exit code is 1 if one fails.
 
@@ -167,19 +165,17 @@ def verify(
 
 @models_app.command("import")
 def import_file(
-    file: Annotated[Path, typer.Argument(help="An .onnx file of another maker.")],
-    name: Annotated[
-        str, typer.Option(help="Its name for --model.", show_default="the file's")
-    ] = "",
+    file: Annotated[Path, argument("An .onnx file of another maker.")],
+    name: Annotated[str, option("Its name for --model.", show_default="the file's")] = "",
     layout: Annotated[
         str,
-        typer.Option(
-            help="yolov8 (also YOLO11), yolov5, yolox, yolov10 (NMS inside), rtdetr, dfine, rfdetr or nanodet."
+        option(
+            "yolov8 (also YOLO11), yolov5, yolox, yolov10 (NMS inside), rtdetr, dfine, rfdetr or nanodet."
         ),
     ] = "auto",
     classes: Annotated[
         str,
-        typer.Option(help="Its classes in its order.", show_default="as in the file, or COCO's"),
+        option("Its classes in its order.", show_default="as in the file, or COCO's"),
     ] = "",
 ) -> None:
     """Install a YOLO, RT-DETR, NanoDet or similar ONNX file as a model of your own.

@@ -2,161 +2,153 @@
 
 import re
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 from sorvolo.errors import SettingsError
 
-Inputs = Annotated[
-    list[str], typer.Argument(help="Videos, folders of photos, photos, or live sources.")
-]
-SiteArgument = Annotated[str, typer.Argument(help="Folder of the map, or s3://BUCKET/NAME.")]
-SiteOption = Annotated[str, typer.Option("--site", help="Folder of the map, or s3://BUCKET/NAME.")]
+
+def option(words: str, *names: str, **more: Any) -> Any:
+    """An option by its help; `names` where it is called other than its parameter."""
+    return typer.Option(*names, help=words, **more)
+
+
+def argument(words: str, **more: Any) -> Any:
+    """An argument by its help."""
+    return typer.Argument(help=words, **more)
+
+
+Inputs = Annotated[list[str], argument("Videos, folders of photos, photos, or live sources.")]
+SiteArgument = Annotated[str, argument("Folder of the map, or s3://BUCKET/NAME.")]
+SiteOption = Annotated[str, option("Folder of the map, or s3://BUCKET/NAME.", "--site")]
 Flight = Annotated[
-    str, typer.Option(help="Flight of the map, by its name.", show_default="its newest or only one")
+    str, option("Flight of the map, by its name.", show_default="its newest or only one")
 ]
-OnlyFlight = Annotated[str | None, typer.Option("--flight", help="Only this flight.")]
+OnlyFlight = Annotated[str | None, option("Only this flight.", "--flight")]
 Telemetry = Annotated[
     str | None,
-    typer.Option(
-        help="The flight's log, or photos' geo.txt or Timestamp.MRK, if not beside the pictures; live: the receiver's address."
+    option(
+        "The flight's log, or photos' geo.txt or Timestamp.MRK, if not beside the pictures; live: the receiver's address."
     ),
 ]
 Camera = Annotated[
     str,
-    typer.Option(
-        help="Camera: a calibration file, a drone's name such as 'Mavic 2 Pro', or aov=DEGREES."
-    ),
+    option("Camera: a calibration file, a drone's name such as 'Mavic 2 Pro', or aov=DEGREES."),
 ]
 Area = Annotated[
     Path | None,
-    typer.Option(help="Outline of the area: GeoJSON, KML, KMZ, .plan, or a list of corners."),
+    option("Outline of the area: GeoJSON, KML, KMZ, .plan, or a list of corners."),
 ]
 Offset = Annotated[
     float | None,
-    typer.Option(
-        help="Seconds to add to the pictures' time to get the log's: 7200 if the camera's clock is two hours behind.",
+    option(
+        "Seconds to add to the pictures' time to get the log's: 7200 if the camera's clock is two hours behind.",
         show_default="from motion or clocks",
     ),
 ]
 GroundElevation = Annotated[
     float | None,
-    typer.Option(help="Elevation of the ground, m, in the telemetry's own height reference."),
+    option("Elevation of the ground, m, in the telemetry's own height reference."),
 ]
 Resolution = Annotated[
     float | None,
-    typer.Option(
-        "--gsd", help="Ground resolution of a new map, m a pixel.", show_default="the frames' own"
-    ),
+    option("Ground resolution of a new map, m a pixel.", "--gsd", show_default="the frames' own"),
 ]
 Model = Annotated[
-    str, typer.Option(help="Detector: a name from `sorvolo models list`, a .onnx file, or none.")
+    str, option("Detector: a name from `sorvolo models list`, a .onnx file, or none.")
 ]
 Classes = Annotated[
     str | None,
-    typer.Option(
-        help="What to look for: person,car,small object.",
-        show_default="what the model usually reports",
+    option(
+        "What to look for: person,car,small object.", show_default="what the model usually reports"
     ),
 ]
 EnoughLookedAt = Annotated[
     float,
-    typer.Option(help="Exit code 3 where a smaller share of the flown ground was looked at."),
+    option("Exit code 3 where a smaller share of the flown ground was looked at."),
 ]
-FlightHeight = Annotated[
-    float | None, typer.Option("--height", help="Flight height above ground, m.")
-]
-OutFile = Annotated[Path, typer.Option("--out", help="File to write.")]
-OutFolder = Annotated[Path, typer.Option("--out", help="Folder for results.")]
-GiveUp = Annotated[
-    float, typer.Option(help="End a live source after this many seconds without a picture.")
-]
+FlightHeight = Annotated[float | None, option("Flight height above ground, m.", "--height")]
+OutFile = Annotated[Path, option("File to write.", "--out")]
+OutFolder = Annotated[Path, option("Folder for results.", "--out")]
+GiveUp = Annotated[float, option("End a live source after this many seconds without a picture.")]
 Again = Annotated[
-    bool, typer.Option("--again", help="Repeat the flight, and discard what a stopped run left.")
+    bool, option("Repeat the flight, and discard what a stopped run left.", "--again")
 ]
 Refly = Annotated[
     list[Path] | None,
-    typer.Option(
-        help="Write waypoints over ground that was missed: .plan, .kmz (DJI), .geojson, .kml. Can be repeated."
+    option(
+        "Write waypoints over ground that was missed: .plan, .kmz (DJI), .geojson, .kml. Can be repeated."
     ),
 ]
 DjiDrone = Annotated[
     str,
-    typer.Option(
-        help="For a .kmz: fly (DJI Fly), m300, m350, m30, m30t, m3e, m3t, m3m, m3d, m3td."
-    ),
+    option("For a .kmz: fly (DJI Fly), m300, m350, m30, m30t, m3e, m3t, m3m, m3d, m3td."),
 ]
 ResultsFolder = Annotated[
-    Path | None, typer.Option("--out", help="Folder for results.", show_default="beside the input")
+    Path | None, option("Folder for results.", "--out", show_default="beside the input")
 ]
 Cot = Annotated[
     str,
-    typer.Option(
-        help="Send objects or the track to TAK: udp://host:port, tcp://host:port, tls://host:port."
-    ),
+    option("Send objects or the track to TAK: udp://host:port, tcp://host:port, tls://host:port."),
 ]
-Authority = Annotated[Path | None, typer.Option(help="Authority of the server's certificate, PEM.")]
+Authority = Annotated[Path | None, option("Authority of the server's certificate, PEM.")]
 CotCertificate = Annotated[
-    Path | None, typer.Option(help="For tls://: own certificate and its key in one PEM file.")
+    Path | None, option("For tls://: own certificate and its key in one PEM file.")
 ]
 AlertCommand = Annotated[
     str,
-    typer.Option(
-        help="Program to run for each object; {flight} {id} {class} {score} {latitude} {longitude} {time} {crop}."
+    option(
+        "Program to run for each object; {flight} {id} {class} {score} {latitude} {longitude} {time} {crop}."
     ),
 ]
-AlertUrl = Annotated[str, typer.Option(help="Post each new object to this web address as JSON.")]
+AlertUrl = Annotated[str, option("Post each new object to this web address as JSON.")]
 SearchRate = Annotated[
     float | None,
-    typer.Option(
-        help="Frames searched per second of flight.", show_default="10; live: as many as possible"
-    ),
+    option("Frames searched per second of flight.", show_default="10; live: as many as possible"),
 ]
 LeastScore = Annotated[
     float | None,
-    typer.Option(help="Lowest score to report, 0 to 1.", show_default="each class's own"),
+    option("Lowest score to report, 0 to 1.", show_default="each class's own"),
 ]
 CatalogueAddress = Annotated[
     str,
-    typer.Option(
-        help="Database of a new map or index: postgresql://USER@HOST/DATABASE with PostGIS, or sqlite.",
+    option(
+        "Database of a new map or index: postgresql://USER@HOST/DATABASE with PostGIS, or sqlite.",
         show_default="a file in the folder",
     ),
 ]
 Truth = Annotated[
-    Path | None, typer.Option(help="Folder that `sorvolo simulate` made, or of true change masks.")
+    Path | None, option("Folder that `sorvolo simulate` made, or of true change masks.")
 ]
-Seed = Annotated[int | None, typer.Option(help="Random seed; the same seed gives the same result.")]
+Seed = Annotated[int | None, option("Random seed; the same seed gives the same result.")]
 LabelClasses = Annotated[
     str | None,
-    typer.Option("--classes", help="Class names of the labels as ours: Pedestrian=person,Van=car."),
+    option("Class names of the labels as ours: Pedestrian=person,Van=car.", "--classes"),
 ]
 IgnoredClasses = Annotated[
-    str, typer.Option("--ignore", help="Class names whose boxes are ignored: Bicycle,DontCare.")
+    str, option("Class names whose boxes are ignored: Bicycle,DontCare.", "--ignore")
 ]
 UnlabelledClasses = Annotated[
     str,
-    typer.Option(
-        "--unlabelled", help="Our classes that the pictures may show without a label: person."
-    ),
+    option("Our classes that the pictures may show without a label: person.", "--unlabelled"),
 ]
 GroupPattern = Annotated[
     str | None,
-    typer.Option(help="Regular expression; its group is the video's name in a picture's path."),
+    option("Regular expression; its group is the video's name in a picture's path."),
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
+AsJson = Annotated[bool, option("Print JSON instead of tables.", "--json")]
 
 
 PlaceFormat = Literal["latlon", "utm", "mgrs"]
 PlaceFormatOption = Annotated[
-    PlaceFormat, typer.Option("--coordinates", help="How places are written: latlon, utm or mgrs.")
+    PlaceFormat, option("How places are written: latlon, utm or mgrs.", "--coordinates")
 ]
 
 
 SaveOption = Annotated[
     Literal["none", "video", "pictures"],
-    typer.Option("--save", help="Keep the frames with the objects drawn in."),
+    option("Keep the frames with the objects drawn in.", "--save"),
 ]
 
 

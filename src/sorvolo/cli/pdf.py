@@ -8,8 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
+from sorvolo.cli.options import option
 from sorvolo.cli.printing import Console, show_path
 from sorvolo.errors import SettingsError, StoreError
 from sorvolo.store.atomic import atomic_path
@@ -37,9 +36,7 @@ def _checked(is_wanted: bool) -> bool:
     return is_wanted and bool(_browser())  # refused before the work begins
 
 
-Pdf = Annotated[
-    bool, typer.Option("--pdf", callback=_checked, help="Print the pages as PDFs beside them.")
-]
+Pdf = Annotated[bool, option("Print the pages as PDFs beside them.", "--pdf", callback=_checked)]
 
 
 def write_pdfs(pages: Iterable[Path], console: Console) -> None:

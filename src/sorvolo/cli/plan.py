@@ -5,9 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import typer
-
-from sorvolo.cli.options import Area, AsJson, Camera, DjiDrone, FlightHeight, Model, size_px
+from sorvolo.cli.options import Area, AsJson, Camera, DjiDrone, FlightHeight, Model, option, size_px
 from sorvolo.cli.printing import Console, facts_table, print_json
 from sorvolo.errors import SettingsError
 
@@ -18,38 +16,30 @@ if TYPE_CHECKING:
 
 TaskOption = Annotated[
     Literal["detection", "recognition", "identification"],
-    typer.Option(
-        help="detection: something is there. recognition: it is a person. identification: who."
-    ),
+    option("detection: something is there. recognition: it is a person. identification: who."),
 ]
 CriticalDimension = Annotated[
     float | None,
-    typer.Option(
-        help="Smallest side of another object to be made out, m.", show_default="a person's"
-    ),
+    option("Smallest side of another object to be made out, m.", show_default="a person's"),
 ]
-HighestFlight = Annotated[
-    float, typer.Option(help="Highest flight allowed, m: the law's in most countries.")
-]
-GroundSpeed = Annotated[float, typer.Option(help="Ground speed, m/s.")]
-ForwardOverlap = Annotated[float, typer.Option(help="Overlap of consecutive pictures, 0 to 0.95.")]
-SideOverlap = Annotated[float, typer.Option(help="Overlap of neighbouring strips, 0 to 0.95.")]
+HighestFlight = Annotated[float, option("Highest flight allowed, m: the law's in most countries.")]
+GroundSpeed = Annotated[float, option("Ground speed, m/s.")]
+ForwardOverlap = Annotated[float, option("Overlap of consecutive pictures, 0 to 0.95.")]
+SideOverlap = Annotated[float, option("Overlap of neighbouring strips, 0 to 0.95.")]
 StripBearing = Annotated[
     float | None,
-    typer.Option(help="Direction of the strips, deg from north.", show_default="along the area"),
+    option("Direction of the strips, deg from north.", show_default="along the area"),
 ]
 ThroughTrees = Annotated[
     float | None,
-    typer.Option(
-        help="Plan for `search --through-trees` below crowns that hide this share of the floor, such as 0.6."
+    option(
+        "Plan for `search --through-trees` below crowns that hide this share of the floor, such as 0.6."
     ),
 ]
-PictureSize = Annotated[str, typer.Option(help="Picture size, such as 1920x1080.")]
+PictureSize = Annotated[str, option("Picture size, such as 1920x1080.")]
 WaypointFiles = Annotated[
     list[Path] | None,
-    typer.Option(
-        help="File to write: .plan (QGroundControl), .kmz (DJI), .geojson or .kml. Can be repeated."
-    ),
+    option("File to write: .plan (QGroundControl), .kmz (DJI), .geojson or .kml. Can be repeated."),
 ]
 
 

@@ -8,7 +8,7 @@ from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
-from sorvolo.cli.options import AsJson, OutFolder
+from sorvolo.cli.options import AsJson, OutFolder, argument, option
 from sorvolo.cli.printing import TO_CHECK, Console, print_json
 from sorvolo.cli.progress import ProgressReport
 from sorvolo.errors import SettingsError
@@ -20,23 +20,13 @@ if TYPE_CHECKING:
 _DEFAULT_OUT = Path("reproduction")
 
 
-Dataset = Annotated[
-    Path | None, typer.Argument(help="The UMCD dataset's folder, in the thesis's layout.")
-]
-Simulated = Annotated[
-    bool, typer.Option("--simulated", help="Simulate a dataset in the same layout instead.")
-]
-Quick = Annotated[bool, typer.Option("--quick", help="Only a try: one short path, small pictures.")]
-VideoCount = Annotated[
-    int | None, typer.Option(help="At most this many videos of each environment and part.")
-]
-Okutama = Annotated[
-    Path | None, typer.Option(help="Okutama-Action's folder, for its column of Table 4.6.")
-]
-Npu = Annotated[
-    Path | None, typer.Option(help="The NPU Drone-Map dataset's folder, for Table 4.1.")
-]
-TrainSteps = Annotated[int, typer.Option(help="Steps of each network of Table 4.6; 0: train none.")]
+Dataset = Annotated[Path | None, argument("The UMCD dataset's folder, in the thesis's layout.")]
+Simulated = Annotated[bool, option("Simulate a dataset in the same layout instead.", "--simulated")]
+Quick = Annotated[bool, option("Only a try: one short path, small pictures.", "--quick")]
+VideoCount = Annotated[int | None, option("At most this many videos of each environment and part.")]
+Okutama = Annotated[Path | None, option("Okutama-Action's folder, for its column of Table 4.6.")]
+Npu = Annotated[Path | None, option("The NPU Drone-Map dataset's folder, for Table 4.1.")]
+TrainSteps = Annotated[int, option("Steps of each network of Table 4.6; 0: train none.")]
 
 
 def reproduce(

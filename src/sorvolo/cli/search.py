@@ -20,6 +20,8 @@ from sorvolo.cli.options import (
     ResultsFolder,
     SiteOption,
     Telemetry,
+    argument,
+    option,
     wanted_classes,
 )
 from sorvolo.cli.pdf import Pdf, write_pdfs
@@ -36,7 +38,7 @@ from sorvolo.cli.printing import (
 from sorvolo.cli.progress import ProgressReport, show_progress
 from sorvolo.cli.sites import ended_by_signal, opened_site, run_on_site
 from sorvolo.errors import SettingsError
-from sorvolo.paths import Json
+from sorvolo.paths import Json, JsonView
 
 if TYPE_CHECKING:
     from sorvolo.cli.sites import OpenedSite
@@ -44,34 +46,30 @@ if TYPE_CHECKING:
 
 Flights = Annotated[
     list[str] | None,
-    typer.Option(help="Flight to measure. Can be repeated.", show_default="all flights of the map"),
+    option("Flight to measure. Can be repeated.", show_default="all flights of the map"),
 ]
 Segments = Annotated[
     Path | None,
-    typer.Option(help="Segments as GeoJSON polygons with the property poa (probability of area)."),
+    option("Segments as GeoJSON polygons with the property poa (probability of area)."),
 ]
-Plants = Annotated[
-    int, typer.Option(help="People, and cars, to plant: more take longer and are surer.")
-]
+Plants = Annotated[int, option("People, and cars, to plant: more take longer and are surer.")]
 Plant = Annotated[
     list[Path] | None,
-    typer.Option(
-        help="Photos or a video of a person from straight above, or cut-outs with transparency, to plant in place of "
+    option(
+        "Photos or a video of a person from straight above, or cut-outs with transparency, to plant in place of "
         "drawn people. Can be repeated."
     ),
 ]
 PlantCm = Annotated[
     float | None,
-    typer.Option(
-        help="Centimetres of ground that a pixel of --plant covers.", show_default="by its height"
-    ),
+    option("Centimetres of ground that a pixel of --plant covers.", show_default="by its height"),
 ]
-Enough = Annotated[float, typer.Option(help="Ground with a lower probability is a hole.")]
+Enough = Annotated[float, option("Ground with a lower probability is a hole.")]
 ThroughTrees = Annotated[
     bool,
-    typer.Option(
+    option(
+        "Look for people below crowns: put all pictures together on the forest floor, in place of measuring.",
         "--through-trees",
-        help="Look for people below crowns: put all pictures together on the forest floor, in place of measuring.",
     ),
 ]
 
@@ -79,8 +77,8 @@ ThroughTrees = Annotated[
 def search_command(
     inputs: Annotated[
         list[str],
-        typer.Argument(
-            help="The folder of a map, or s3://BUCKET/NAME; or flights (videos, photos, a live source) to map into --site."
+        argument(
+            "The folder of a map, or s3://BUCKET/NAME; or flights (videos, photos, a live source) to map into --site."
         ),
     ],
     site: SiteOption = "",
@@ -172,53 +170,9 @@ def search_command(
     if as_json:
         print_json({"folder": str(outputs.folder), **report})
     elif through_trees:
-        console = Console()
-        console.print(escape(report["headline"]["text"]), style="bold", soft_wrap=True)
-        for row in report["people"]:
-            where = f"{row['latitude_deg']:.6f}, {row['longitude_deg']:.6f}"
-            pictures = ", ".join(row["pictures"])
-            announce_person(f"{where}  {row['anomaly']:.0f} sigmas, see {pictures}", console)
-        show_notices_and_warnings(report, console)
-        for name, file in (
-            ("page", "under_trees.html"),
-            ("GeoTIFF", "under_trees.tif"),
-            ("places", "under_trees.geojson"),
-        ):
-            show_path(name, outputs.folder / file, console)
+        _show_under_trees(report, outputs.folder, Console())
     else:
-        console = Console()
-        text = report["headline"]["text"]
-        console.print(escape(text[:1].upper() + text[1:]), style="bold", soft_wrap=True)
-        table = Table("class", "POD", "90 % interval", "area", "seen", "sweep width", "coverage")
-        for label, row in report["classes"].items():
-            width = "" if row["sweep_width_m"] is None else f"{row['sweep_width_m']:.1f} m"
-            table.add_row(
-                escape(label),
-                f"{row['pod']:.2f}",
-                f"{row['pod_low']:.2f} to {row['pod_high']:.2f}",
-                f"{row['area_m2']:,.0f} m2",
-                f"{row['seen_m2']:,.0f} m2",
-                width,
-                f"{row['coverage']:.2f}",
-            )
-        console.print(table)
-        if report["segments"]:
-            segments = Table("segment", "POA", "POD", "POS", "left")
-            for segment in report["segments"]:
-                segments.add_row(
-                    escape(segment["name"]),
-                    *(f"{segment[key]:.2f}" for key in ("poa", "pod", "pos", "left")),
-                )
-            console.print(segments)
-        show_notices_and_warnings(report, console)
-        for name, file in (
-            ("page", "search.html"),
-            ("GeoTIFF", "pod.tif"),
-            ("areas", "pod.geojson"),
-        ):
-            show_path(name, outputs.folder / file, console)
-        for path in outputs.refly if report["refly"] else ():
-            show_path("re-fly", path, console)
+        _show(report, outputs.folder, outputs.refly, Console())
     if pdf:
         page = "under_trees.html" if through_trees else "search.html"
         write_pdfs([outputs.folder / page], Console(stderr=as_json))
@@ -240,6 +194,21 @@ def _look_through_trees(place: "OpenedSite", outputs: "SearchOutputs", plants: i
             else:
                 progress.show(f"under the trees of {update.flight}: {update.stage},", update.number, update.total)  # fmt: skip
     return report
+
+
+def _show_under_trees(report: JsonView, folder: Path, console: Console) -> None:
+    console.print(escape(report["headline"]["text"]), style="bold", soft_wrap=True)
+    for row in report["people"]:
+        where = f"{row['latitude_deg']:.6f}, {row['longitude_deg']:.6f}"
+        pictures = ", ".join(row["pictures"])
+        announce_person(f"{where}  {row['anomaly']:.0f} sigmas, see {pictures}", console)
+    show_notices_and_warnings(report, console)
+    for name, file in (
+        ("page", "under_trees.html"),
+        ("GeoTIFF", "under_trees.tif"),
+        ("places", "under_trees.geojson"),
+    ):
+        show_path(name, folder / file, console)
 
 
 def _map_all(
@@ -301,3 +270,34 @@ def _map_of(inputs: Sequence[str]) -> str:
     raise SettingsError(
         f"{found}; give the folder of a map, or flights and --site FOLDER to map them into"
     )
+
+
+def _show(report: JsonView, folder: Path, refly: tuple[Path, ...], console: Console) -> None:
+    text = report["headline"]["text"]
+    console.print(escape(text[:1].upper() + text[1:]), style="bold", soft_wrap=True)
+    table = Table("class", "POD", "90 % interval", "area", "seen", "sweep width", "coverage")
+    for label, row in report["classes"].items():
+        width = "" if row["sweep_width_m"] is None else f"{row['sweep_width_m']:.1f} m"
+        table.add_row(
+            escape(label),
+            f"{row['pod']:.2f}",
+            f"{row['pod_low']:.2f} to {row['pod_high']:.2f}",
+            f"{row['area_m2']:,.0f} m2",
+            f"{row['seen_m2']:,.0f} m2",
+            width,
+            f"{row['coverage']:.2f}",
+        )
+    console.print(table)
+    if report["segments"]:
+        segments = Table("segment", "POA", "POD", "POS", "left")
+        for segment in report["segments"]:
+            segments.add_row(
+                escape(segment["name"]),
+                *(f"{segment[key]:.2f}" for key in ("poa", "pod", "pos", "left")),
+            )
+        console.print(segments)
+    show_notices_and_warnings(report, console)
+    for name, file in (("page", "search.html"), ("GeoTIFF", "pod.tif"), ("areas", "pod.geojson")):
+        show_path(name, folder / file, console)
+    for path in refly if report["refly"] else ():
+        show_path("re-fly", path, console)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from sorvolo.cli.options import AsJson, Authority, Cot, CotCertificate
+from sorvolo.cli.options import AsJson, Authority, Cot, CotCertificate, argument, option
 from sorvolo.cli.printing import Console, new_table, print_json
 from sorvolo.cli.sites import show_copy
 from sorvolo.errors import InputError, SettingsError
@@ -25,65 +25,59 @@ _NEEDED = ("fastapi", "uvicorn", "websockets", "titiler.core", "prometheus_clien
 
 Root = Annotated[
     str,
-    typer.Argument(
-        help="Folder that holds the sites, or s3://BUCKET/PREFIX; a site itself will do."
-    ),
+    argument("Folder that holds the sites, or s3://BUCKET/PREFIX; a site itself will do."),
 ]
 Host = Annotated[
     str,
-    typer.Option(help="Address to listen at; others than this machine's own need TLS and tokens."),
+    option("Address to listen at; others than this machine's own need TLS and tokens."),
 ]
-Port = Annotated[int, typer.Option(help="Port to listen at.")]
-Certificate = Annotated[Path | None, typer.Option(help="TLS certificate, PEM.")]
-Key = Annotated[Path | None, typer.Option(help="TLS key, PEM.")]
+Port = Annotated[int, option("Port to listen at.")]
+Certificate = Annotated[Path | None, option("TLS certificate, PEM.")]
+Key = Annotated[Path | None, option("TLS key, PEM.")]
 InsecureLan = Annotated[
-    bool, typer.Option("--insecure-lan", help="Listen without TLS in a network that you trust.")
+    bool, option("Listen without TLS in a network that you trust.", "--insecure-lan")
 ]
 Names = Annotated[
-    list[str] | None, typer.Option("--name", help="A host name that browsers use. Can be repeated.")
+    list[str] | None, option("A host name that browsers use. Can be repeated.", "--name")
 ]
 PublicUrl = Annotated[
     str,
-    typer.Option(
-        help="Address of a TLS proxy on this machine before the station, such as https://maps.example."
+    option(
+        "Address of a TLS proxy on this machine before the station, such as https://maps.example."
     ),
 ]
-BaseMap = Annotated[
-    Path | None, typer.Option(help="Base map that pages show below the maps, PMTiles.")
-]
+BaseMap = Annotated[Path | None, option("Base map that pages show below the maps, PMTiles.")]
 StreamFrom = Annotated[
     list[str] | None,
-    typer.Option(
-        help="Network whose cameras the station may connect to, such as 192.168.1.0/24. Can be repeated."
+    option(
+        "Network whose cameras the station may connect to, such as 192.168.1.0/24. Can be repeated."
     ),
 ]
-Opens = Annotated[bool, typer.Option("--open", help="Open the page in a browser.")]
+Opens = Annotated[bool, option("Open the page in a browser.", "--open")]
 Webhooks = Annotated[
     list[str] | None,
-    typer.Option(
-        "--webhook",
-        help="Web address to post new objects and changes to, signed (HMAC) by SORVOLO_WEBHOOK_SECRET if set. "
+    option(
+        "Web address to post new objects and changes to, signed (HMAC) by SORVOLO_WEBHOOK_SECRET if set. "
         "Can be repeated.",
+        "--webhook",
     ),
 ]
 Mqtt = Annotated[
     str,
-    typer.Option(
-        help="MQTT broker: mqtt://HOST:PORT/PREFIX (port, prefix optional), mqtts://USER@HOST; password: "
+    option(
+        "MQTT broker: mqtt://HOST:PORT/PREFIX (port, prefix optional), mqtts://USER@HOST; password: "
         "SORVOLO_MQTT_PASSWORD."
     ),
 ]
 LogJson = Annotated[
-    bool, typer.Option("--log-json", help="Log each request and fault as a line of JSON on stderr.")
+    bool, option("Log each request and fault as a line of JSON on stderr.", "--log-json")
 ]
 TokenName = Annotated[
-    str, typer.Argument(help="Who it is for, such as a person's name.", show_default="list tokens")
+    str, argument("Who it is for, such as a person's name.", show_default="list tokens")
 ]
-TokenRole = Annotated[
-    str, typer.Option(help="view, review (also judge), or operate (also run missions).")
-]
-Days = Annotated[float | None, typer.Option(help="Days until it expires.", show_default="never")]
-Revoke = Annotated[bool, typer.Option("--revoke", help="Revoke the token of this name.")]
+TokenRole = Annotated[str, option("view, review (also judge), or operate (also run missions).")]
+Days = Annotated[float | None, option("Days until it expires.", show_default="never")]
+Revoke = Annotated[bool, option("Revoke the token of this name.", "--revoke")]
 
 
 def serve(

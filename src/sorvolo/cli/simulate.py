@@ -11,7 +11,7 @@ import typer
 from sorvolo import __version__
 from sorvolo.cli.compare import read_results, show_results
 from sorvolo.cli.map import show_reports
-from sorvolo.cli.options import AsJson, FlightHeight, Seed
+from sorvolo.cli.options import AsJson, FlightHeight, Seed, argument, option
 from sorvolo.cli.printing import Console, read_json
 from sorvolo.cli.progress import ProgressReport, show_progress
 from sorvolo.cli.sites import opened_site, run_on_site
@@ -24,48 +24,30 @@ if TYPE_CHECKING:
 
 PresetName = Annotated[
     str,
-    typer.Option(
-        "--preset", help="What to simulate: demo, survey, compare ...; an unknown name lists all."
-    ),
+    option("What to simulate: demo, survey, compare ...; an unknown name lists all.", "--preset"),
 ]
-Ground = Annotated[
-    str, typer.Option(help="Ground: dirt, countryside, urban, sand, or an orthophoto's file.")
-]
+Ground = Annotated[str, option("Ground: dirt, countryside, urban, sand, or an orthophoto's file.")]
 GroundResolution = Annotated[
-    float | None, typer.Option(help="Ground resolution of an orthophoto without a CRS, m a pixel.")
+    float | None, option("Ground resolution of an orthophoto without a CRS, m a pixel.")
 ]
 ReliefHeight = Annotated[
     float | None,
-    typer.Option(
-        "--relief", help="Hills, from the lowest to the highest ground, m.", show_default="level"
-    ),
+    option("Hills, from the lowest to the highest ground, m.", "--relief", show_default="level"),
 ]
-FlightCount = Annotated[
-    int | None, typer.Option(help="Number of flights; between them things change.")
-]
-TelemetryFormat = Annotated[
-    str, typer.Option(help="Telemetry format: csv, srt, nmea, gpx, all or none.")
-]
-StripLength = Annotated[float | None, typer.Option(help="Length of a strip, m.")]
-StripCount = Annotated[int | None, typer.Option(help="Number of strips.")]
-AsPhotos = Annotated[
-    bool, typer.Option("--photos", help="Write geo-tagged JPEG photos instead of a video.")
-]
+FlightCount = Annotated[int | None, option("Number of flights; between them things change.")]
+TelemetryFormat = Annotated[str, option("Telemetry format: csv, srt, nmea, gpx, all or none.")]
+StripLength = Annotated[float | None, option("Length of a strip, m.")]
+StripCount = Annotated[int | None, option("Number of strips.")]
+AsPhotos = Annotated[bool, option("Write geo-tagged JPEG photos instead of a video.", "--photos")]
 PictureCount = Annotated[
     int | None,
-    typer.Option(
-        help="Make this many single labelled pictures (COCO) of different sites instead of flights."
-    ),
+    option("Make this many single labelled pictures (COCO) of different sites instead of flights."),
 ]
-ThermalShare = Annotated[
-    float, typer.Option(help="With --pictures: share of thermal pictures, 0 to 1.")
-]
+ThermalShare = Annotated[float, option("With --pictures: share of thermal pictures, 0 to 1.")]
 
 
 def simulate(
-    folder: Annotated[
-        Path, typer.Argument(help="Folder to make; an earlier simulation in it is replaced.")
-    ],
+    folder: Annotated[Path, argument("Folder to make; an earlier simulation in it is replaced.")],
     preset: PresetName = "",
     seed: Seed = None,
     ground: Ground = "",
@@ -198,9 +180,9 @@ def _show_progress(
 
 
 def demo(
-    folder: Annotated[
-        Path, typer.Argument(help="Folder to make; an earlier demo in it is replaced.")
-    ] = Path("demo-site"),
+    folder: Annotated[Path, argument("Folder to make; an earlier demo in it is replaced.")] = Path(
+        "demo-site"
+    ),
 ) -> None:
     """Try everything: simulate two flights, map the first, compare the second, and check both against the truth.
 

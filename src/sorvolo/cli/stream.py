@@ -7,10 +7,9 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
 from rich.markup import escape
 
-from sorvolo.cli.options import AsJson, Authority, Camera, Telemetry
+from sorvolo.cli.options import AsJson, Authority, Camera, Telemetry, argument, option
 from sorvolo.cli.printing import Console, print_json
 from sorvolo.cli.progress import ProgressReport
 from sorvolo.cli.serve import demand_extra
@@ -24,37 +23,34 @@ if TYPE_CHECKING:
     from sorvolo.station.spool import Spool
 
 StreamInput = Annotated[
-    str, typer.Argument(help="A video, or the camera's address, such as rtsp://192.168.1.10/live.")
+    str, argument("A video, or the camera's address, such as rtsp://192.168.1.10/live.")
 ]
-To = Annotated[
-    str, typer.Option(help="The station's address, such as https://station.example:8750.")
-]
+To = Annotated[str, option("The station's address, such as https://station.example:8750.")]
 StreamName = Annotated[
     str,
-    typer.Option("--stream", help="The stream's name at the station.", show_default="the input's"),
+    option("The stream's name at the station.", "--stream", show_default="the input's"),
 ]
 Token = Annotated[
     str,
-    typer.Option(
-        envvar="SORVOLO_TOKEN",
-        help="Token of the role operate; others cannot see it in SORVOLO_TOKEN.",
+    option(
+        "Token of the role operate; others cannot see it in SORVOLO_TOKEN.", envvar="SORVOLO_TOKEN"
     ),
 ]
 Speed = Annotated[
-    float, typer.Option(help="Of a recording: 1 as it was flown, 0 as fast as the link takes it.")
+    float, option("Of a recording: 1 as it was flown, 0 as fast as the link takes it.")
 ]
 Latency = Annotated[
     float,
-    typer.Option(help="On a slow link pictures older than this are dropped, s; inf drops none."),
+    option("On a slow link pictures older than this are dropped, s; inf drops none."),
 ]
 SpoolFolder = Annotated[
-    Path | None, typer.Option(help="Folder for what waits.", show_default="in the user's cache")
+    Path | None, option("Folder for what waits.", show_default="in the user's cache")
 ]
-SpoolMb = Annotated[float, typer.Option(help="Most that waits through an outage, MB.")]
+SpoolMb = Annotated[float, option("Most that waits through an outage, MB.")]
 StreamGiveUp = Annotated[
     float | None,
-    typer.Option(
-        help="End when the camera sent nothing for so long, or all is taken and there is no link, s.",
+    option(
+        "End when the camera sent nothing for so long, or all is taken and there is no link, s.",
         show_default="30 for the camera, never for the link",
     ),
 ]

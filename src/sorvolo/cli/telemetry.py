@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
 from rich.markup import escape
 
 from sorvolo.cli.options import (
@@ -17,6 +16,8 @@ from sorvolo.cli.options import (
     ResultsFolder,
     SiteOption,
     Telemetry,
+    argument,
+    option,
 )
 from sorvolo.cli.printing import Console, print_json, show_path
 from sorvolo.cli.progress import show_progress
@@ -28,8 +29,8 @@ from sorvolo.survey.wording import counted
 def telemetry_command(
     source: Annotated[
         str,
-        typer.Argument(
-            help="A flight (video, folder of photos), with --site; or a map's folder, or s3://BUCKET/NAME."
+        argument(
+            "A flight (video, folder of photos), with --site; or a map's folder, or s3://BUCKET/NAME."
         ),
     ],
     site: SiteOption = "",
@@ -38,8 +39,8 @@ def telemetry_command(
     camera: Camera = "",
     detections: Annotated[
         Path | None,
-        typer.Option(
-            help="Folder of this video's `sorvolo watch`: its detections go into the KLV (VMTI, MISB ST 0903)."
+        option(
+            "Folder of this video's `sorvolo watch`: its detections go into the KLV (VMTI, MISB ST 0903)."
         ),
     ] = None,
     out: ResultsFolder = None,

@@ -18,8 +18,10 @@ from sorvolo.cli.options import (
     OutFolder,
     Seed,
     UnlabelledClasses,
+    argument,
     class_names,
     names,
+    option,
 )
 from sorvolo.cli.printing import Console
 from sorvolo.cli.progress import ProgressReport
@@ -32,15 +34,15 @@ if TYPE_CHECKING:  # torch is an extra, and slow to import: only this command ne
 
 PresetOption = Annotated[
     Literal["fast", "thesis"],
-    typer.Option(help="fast: the packaged network. thesis: ResNet-50 with the nine modules."),
+    option("fast: the packaged network. thesis: ResNet-50 with the nine modules."),
 ]
 CheckedOn = Annotated[
-    str, typer.Option(help="A labelled set to check on, or the share of videos to hold out.")
+    str, option("A labelled set to check on, or the share of videos to hold out.")
 ]
 StartingWeights = Annotated[
     str,
-    typer.Option(
-        help="Model to tune: its name or .onnx file. auto: the packaged one; none: nothing. thesis: ImageNet."
+    option(
+        "Model to tune: its name or .onnx file. auto: the packaged one; none: nothing. thesis: ImageNet."
     ),
 ]
 
@@ -48,17 +50,17 @@ StartingWeights = Annotated[
 def train(
     context: typer.Context,
     data: Annotated[
-        list[Path] | None, typer.Argument(help="Labelled sets: folders, or their label files.")
+        list[Path] | None, argument("Labelled sets: folders, or their label files.")
     ] = None,
     out: OutFolder = Path("model"),
     preset: PresetOption = "fast",
     val: CheckedOn = "0.15",
     weights: StartingWeights = "auto",
-    steps: Annotated[int, typer.Option(help="Number of batches.")] = 8000,
-    batch: Annotated[int, typer.Option(help="Samples per batch.")] = 8,
-    side: Annotated[int, typer.Option(help="Side of the samples cut from the pictures, px.")] = 384,
+    steps: Annotated[int, option("Number of batches.")] = 8000,
+    batch: Annotated[int, option("Samples per batch.")] = 8,
+    side: Annotated[int, option("Side of the samples cut from the pictures, px.")] = 384,
     seed: Seed = 1,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue the run in --out.")] = False,
+    resume: Annotated[bool, option("Continue the run in --out.", "--resume")] = False,
     classes: LabelClasses = None,
     ignore: IgnoredClasses = "",
     unlabelled: UnlabelledClasses = "",

@@ -29,7 +29,9 @@ from sorvolo.cli.options import (
     SaveOption,
     SearchRate,
     Telemetry,
+    argument,
     names,
+    option,
     wanted_classes,
 )
 from sorvolo.cli.printing import (
@@ -52,21 +54,15 @@ if TYPE_CHECKING:
 
 _MAX_ROWS = 40  # of a table on a terminal; by choice
 
-Labels = Annotated[
-    str, typer.Option(help="Write labels to correct and train with: coco, yolo or coco,yolo.")
-]
+Labels = Annotated[str, option("Write labels to correct and train with: coco, yolo or coco,yolo.")]
 HeightModel = Annotated[
     str,
-    typer.Option(
-        help="GeoTIFF of ground heights in the telemetry's reference.", show_default="level ground"
-    ),
+    option("GeoTIFF of ground heights in the telemetry's reference.", show_default="level ground"),
 ]
 
 
 def watch_command(
-    source: Annotated[
-        str, typer.Argument(help="A video, a folder of photos, or a live stream's address.")
-    ],
+    source: Annotated[str, argument("A video, a folder of photos, or a live stream's address.")],
     telemetry: Telemetry = None,
     camera: Camera = "",
     model: Model = "default",
@@ -126,14 +122,7 @@ def watch_command(
         alert_url=alert_url,
         cot_tls=CotTls(cot_ca, cot_cert),
     )
-    # print a warning where an alert's program would run a placeholder's text as code of its
-    # own
-    from sorvolo.missions.watch.alerts import interpreted_placeholder, interpreted_words
-
-    if name := interpreted_placeholder(alert_command):
-        Console(stderr=True).print(
-            f"[yellow]warning[/yellow]  {escape(interpreted_words(name))}", soft_wrap=True
-        )
+    warn_of_interpreted(alert_command)
     # before the first frame there is nothing to keep
     words = "landed: the frames that wait are searched; press Ctrl-C again to stop at once"
     stop = SignalStop(is_running=False, words=words if is_live_address(source) else "")
@@ -189,6 +178,16 @@ def watch_command(
         Console(stderr=True).print("stopped before the first frame was searched")
     if not results or not all(each["headline"]["complete"] for each in results):
         raise typer.Exit(TO_CHECK)
+
+
+def warn_of_interpreted(alert_command: str) -> None:
+    """Print a warning where an alert's program would run a placeholder's text as code of its own."""
+    from sorvolo.missions.watch.alerts import interpreted_placeholder, interpreted_words
+
+    if name := interpreted_placeholder(alert_command):
+        Console(stderr=True).print(
+            f"[yellow]warning[/yellow]  {escape(interpreted_words(name))}", soft_wrap=True
+        )
 
 
 def _show_progress(

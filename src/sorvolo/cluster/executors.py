@@ -126,9 +126,8 @@ def _lines(process: "subprocess.Popen[bytes]", stall_s: float) -> Iterator[Json 
         if cpu_s - used_s > _LIVELY * stall_s:
             alive_s, used_s = time.monotonic(), cpu_s
         if time.monotonic() - alive_s > stall_s:
-            os.kill(
-                process.pid, signal.SIGKILL
-            )  # `process.kill()` may reap it, and `run_order` does
+            # `process.kill()` may reap it, and `run_order` does
+            os.kill(process.pid, signal.SIGKILL)
             yield None
             return
 

@@ -30,17 +30,15 @@ _WAYS = tuple(  # to the eight neighbours, down and right, and what a tie to eac
 
 
 _BORDER_STEP_CELLS = 8.0  # a height so far above one nearby, in cells, stands on the ground
-_BORDER_REACH_CELLS = (
-    9  # nearby: more than half of a patch of 15 cells, and the blur of its contrast
-)
+# nearby: more than half of a patch of 15 cells, and the blur of its contrast
+_BORDER_REACH_CELLS = 9
 _BORDER_WINDOW_CELLS = 3  # side of the patches that decide
 _BORDER_VIEWS = 6  # compared at a place
 _BORDER_PAIR_SHARE = 0.2  # of their pairs, the most alike: the others may be hidden from it
 _BORDER_EVIDENCE = 2.0  # what a likeness weighs against a border of one cell
 _BORDER_STAYS = 0.05  # likeness in favour of the height that was found
-_BORDER_EDGE_LEVELS = (
-    8.0  # gray levels between neighbours, at which a border costs 0.6 of its price
-)
+# gray levels between neighbours, at which a border costs 0.6 of its price
+_BORDER_EDGE_LEVELS = 8.0
 _BORDER_APRON_CELLS = 24  # beyond a tile, so that neighbouring tiles agree
 
 
@@ -93,9 +91,8 @@ def _standing(up_m: Floats32, cell_m: float) -> _Standing | None:
     nearby = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
     calm = cv2.medianBlur(whole, 5)
     near = known & (whole - cv2.erode(calm, nearby) > step_m)
-    below = ~near & (
-        cv2.dilate(calm, nearby) - whole > step_m
-    )  # the ground beside it, and not the middle of a roof
+    # the ground beside it, and not the middle of a roof
+    below = ~near & (cv2.dilate(calm, nearby) - whole > step_m)
     if not near.any() or not below.any():
         return None
     _, labels = cv2.distanceTransformWithLabels(
@@ -179,7 +176,7 @@ class _Ties:
 
     def kept(self) -> Rows:
         """The nodes that stay with `keep` when the ties between it and `give` are cut as cheaply as can be."""
-        begin, end, price = (np.concatenate(each) for each in zip(*self._parts, strict=True))
+        begin, end, price = (np.concatenate(each) for each in zip(*self._parts))
         capacity = np.rint(_CAPACITY * price).astype(np.int32)
         ties = csr_matrix(
             coo_matrix((capacity, (begin, end)), shape=(self.give + 1, self.give + 1))

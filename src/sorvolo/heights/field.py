@@ -54,9 +54,8 @@ class HeightField:
 
     def _bands_at(self, points_m: PointsM) -> tuple[Floats, Floats]:
         side = 1024
-        padded = np.full(
-            (max(1, -(-len(points_m) // side)) * side, 2), 1e9
-        )  # none is a row as well
+        # none is a row as well
+        padded = np.full((max(1, -(-len(points_m) // side)) * side, 2), 1e9)
         padded[: len(points_m)] = points_m
         cells = self.lattice.cells_from_site(padded).astype(np.float32).reshape(-1, side, 2)
         heights, sigmas = (

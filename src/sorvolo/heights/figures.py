@@ -17,9 +17,8 @@ _SHARES = (0.6827, 0.9545)  # of a Gaussian, within one and two sigma
 _ROUNDS = 30  # in which the factor settles
 
 
-_LEAST_VIEWS = (
-    3  # see a point that judges: where two do, a wrong match along their line goes unseen
-)
+# see a point that judges: where two do, a wrong match along their line goes unseen
+_LEAST_VIEWS = 3
 _LEAST_POINTS = 100  # fewer judge nothing: five of them would be the share beyond two sigma
 
 
@@ -88,9 +87,8 @@ def _factor(off_m: Floats, match_m: Floats, point_m: Floats) -> float:
 _WARN_OBLIQUE_DEG = 25.0  # off the vertical, the median photo
 _WARN_ONE_STRIP = 0.08  # how wide a path is, as a share of its length, below which it is one strip
 _WARN_MOST_HOLES = 0.1  # share of the ground that two photos see
-_WARN_BAD_FIT_PX = (
-    0.45  # rms, of pictures no larger than `fit_side_px`: level and hilly flights have 0.1 to 0.3
-)
+# rms, of pictures no larger than `fit_side_px`: level and hilly flights have 0.1 to 0.3
+_WARN_BAD_FIT_PX = 0.45
 _WARN_FIT_SIDE_PX = FEATURES_SIDE_PX  # larger ones are matched at this size
 
 

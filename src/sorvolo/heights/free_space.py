@@ -65,16 +65,15 @@ def pieces(up_m: Floats32, step_m: float) -> Rows:
         with np.errstate(invalid="ignore"):
             close = np.abs(up_m[here] - up_m[there]) < step_m
         joined.append((number[here][close], number[there][close]))
-    rows, columns = (np.concatenate(each) for each in zip(*joined, strict=True))
+    rows, columns = (np.concatenate(each) for each in zip(*joined))
     ties = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), shape=(up_m.size, up_m.size))
     _, piece = connected_components(ties, directed=False)
     return np.asarray(piece.reshape(up_m.shape), np.int64)
 
 
 _SEEN_VIEWS = 6  # compared with each other at a place
-_SEEN_AGREES = (
-    0.3  # likeness of two photos, 0 to 1, by which they agree: by chance it is below 0.15
-)
+# likeness of two photos, 0 to 1, by which they agree: by chance it is below 0.15
+_SEEN_AGREES = 0.3
 _SEEN_MARGIN_CELLS = 1.5  # what a photo shows, less than that beside a cell's height, is the cell
 _SEEN_SHARE = 0.5  # of a piece: seen through so many times, of the times that it is seen
 _SEEN_STEP_CELLS = 2.0  # a height this much beside its neighbour's, in cells, is another piece
@@ -108,10 +107,11 @@ def seen_through(
     for x0, y0, x1, y1 in lattice.windows(_SEEN_WINDOW_CELLS):
         here = slice(y0, y1), slice(x0, x1)
         rest = np.where(found[here], np.float32(np.nan), up_m[here])
+        # a plate beside a wall is apart from it once its own cells are gone
         for model in (
             up_m[here],
             rest,
-        ):  # a plate beside a wall is apart from it once its own cells are gone
+        ):
             found[here] |= known[here] & _mostly(model, through[here], shown[here], lattice.cell_m)
     return found
 
@@ -177,10 +177,11 @@ def _seen_at(lattice: Lattice, ground: Floats32, view: View, places: _Places) ->
     x, y = np.clip(np.rint(pixels / per_cell).astype(int), 0, [width - 1, height - 1]).T
     at, order = y * width + x, np.argsort(places.alike, kind="stable")
     alike, shows_m = np.zeros(width * height, np.float32), np.zeros(width * height, np.float32)
+    # of several the last is the most alike
     alike[at[order]], shows_m[at[order]] = (
         places.alike[order],
         up_m[order],
-    )  # of several the last is the most alike
+    )
     agrees, above_m = alike[at] > _SEEN_AGREES, up_m - shows_m[at]
     margin_m = _SEEN_MARGIN_CELLS * lattice.cell_m
     return agrees & (above_m > margin_m), agrees & (np.abs(above_m) <= margin_m)

@@ -19,9 +19,8 @@ _FINE_PX = 3.0
 _COARSE_PX = 6.0
 _FEW_CELLS = 2e6
 _MOST_CELLS = 60e6  # bounds the memory: larger sites get larger cells still
-_MOST_SIDE = (
-    30_000  # of the box's longer side; the raster, north up, may be a little longer (`MOST_SIDE`)
-)
+# of the box's longer side; the raster, north up, may be a little longer (`MOST_SIDE`)
+_MOST_SIDE = 30_000
 
 
 @dataclass(frozen=True, eq=False)

@@ -83,11 +83,9 @@ class Obstacles:
         far = np.maximum(np.hypot(dx, dy), np.float32(1e-3))
         dx, dy = dx / far, dy / far
         lowest = np.full(x.shape, -np.inf, np.float32)
-        low_m, high_m, eye_up_m = (
-            float(self.up_m.min()),
-            float(self.up_m.max()),
-            np.float32(eye_m[2]),
-        )
+        low_m = float(self.up_m.min())
+        high_m = float(self.up_m.max())
+        eye_up_m = np.float32(eye_m[2])
         reach = float(far.max()) * min((high_m - low_m) / max(float(eye_up_m) - high_m, 1e-3), 1.0)
         step = _MARGIN_CELLS
         while step < reach:

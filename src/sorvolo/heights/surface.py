@@ -27,9 +27,8 @@ _APRON_CELLS = 10  # beyond a tile, so that neighbouring tiles agree: more than 
 _COARSE_APRON_CELLS = 5  # of the first sweep, whose patches are smaller
 _MARGIN_CELLS = 12.0  # heights searched above and below what the first sweep found, in cells
 _MATCH_CELLS = 0.12  # sigma of a match where photos agree perfectly, in cells of parallax
-_RELIEF_SHARE = (
-    0.25  # of the heights' spread around a cell: at an edge it is not known which is right
-)
+# of the heights' spread around a cell: at an edge it is not known which is right
+_RELIEF_SHARE = 0.25
 
 
 def sizes_m(cell_m: float) -> tuple[float, float]:

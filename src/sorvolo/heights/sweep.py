@@ -41,10 +41,11 @@ _TEMPERATURE = 0.04
 class SweepSettings:
     """How photos are compared."""
 
+    # sides of the patches that are compared: detail, and what is sure
     window_cells: tuple[int, int] = (
         5,
         15,
-    )  # sides of the patches that are compared: detail, and what is sure
+    )
     edge_cost: float = 0.9  # of any change of height above one level: an edge of a roof
 
 
@@ -125,9 +126,8 @@ def sweep(
     chance = np.exp((total.min(axis=1, keepdims=True) - total) / (8 * _TEMPERATURE))
     away = levels[None, :, None].astype(np.float32) - up_m[:, None]
     deviation = np.asarray(np.sqrt((chance * away**2).sum(axis=1) / chance.sum(axis=1)), np.float32)
-    up_m[~(score >= _LEAST_SCORE)] = (
-        np.nan
-    )  # no two photos see the height that fits, or they do not agree
+    # no two photos see the height that fits, or they do not agree
+    up_m[~(score >= _LEAST_SCORE)] = np.nan
     shown_by = np.sum([each.shows(up_m, least) for each in laid], axis=0).astype(np.float32)
     # (H, W) the largest spread of two photos that see a cell; 0 where fewer do
     widest = np.zeros(seen[0].shape, np.float32)
@@ -188,9 +188,8 @@ def choose_views(
     chosen: list[int] = []
     least = np.ones(len(views))
     seen = np.zeros(len(ground))
-    wanted = np.minimum(
-        covers.sum(axis=0), 2
-    )  # ground that only photos left out see would be a hole
+    # ground that only photos left out see would be a hole
+    wanted = np.minimum(covers.sum(axis=0), 2)
     while len(chosen) < count or (
         len(chosen) < count + _MORE and (seen < wanted).mean() >= _LEFT_OUT
     ):

@@ -78,10 +78,8 @@ def laid_pixels(view: View, site_from_pixels: Matrix3, up_m: Floats32) -> tuple[
         [turn, -turn @ view.site_from_camera.translation_m]
     )
     level = project[:, :2] @ site_from_pixels[:2] + np.outer(project[:, 3], [0, 0, 1])
-    columns, rows = (
-        np.arange(up_m.shape[1], dtype=np.float32),
-        np.arange(up_m.shape[0], dtype=np.float32),
-    )
+    columns = np.arange(up_m.shape[1], dtype=np.float32)
+    rows = np.arange(up_m.shape[0], dtype=np.float32)
     x, y, z = (
         np.float32(a) * columns[None, :]
         + (np.float32(b) * rows[:, None] + np.float32(c))

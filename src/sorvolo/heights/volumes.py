@@ -23,9 +23,8 @@ _ROUNDS = 6  # of a robust fit
 _CLIP_SIGMAS = 3.0  # of the spread: what changed outside the area does not tie
 _BLOCK_M = 5.0  # errors of a height model hold on for about as long
 _LEAST_STABLE = 500  # cells
-_BEYOND = (
-    0.1  # of the area outside of the height model: an area drawn elsewhere, not a hole; by choice
-)
+# of the area outside of the height model: an area drawn elsewhere, not a hole; by choice
+_BEYOND = 0.1
 
 
 _LEAST_KNOWN = 0.5  # of an area
@@ -103,10 +102,8 @@ def tie(
         usable &= np.abs(off - middle) < _CLIP_SIGMAS * spread
         step = _step(off[usable], east[usable], north[usable])
         shift_m += step
-        sigma, count = (
-            _offset_sigma(off - step[2], usable, earlier.lattice.cell_m),
-            int(usable.sum()),
-        )
+        sigma = _offset_sigma(off - step[2], usable, earlier.lattice.cell_m)
+        count = int(usable.sum())
         if np.abs(step).max() < 1e-3:
             break
     return Tie(shift_m, sigma, spread, count)

@@ -149,10 +149,8 @@ def linearise(nodes: Nodes, pairs: Pairs, shared: Floats) -> Linearised:
     log_focal, radial = shared[0], shared[1]
     old_own, new_own = nodes.own[pairs.old], nodes.own[pairs.new]
     rotation_old, rotation_new = nodes.rotations[pairs.old], nodes.rotations[pairs.new]
-    centre_old, centre_new = (
-        nodes.centres_m[pairs.old][:, None],
-        nodes.centres_m[pairs.new][:, None],
-    )
+    centre_old = nodes.centres_m[pairs.old][:, None]
+    centre_new = nodes.centres_m[pairs.new][:, None]
     focal_old = np.where(old_own, np.exp(-log_focal), 1.0)[:, None, None]
     focal_new = np.where(new_own, np.exp(log_focal), 1.0)[:, None, None]
     r2_old = (pairs.old_ideal**2).sum(-1, keepdims=True) * old_own[:, None, None]
@@ -435,9 +433,8 @@ def _advance(nodes: Nodes, shared: Floats, step: Floats, position: Rows) -> tupl
     rotations[index] = u @ vt  # rounding would add up over thousands of steps
     shift = steps[:, 3:].copy()
     limit = 0.5 * np.abs(centres[index, 2])
-    shift[:, 2] = np.clip(
-        shift[:, 2], -limit, limit
-    )  # a camera may not dive through the ground in one step
+    # a camera may not dive through the ground in one step
+    shift[:, 2] = np.clip(shift[:, 2], -limit, limit)
     centres[index] += shift
     return replace(nodes, rotations=rotations, centres_m=centres), shared + step[6 * len(index) :]
 

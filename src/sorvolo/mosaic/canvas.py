@@ -76,9 +76,8 @@ class Canvas:
         self._painted_before: set[int] = set()
         self._fillings: dict[int, ImageRGB] = {}
         self._warping = ThreadPoolExecutor(1, thread_name_prefix="warping")
-        self._bounded: set[TileIndex] = (
-            set()
-        )  # chunks where painted frames win what the map showed, no more
+        # chunks where painted frames win what the map showed, no more
+        self._bounded: set[TileIndex] = set()
         for frame in painted:
             self._add(frame)
             self._painted_before.add(frame.id)

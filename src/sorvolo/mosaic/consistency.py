@@ -20,9 +20,8 @@ _RMS_SIGMAS = 8.0  # ... or so many stated sigmas
 _MOST_OFF_M = 5.0  # median, if it is also a quarter of how far the flight reaches
 _OFF_SHARE = 0.25
 _LEAST_ALIKE = 0.6  # rms misfit over the fixes' spread: more, and the path is another one
-_MOST_UNEVEN = (
-    0.35  # of the height above ground: heights of frames that scatter so against telemetry's
-)
+# of the height above ground: heights of frames that scatter so against telemetry's
+_MOST_UNEVEN = 0.35
 _LEAST_UNEVEN_M = 8.0
 _HEIGHTS_DIFFER = 0.15  # of the stated height: more is reported ...
 _HEIGHTS_DIFFER_M = 4.0  # ... if it is so many metres as well
@@ -233,9 +232,8 @@ def _height_faults(frames: Sequence[PlacedFrame], figures: FlightFigures) -> lis
         return []
     up_m, off_m = rows.T
     uneven_m = _uneven_m(off_m)
-    telemetry_drifts = _uneven_m(up_m) < _uneven_m(
-        up_m - off_m
-    )  # a barometer or a poor receiver, not the map
+    # a barometer or a poor receiver, not the map
+    telemetry_drifts = _uneven_m(up_m) < _uneven_m(up_m - off_m)
     if telemetry_drifts or uneven_m <= max(_MOST_UNEVEN * figures.height_m, _LEAST_UNEVEN_M):
         return []
     return [

@@ -31,15 +31,12 @@ _MOST_MISFIT = 0.12  # of the points' spread: more, and the points are not those
 _LEAST_SPREAD_M = 0.1  # rms: closer together they give no scale and no north
 _MOST_OFF_GPS_M = 60.0  # no receiver errs so far: the points' CRS is another
 _MOST_SCALE = 1.3  # between GPS and the points
-_ON_LINE = (
-    0.1  # spread across over spread along, or over that of a picture's ground: less is one line
-)
-_CLEARLY_BETTER = (
-    0.5  # times the rms miss, by choice: heights in feet that fit so much better are in feet
-)
-_IN_CORNER = (
-    0.3  # their spread over that of the flight's cameras, below which they hold a corner of it
-)
+# spread across over spread along, or over that of a picture's ground: less is one line
+_ON_LINE = 0.1
+# times the rms miss, by choice: heights in feet that fit so much better are in feet
+_CLEARLY_BETTER = 0.5
+# their spread over that of the flight's cameras, below which they hold a corner of it
+_IN_CORNER = 0.3
 
 
 @dataclass(frozen=True)

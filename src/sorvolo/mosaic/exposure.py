@@ -127,7 +127,7 @@ def solve_exposure(pairs: Mapping[tuple[int, int], ColourPairs]) -> Exposure:
     exists = np.arange(counts.max()) < counts[:, None]
     radius2_a, radius2_b = np.zeros((2, *exists.shape), np.float32)
     difference = np.zeros((*exists.shape, 3), np.float32)
-    for row, (link, count) in enumerate(zip(links, counts.tolist(), strict=True)):
+    for row, (link, count) in enumerate(zip(links, counts.tolist())):
         chosen = pairs[link].thinned(POINTS_PER_LINK)
         radius2_a[row, :count], radius2_b[row, :count] = chosen.radius2_a, chosen.radius2_b
         colours_a, colours_b = (
@@ -167,9 +167,8 @@ def corrected(
     y = (2 * np.arange(y0, y0 + height) - (whole_height - 1)) ** 2 / diagonal2
     x, y = x.astype(np.float32), y.astype(np.float32)
     result = np.empty((height, width, 3), np.uint8)
-    rows = max(
-        1, _FIELD_PX // width
-    )  # at a time: the field of a whole picture is five times as large as the picture
+    # at a time: the field of a whole picture is five times as large as the picture
+    rows = max(1, _FIELD_PX // width)
     for first in range(0, height, rows):
         some = slice(first, first + rows)
         radius2 = y[some, None] + x

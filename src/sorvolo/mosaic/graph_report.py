@@ -22,17 +22,16 @@ class GraphReport:
     links_dropped: int
     relief_m: float
     rms_px: float
-    angles_contradicted: int = (
-        0  # frames whose stated angles the pictures rule out: these angles are not used
-    )
+    # frames whose stated angles the pictures rule out: these angles are not used
+    angles_contradicted: int = 0
+    # tilt and heading that all stated angles are off by
     turned_deg: tuple[float, float] = (
         0.0,
         0.0,
-    )  # tilt and heading that all stated angles are off by
-    is_uneven: bool = False  # pictures fit each other as over ground that is not level
-    lean_m: float = (
-        0.0  # median of `leans_m`, and how far stated angles leave the ground open themselves
     )
+    is_uneven: bool = False  # pictures fit each other as over ground that is not level
+    # median of `leans_m`, and how far stated angles leave the ground open themselves
+    lean_m: float = 0.0
     lean_stated_m: float = 0.0
 
 
@@ -59,10 +58,7 @@ def ground_sigmas_m(
     found: list[float] = []
     for first in range(0, len(starts), _AT_ONCE):
         some = slice(first, first + _AT_ONCE)
-        blocks = [
-            _ground_centre_jacobian(*each)
-            for each in zip(rotations[some], heights_m[some], strict=True)
-        ]
+        blocks = [_ground_centre_jacobian(*each) for each in zip(rotations[some], heights_m[some])]
         unknowns = starts[some, None] + np.arange(6)
         right = np.zeros((factors.size, len(blocks), 2))
         for k, block in enumerate(blocks):

@@ -19,9 +19,8 @@ from sorvolo.mosaic.shelf import Shelf, ShelvedRows
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Link
 
-_UNKNOWN_SIGMA_M = (
-    1e6  # stands in for an infinite sigma; its weight is nothing, its arithmetic finite
-)
+# stands in for an infinite sigma; its weight is nothing, its arithmetic finite
+_UNKNOWN_SIGMA_M = 1e6
 _FIRST_ROOM = 16  # rows; then they double
 
 

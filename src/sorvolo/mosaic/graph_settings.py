@@ -16,39 +16,33 @@ OFFSET_ALTITUDE_M = 0.1
 OFFSET_TILT_RAD = 0.002
 OFFSET_HEADING_RAD = 0.003
 OFFSET_LEAST_SIGMAS = 2.0  # of its own, without the prior: less is noise
-OFFSET_WIDEST_SIGMA = (
-    100.0  # of the prior, m or rad: a wider one is no belief that a flight could confirm
-)
+# of the prior, m or rad: a wider one is no belief that a flight could confirm
+OFFSET_WIDEST_SIGMA = 100.0
 
 
 PAIRS_PER_LINK = 40  # matches that stand for a link, spread over it
 INDEPENDENT_PAIRS = 20.0  # matches of one link share lens and relief errors: they count as so many
 WINDOW = 6  # recent keyframes freed by each local solve
-UNEVEN = (
-    0.002  # relief left between linked pictures over the height: level ground 0.0003, hills 0.004
-)
-STRAINED = (
-    3.0  # times a link's believed noise: the ground around it cannot be laid without bending more
-)
+# relief left between linked pictures over the height: level ground 0.0003, hills 0.004
+UNEVEN = 0.002
+# times a link's believed noise: the ground around it cannot be laid without bending more
+STRAINED = 3.0
 
 
 @dataclass(frozen=True)
 class PoseGraphSettings:
     """What the graph may move and when it solves."""
 
-    sigma_px: float = (
-        0.3  # floor of a match's noise; calibration and rolling shutter never are better
-    )
+    # floor of a match's noise; calibration and rolling shutter never are better
+    sigma_px: float = 0.3
     region: int = 120  # keyframes; a larger flight is solved around its newest ones only, until it ends or is strained
     focal_sigma: float = 0.0  # relative; 0 holds the focal length
     radial_sigma: float = 0.0  # prior of the left-over radial distortion; 0 holds it
     altitude_offset_sigma_m: float = 1.0  # how well the altitude's zero is known to be the ground
-    gps_offset_sigma_m: float = (
-        0.0  # > 0 when a known map fixes the datum instead of this flight's GPS
-    )
-    tilt_offset_sigma_deg: float = (
-        0.0  # of gimbal or mount against the vertical, the same all flight
-    )
+    # > 0 when a known map fixes the datum instead of this flight's GPS
+    gps_offset_sigma_m: float = 0.0
+    # of gimbal or mount against the vertical, the same all flight
+    tilt_offset_sigma_deg: float = 0.0
     heading_offset_sigma_deg: float = 0.0  # of the compass, the same all flight
 
     @classmethod

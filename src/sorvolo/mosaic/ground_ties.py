@@ -7,9 +7,8 @@ import numpy as np
 from sorvolo.geometry.arrays import Floats, Matrix3, PointsM, Rows
 from sorvolo.geometry.homography import apply_homography, fit_similarity
 
-_MOST_GUESSES = (
-    600  # pairs of points that may give the similarity: 600 find it among two thirds of wild ones
-)
+# pairs of points that may give the similarity: 600 find it among two thirds of wild ones
+_MOST_GUESSES = 600
 _MILD = 2.5  # robust sigmas
 
 

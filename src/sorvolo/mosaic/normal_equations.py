@@ -12,9 +12,8 @@ from scipy.sparse.linalg import splu
 from sorvolo.geometry.arrays import Floats, Mask, Rows
 
 SIDE = 6  # unknowns of a camera
-_AT_ONCE = (
-    20  # cameras that go out together whatever they are tied to: so few are not worth an order
-)
+# cameras that go out together whatever they are tied to: so few are not worth an order
+_AT_ONCE = 20
 _FILLED = 0.1  # of a piece's numbers may be zeros that a smaller piece would not hold
 
 
@@ -37,9 +36,8 @@ class Elimination:
         at = np.empty(count, int)
         for number, front in enumerate(self._fronts):
             at[front.out] = number
-        first = np.minimum(
-            at[one], at[other]
-        )  # that front takes a tie in, in which the first of its cameras goes out
+        # that front takes a tie in, in which the first of its cameras goes out
+        first = np.minimum(at[one], at[other])
         order = np.argsort(first, kind="stable")
         self._ties = np.split(order, np.searchsorted(first[order], np.arange(1, len(self._fronts))))
 
@@ -92,7 +90,7 @@ class BlockFactors:
     def solve(self, right: Floats) -> Floats:
         """(6 n,) or (6 n, k) right-hand sides to as many solutions."""
         found = right.reshape(len(right), -1).copy()
-        for front, (corner, below) in zip(self._fronts, self._pieces, strict=True):
+        for front, (corner, below) in zip(self._fronts, self._pieces):
             out = _unknowns(front.out)
             found[out] = dtrsm(1.0, corner.T, found[out], trans_a=1)
             if len(front.rest):

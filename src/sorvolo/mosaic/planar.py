@@ -700,10 +700,8 @@ class PlanarMapper:
         return self._keyframes.keyframe(other)
 
     def _tie_colours(self, each: Link) -> None:
-        small_new, small_old = (
-            self._keyframes.thumbnail(each.new_id),
-            self._keyframes.thumbnail(each.old_id),
-        )
+        small_new = self._keyframes.thumbnail(each.new_id)
+        small_old = self._keyframes.thumbnail(each.old_id)
         new, old = self._keyframes.camera(each.new_id), self._keyframes.camera(each.old_id)
         pairs = tie_colours(
             small_new,

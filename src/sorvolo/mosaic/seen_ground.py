@@ -13,15 +13,15 @@ from sorvolo.survey.coverage import SeenGround
 
 _CELLS_ACROSS = 24  # of a picture's shorter side on the ground
 _MOST_CELLS = 1500  # along a side of the whole flight: then they are larger
+# numbers of pictures that are distinguished: heights need 3, better 5
 _STEPS = (
     1,
     2,
     3,
     5,
-)  # numbers of pictures that are distinguished: heights need 3, better 5
-_BRIDGED = (
-    1.0  # of a picture's shorter side: gaps between strips up to this wide are amid what was seen
 )
+# of a picture's shorter side: gaps between strips up to this wide are amid what was seen
+_BRIDGED = 1.0
 _LEAST_HOLE = 0.05  # of a picture's area: notches at its corners are smaller
 
 
@@ -61,10 +61,8 @@ def seen_ground(
 def coverage_figures(ground: Sequence[SeenGround]) -> dict[str, float | int | None]:
     """The figures of a report: areas seen, seen in one picture only, of the holes, and their number; the resolution
     that half of the ground has or a finer one."""
-    seen, holes = (
-        [each for each in ground if each.views],
-        [each for each in ground if not each.views],
-    )
+    seen = [each for each in ground if each.views]
+    holes = [each for each in ground if not each.views]
     total_m2, coarser_m2, middle = sum(each.area_m2 for each in seen), 0.0, None
     for each in sorted(seen, key=lambda part: part.m_per_px):
         coarser_m2 += each.area_m2
@@ -132,10 +130,8 @@ class _Raster:
         """The cells in these polygons."""
         found = np.zeros(self._shape, np.uint8)
         for rings in area_m:
-            own, corners = (
-                np.zeros(self._shape, np.uint8),
-                [self._cells(ring).astype(np.int32) for ring in rings],
-            )
+            own = np.zeros(self._shape, np.uint8)
+            corners = [self._cells(ring).astype(np.int32) for ring in rings]
             cv2.fillPoly(own, corners, 1)
             edge = np.zeros(self._shape, np.uint8)
             cv2.polylines(edge, corners, True, 1)
@@ -184,7 +180,7 @@ def _runs(cells: Mask) -> Iterator[tuple[int, int, int]]:
     edges = np.diff(np.pad(cells.astype(np.int8), ((0, 0), (1, 1))), axis=1)
     rows, starts = np.nonzero(edges == 1)
     ends = np.nonzero(edges == -1)[1]
-    yield from zip(rows.tolist(), starts.tolist(), ends.tolist(), strict=True)
+    yield from zip(rows.tolist(), starts.tolist(), ends.tolist())
 
 
 def _regions(cells: Mask, least: float) -> Iterator[Mask]:

@@ -20,9 +20,8 @@ _COARSE_PX = 64  # at which a sensor's noise averages out and ground still shows
 
 _BLURRED = 0.6  # of the usual sharpness: wait for a better one
 _USELESS = 0.35  # of the usual sharpness: reject
-_BARE_LEVELS = (
-    0.6  # of gray, spread at 64 px: one gray 0, with noise 0.5, the barest real field 2.2
-)
+# of gray, spread at 64 px: one gray 0, with noise 0.5, the barest real field 2.2
+_BARE_LEVELS = 0.6
 _USUAL = 25  # frames that show how sharp the flight's usually are
 _SPARSE_SHARE = 2 / 3  # of the way between keyframes that decoded frames may lie apart
 
@@ -32,9 +31,8 @@ class SelectionSettings:
     """When a frame is worth a place in the map."""
 
     overlap: float = 0.7  # s of eq. 3.17: share of a frame that its successor shows again
-    least_overlap: float = (
-        0.5  # a blurred frame is skipped only while its successors still overlap this much
-    )
+    # a blurred frame is skipped only while its successors still overlap this much
+    least_overlap: float = 0.5
 
     def __post_init__(self) -> None:
         if not 0 < self.least_overlap <= self.overlap < 1:
@@ -44,9 +42,8 @@ class SelectionSettings:
 
 
 _STEP_S = 0.2  # five a second: the pictures decide
-_LIVE_SPEED_M_S = (
-    5.0  # at least, of a live flight that has just begun: a drone's usual speed over a survey
-)
+# at least, of a live flight that has just begun: a drone's usual speed over a survey
+_LIVE_SPEED_M_S = 5.0
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ from sorvolo.station.place import PlaceIndex, place_routes
 from sorvolo.station.problems import PROBLEM_ANSWERS, Problem, answer_problems
 from sorvolo.station.reviews import Drawings, Reviews, drawing_routes, review_routes
 from sorvolo.station.runs import Runs, run_routes
-from sorvolo.station.security import COOKIE, Doorkeeper, holder_in, needs
+from sorvolo.station.security import COOKIE, FOR_VIEWERS, Doorkeeper, holder_in
 from sorvolo.station.settings import (
     DELETED_FOLDER,
     RUNS_FOLDER,
@@ -55,7 +55,7 @@ from sorvolo.station.sites import SiteShelf, readable, site_detail
 from sorvolo.station.state import RootLock, StationState
 from sorvolo.station.stream_routes import CameraDoor, announcing, stream_routes
 from sorvolo.station.tiles import WebTiles, wmts_routes
-from sorvolo.station.tokens import Role, has_tokens
+from sorvolo.station.tokens import has_tokens
 from sorvolo.station.uploads import Uploads, upload_routes
 
 PAGE_FOLDER = Path(__file__).parent / "page"
@@ -214,9 +214,8 @@ def station_app(
     _serve_page(app)
     app.add_middleware(_answering_heads)
     app.add_middleware(Doorkeeper, settings=settings, state=station.state, upload_path=_UPLOADS)
-    app.add_middleware(
-        Observer, count=metrics.count
-    )  # outermost: what the doorkeeper refuses counts, too
+    # outermost: what the doorkeeper refuses counts, too
+    app.add_middleware(Observer, count=metrics.count)
     return app
 
 
@@ -253,7 +252,7 @@ def _about_routes(station: Station) -> APIRouter:
             "base_map_url": None if station.settings.base_map is None else _BASE_MAP,
         }
 
-    @router.get(_BASE_MAP, dependencies=[needs(Role.VIEW)], response_class=FileResponse)
+    @router.get(_BASE_MAP, dependencies=FOR_VIEWERS, response_class=FileResponse)
     def base_map() -> Response:
         """The base map as PMTiles, read in ranges; 404 where the station was given none."""
         path = station.settings.base_map
@@ -301,7 +300,7 @@ def _about_routes(station: Station) -> APIRouter:
 
 
 def _site_routes(station: Station) -> APIRouter:
-    router = APIRouter(prefix="/api/sites", tags=["sites"], dependencies=[needs(Role.VIEW)])
+    router = APIRouter(prefix="/api/sites", tags=["sites"], dependencies=FOR_VIEWERS)
 
     @router.get("")
     def sites() -> list[Json]:

@@ -13,9 +13,8 @@ from typing import IO
 
 from sorvolo.paths import Json
 
-_MEMORY_BYTES = (
-    3 << 30
-)  # a picture of 200 megapixels takes 0.6 GB decoded, copies and libraries the rest
+# a picture of 200 megapixels takes 0.6 GB decoded, copies and libraries the rest
+_MEMORY_BYTES = 3 << 30
 _CPU_S = 600  # of processor time; by choice
 _MOST_PIXELS = 200_000_000  # of one picture: a 100-megapixel camera twice over
 _MOST_FILES = 20_000  # photos of a day's flights; by choice
@@ -210,9 +209,8 @@ def _check_picture(path: Path) -> None:
 
     with path.open("rb") as file:
         head = file.read(12)
-    if (
-        path.suffix.lower() in _SIGNATURES
-    ):  # their decoders are the mission's; their size is bounded there
+    # their decoders are the mission's; their size is bounded there
+    if path.suffix.lower() in _SIGNATURES:
         if not any(
             head[at : at + len(sign)] == sign for at, sign in _SIGNATURES[path.suffix.lower()]
         ):

@@ -34,9 +34,8 @@ _TURN_S = 0.02  # how long the sender rests where there is nothing to send
 _CONNECT_S = 10.0  # over a weak link; by choice
 _ANSWER_S = 10.0  # to a greeting or a flight's end; by choice
 _MOST_SENT_BYTES = 4_000_000  # on the way and not acknowledged
-_MOST_WAY_S = (
-    2.0  # age of what is on the way; more waits in the spool, from where it can be left out
-)
+# age of what is on the way; more waits in the spool, from where it can be left out
+_MOST_WAY_S = 2.0
 _CATCH_UP = 0.5  # seconds of an outage that are made up for in a second
 _DELAYS_KEPT = 100_000  # acknowledgements: an hour of video at 25 pictures a second
 _SAME_FLIGHT_NS = 600_000_000_000  # a client that was away for longer comes with another flight
@@ -53,9 +52,8 @@ class StreamSettings:
     flush_s: float = 10.0  # after a stop, to send what waits
     give_up_s: float = float("inf")  # without a link, once everything was taken
     authority: Path | None = None  # of the station's certificate, PEM
-    door: str = (
-        ""  # the socket of a station on this machine, which is called instead of the address
-    )
+    # the socket of a station on this machine, which is called instead of the address
+    door: str = ""
 
     def __post_init__(self) -> None:
         if not (self.speed == 0 or 0.01 <= self.speed <= 1000):
@@ -132,9 +130,8 @@ class StreamClient:
         self._is_taken = threading.Event()  # all pieces were taken
         self._failure: BaseException | None = None
         self._allowance = _Allowance(settings.latency_s)
-        if (
-            oldest_ns := spool.oldest_ns
-        ) is not None:  # what an earlier run left is late, and sent all the same
+        # what an earlier run left is late, and sent all the same
+        if (oldest_ns := spool.oldest_ns) is not None:
             self._allowance.add((time.time_ns() - oldest_ns) / 1e9)
         self._way = _Way()
         self._was_linked = False

@@ -18,9 +18,8 @@ from sorvolo.geometry.arrays import ImageRGB, PointsM
 from sorvolo.station.collections import Findings, SiteCollections
 from sorvolo.station.inputs import Inputs
 from sorvolo.station.problems import Problem
-from sorvolo.station.security import needs
+from sorvolo.station.security import FOR_VIEWERS
 from sorvolo.station.sites import SiteShelf
-from sorvolo.station.tokens import Role
 from sorvolo.store.exports.change_files import CROPS, crop_name, crop_names
 from sorvolo.store.images import BytesCache, jpeg_from_image, rgba_from_png
 from sorvolo.store.site.archive import Archive
@@ -42,9 +41,7 @@ class JpegResponse(Response):
 def crop_routes(shelf: SiteShelf, findings: Findings) -> APIRouter:
     """Pictures by the id of what they show; never by a path."""
     cutting = CapacityLimiter(_AT_ONCE)
-    router = APIRouter(
-        prefix="/api/sites/{site}/crops", tags=["crops"], dependencies=[needs(Role.VIEW)]
-    )
+    router = APIRouter(prefix="/api/sites/{site}/crops", tags=["crops"], dependencies=FOR_VIEWERS)
 
     @router.get("/change/{change_id}/{n}.jpg", response_class=JpegResponse)
     def of_change(site: str, change_id: str, n: int) -> Response:
@@ -169,7 +166,7 @@ class FlightVideos:
 
 def video_routes(shelf: SiteShelf, collections: SiteCollections, videos: FlightVideos) -> APIRouter:
     """A flight's video, and pictures of a place cut from it."""
-    router = APIRouter(prefix="/api/sites/{site}", tags=["memory"], dependencies=[needs(Role.VIEW)])
+    router = APIRouter(prefix="/api/sites/{site}", tags=["memory"], dependencies=FOR_VIEWERS)
     cutting = CapacityLimiter(_VIDEOS_AT_ONCE)
     cache = BytesCache[tuple[Any, ...], bytes](_CACHE_BYTES, len)
 

@@ -113,9 +113,8 @@ class EventLog:
         loop, arrived = asyncio.get_running_loop(), asyncio.Event()
         self._waiting.add((loop, arrived))
         try:
-            if (
-                seq > self._last
-            ):  # the numbers of a station whose memory was moved away: no event would come for long
+            # the numbers of a station whose memory was moved away: no event would come for long
+            if seq > self._last:
                 seq = self._last
                 yield [_lost(1, seq)]
             while True:

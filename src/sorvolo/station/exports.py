@@ -30,7 +30,7 @@ from sorvolo.missions.heights.measure import measure_profile
 from sorvolo.paths import Json
 from sorvolo.station.collections import SEARCH_FOLDER, TITLES, SiteCollections
 from sorvolo.station.problems import Problem, problem_answer
-from sorvolo.station.security import address, needs
+from sorvolo.station.security import FOR_VIEWERS, address, needs
 from sorvolo.station.sites import SiteShelf
 from sorvolo.station.tokens import Role
 from sorvolo.store.exports.geopackage import LAYER_STYLES, qgs_of, qml_of, write_geopackage
@@ -120,9 +120,7 @@ def tilejson_address(site: str, cog: Cog) -> str:
 
 def cog_routes(shelf: SiteShelf) -> list[APIRouter]:
     """The list of a site's rasters, and titiler's routes below each."""
-    listing = APIRouter(
-        prefix="/api/sites/{site}/cogs", tags=["rasters"], dependencies=[needs(Role.VIEW)]
-    )
+    listing = APIRouter(prefix="/api/sites/{site}/cogs", tags=["rasters"], dependencies=FOR_VIEWERS)
 
     @listing.get("")
     def rasters(site: str) -> list[dict[str, str]]:
@@ -239,9 +237,7 @@ class ExportFile:
 
 def export_routes(shelf: SiteShelf, collections: SiteCollections) -> APIRouter:
     """What can be taken away, each by its id; a profile of heights."""
-    router = APIRouter(
-        prefix="/api/sites/{site}", tags=["exports"], dependencies=[needs(Role.VIEW)]
-    )
+    router = APIRouter(prefix="/api/sites/{site}", tags=["exports"], dependencies=FOR_VIEWERS)
 
     @router.get("/exports")
     def listed(site: str) -> list[Json]:

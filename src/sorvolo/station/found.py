@@ -53,10 +53,8 @@ def found_features(
             [*_sightings_of(tracks, site, flown), *_marked(marks, site, flown)]
         )
         stored = archive.objects()
-    objects, watched = (
-        {each.thing.id: each for each in stored},
-        {each["id"]: each for each in tracks},
-    )
+    objects = {each.thing.id: each for each in stored}
+    watched = {each["id"]: each for each in tracks}
     return [_feature(each, site, objects, watched) for each in ordered(register.findings)]
 
 

@@ -101,9 +101,8 @@ class Ingest:
         self._flights: dict[str, Flight] = {}
         self._links: dict[str, DroneLink] = {}
         self._hubs: dict[str, VideoHub] = {}
-        self._loop: asyncio.AbstractEventLoop | None = (
-            None  # in which drones and viewers are served
-        )
+        # in which drones and viewers are served
+        self._loop: asyncio.AbstractEventLoop | None = None
 
     async def serve(self, stream: str, link: DroneLink) -> None:
         """Take one connection until it ends; why it was refused is sent to the drone."""
@@ -241,9 +240,8 @@ class Ingest:
         flight = self._flights.get(stream)
         try:
             if flight is not None:
-                await asyncio.to_thread(
-                    flight.close
-                )  # first: a link that comes meanwhile must not use this file
+                # first: a link that comes meanwhile must not use this file
+                await asyncio.to_thread(flight.close)
         finally:
             if self._links.get(stream) is link:
                 del self._links[stream]

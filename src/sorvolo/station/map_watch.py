@@ -33,9 +33,8 @@ class MapWatch(ThreadOwner):
         self, shelf: SiteShelf, tiles: WebTiles, reviews: Reviews, events: EventLog
     ) -> None:
         self._shelf, self._tiles, self._reviews, self._events = shelf, tiles, reviews, events
-        self._listed: set[str] = (
-            set()
-        )  # also those that could not be opened: their end is announced as well
+        # also those that could not be opened: their end is announced as well
+        self._listed: set[str] = set()
         self._seen: dict[str, _Seen] = {}
         self._covered: dict[
             str, int
@@ -45,9 +44,8 @@ class MapWatch(ThreadOwner):
 
     def start(self) -> None:
         """Follow the maps from now on; the sites of this moment are known when this returns."""
-        self._listed |= (
-            self._shelf.folders().keys()
-        )  # one deleted before the first look has to be announced as well
+        # one deleted before the first look has to be announced as well
+        self._listed |= self._shelf.folders().keys()
         self.begin()
 
     def look(self) -> None:

@@ -26,9 +26,8 @@ CODECS = ("h264", "hevc")
 _STREAM = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _HEAD = struct.Struct(">cBQqq")
 _MOST_TELEMETRY_BYTES = 16_384  # a sample has hundreds; by choice
-_MOST_HELLO_BYTES = (
-    65_536  # a greeting holds a camera and a decoder's head, some kilobytes; by choice
-)
+# a greeting holds a camera and a decoder's head, some kilobytes; by choice
+_MOST_HELLO_BYTES = 65_536
 _STATED = frozenset(item.name for item in ITEMS.values())
 
 

@@ -20,10 +20,10 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from sorvolo.station.events import EventLog
 from sorvolo.station.ingest import Ingest
 from sorvolo.station.relays import RelayFigures
-from sorvolo.station.security import needs
+from sorvolo.station.security import FOR_VIEWERS
 from sorvolo.station.settings import StationSettings
 from sorvolo.station.state import utc_now
-from sorvolo.station.tokens import Holder, Role
+from sorvolo.station.tokens import Holder
 
 # upper limits of the counted times, about threefold each, around the targets of tiles and pages
 _SECONDS = (0.005, 0.01, 0.03, 0.06, 0.1, 0.3, 1.0, 3.0, 10.0)
@@ -133,7 +133,7 @@ def metrics_routes(metrics: StationMetrics) -> APIRouter:
     """`/metrics`, for whoever may view the station."""
     router = APIRouter(tags=["station"])
 
-    @router.get("/metrics", dependencies=[needs(Role.VIEW)], response_class=Response)
+    @router.get("/metrics", dependencies=FOR_VIEWERS, response_class=Response)
     def show_metrics() -> Response:
         """All figures in Prometheus' text format."""
         return Response(generate_latest(metrics.registry), media_type=CONTENT_TYPE_LATEST)
@@ -227,9 +227,8 @@ class Observer:
         finally:
             seconds = time.monotonic() - began_s
             method = scope.get("method", "WS")
-            method = (
-                method if method in _METHODS else "other"
-            )  # a client may invent as many as it likes
+            # a client may invent as many as it likes
+            method = method if method in _METHODS else "other"
             self._count(_pattern(scope, status), method, status, seconds)
             _log(scope, method, status, seconds)
 

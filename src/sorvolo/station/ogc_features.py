@@ -14,9 +14,8 @@ from sorvolo.station.exports import cogs_of, tilejson_address
 from sorvolo.station.found import Feature
 from sorvolo.station.problems import Problem
 from sorvolo.station.reviews import Reviews
-from sorvolo.station.security import address, needs
+from sorvolo.station.security import FOR_VIEWERS, address
 from sorvolo.station.sites import SiteShelf, bounds_lonlat
-from sorvolo.station.tokens import Role
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import VersionEntry
 
@@ -50,9 +49,7 @@ def landing_links(request: Request, site: str) -> list[dict[str, str]]:
 
 def feature_routes(collections: SiteCollections, reviews: Reviews) -> APIRouter:
     """Conformance, collections and items of each site."""
-    router = APIRouter(
-        prefix="/api/sites/{site}", tags=["features"], dependencies=[needs(Role.VIEW)]
-    )
+    router = APIRouter(prefix="/api/sites/{site}", tags=["features"], dependencies=FOR_VIEWERS)
 
     @router.get("/conformance")
     def conformance(site: str) -> Json:
@@ -304,7 +301,7 @@ _PROJECTION = "https://stac-extensions.github.io/projection/v2.0.0/schema.json"
 
 def stac_routes(shelf: SiteShelf) -> APIRouter:
     """The catalogue of all sites, the collection of each, the items of its versions."""
-    router = APIRouter(prefix="/api/stac", tags=["STAC"], dependencies=[needs(Role.VIEW)])
+    router = APIRouter(prefix="/api/stac", tags=["STAC"], dependencies=FOR_VIEWERS)
 
     @router.get("")
     def catalogue(request: Request) -> Json:

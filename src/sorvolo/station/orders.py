@@ -13,12 +13,10 @@ from sorvolo.capture.live.addresses import shown_address
 from sorvolo.missions.worker import Order
 from sorvolo.store.atomic import atomic_write_bytes
 
-ORDER_FILE, JOURNAL_FILE, LOG_FILE, LOCK_FILE = (
-    "order.json",
-    "journal.jsonl",
-    "log.txt",
-    "running.lock",
-)
+ORDER_FILE = "order.json"
+JOURNAL_FILE = "journal.jsonl"
+LOG_FILE = "log.txt"
+LOCK_FILE = "running.lock"
 """The files of a run's folder: what it is to do, what it did line by line, what it printed, who is at it."""
 
 LOCK_VARIABLE = "SORVOLO_RUN_LOCK"

@@ -184,11 +184,9 @@ class CotRelay(ThreadOwner):
             raise NotTaken("it has no place on Earth")
         thing = properties.get("id", event["seq"])
         if event["type"] == "change.announced":
-            name, uid, type_ = (
-                str(properties.get("kind", "change")),
-                f"sorvolo.{site}.{thing}",
-                _CHANGE_TYPE,
-            )
+            name = str(properties.get("kind", "change"))
+            uid = f"sorvolo.{site}.{thing}"
+            type_ = _CHANGE_TYPE
         else:
             name = str(properties.get("class", "object"))
             uid, type_ = f"sorvolo.{site}.{event.get('run')}.{thing}", cot_type(name)
@@ -225,9 +223,9 @@ class CotRelay(ThreadOwner):
             for stream, view in self._drones().items():
                 try:
                     self._drone_sender.send(_drone(view, stream, stream))
-                except (
-                    OSError
-                ):  # the next position is sent in a second; `send` reports a receiver that is away
+                except OSError:
+                    # the next position is sent in a second; `send` reports a receiver that is
+                    # away
                     break
 
 

@@ -21,9 +21,8 @@ from sorvolo.station.crops import FlightVideos
 from sorvolo.station.found import Feature
 from sorvolo.station.problems import Problem
 from sorvolo.station.reviews import Review, Reviews
-from sorvolo.station.security import needs
+from sorvolo.station.security import FOR_VIEWERS
 from sorvolo.station.sites import SiteShelf
-from sorvolo.station.tokens import Role
 from sorvolo.store.exports.plain import utc_text
 from sorvolo.store.index.archive_index import INDEX, ArchiveIndex, has_index
 from sorvolo.store.index.finding import FoundFlight, Place
@@ -116,7 +115,7 @@ def place_routes(
     index: PlaceIndex,
 ) -> APIRouter:
     """What is remembered of a place."""
-    router = APIRouter(prefix="/api", tags=["memory"], dependencies=[needs(Role.VIEW)])
+    router = APIRouter(prefix="/api", tags=["memory"], dependencies=FOR_VIEWERS)
 
     @router.get("/place")
     def place_of_all(
@@ -157,7 +156,7 @@ def place_routes(
             found = _near(site, Point(lon, lat), collections, reviews)
         else:
             seeing = [each.flight for each in known if each.frames]
-            those = dict(zip(seeing, collections.frames_of(site, seeing), strict=True))
+            those = dict(zip(seeing, collections.frames_of(site, seeing)))
             views = [view for each in those.values() for view in _views(each.frames, lon, lat)]
             kept = {(flight, number) for flight, each in those.items() for number in each.kept}
             found = {each.flight: _things(site, each, reviews) for each in known}

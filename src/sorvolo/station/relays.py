@@ -147,7 +147,8 @@ class Relay(ThreadOwner):
         except (
             OSError,
             StoreError,
-        ) as error:  # a full disk costs events that are sent twice, not events
+        ) as error:
+            # a full disk costs events that are sent twice, not events
             _LOG.warning("cannot note what %s got: %s", self.name, error)
 
 

@@ -19,7 +19,7 @@ from sorvolo.station.collections import FINDINGS, SiteCollections
 from sorvolo.station.events import EventLog, NewEvent
 from sorvolo.station.orders import Wish
 from sorvolo.station.problems import Problem
-from sorvolo.station.security import needs
+from sorvolo.station.security import FOR_VIEWERS, needs
 from sorvolo.station.settings import StationSettings
 from sorvolo.station.sites import SiteShelf
 from sorvolo.station.state import StationState, compact_json, utc_now
@@ -145,12 +145,10 @@ class Reviews:
             found = (
                 self._collections.get(site_id, FINDINGS).features if made.kind == "object" else []
             )
-            key, kept = (
-                self._key(site_id),
-                next(
-                    (each["properties"]["voted_as"] for each in found if each["id"] == made.id),
-                    made.id,
-                ),
+            key = self._key(site_id)
+            kept = next(
+                (each["properties"]["voted_as"] for each in found if each["id"] == made.id),
+                made.id,
             )
             event = NewEvent("review.changed", asdict(standing), site_id)
             try:
@@ -258,7 +256,7 @@ def review_routes(reviews: Reviews, shelf: SiteShelf) -> APIRouter:
     """Verdicts listed and given."""
     router = APIRouter(prefix="/api/sites/{site}/reviews", tags=["reviews"])
 
-    @router.get("", dependencies=[needs(Role.VIEW)])
+    @router.get("", dependencies=FOR_VIEWERS)
     def history(
         site: str,
         kind: Literal["", "object", "change"] = "",
@@ -409,7 +407,7 @@ def drawing_routes(drawings: Drawings) -> APIRouter:
     """Drawings read and kept."""
     router = APIRouter(prefix="/api/sites/{site}/drawings", tags=["drawings"])
 
-    @router.get("", dependencies=[needs(Role.VIEW)])
+    @router.get("", dependencies=FOR_VIEWERS)
     def get(site: str) -> Json:
         """Areas of interest, alert zones, waypoints and measures of a site."""
         return drawings.get(site)

@@ -40,7 +40,7 @@ from sorvolo.station.orders import (
     writes,
 )
 from sorvolo.station.problems import Problem, below, demand_room
-from sorvolo.station.security import needs
+from sorvolo.station.security import FOR_OPERATORS, FOR_VIEWERS, needs
 from sorvolo.station.settings import RESERVE_FILE, RUNS_FOLDER, STREAMS_FOLDER, StationSettings
 from sorvolo.station.sites import SiteShelf
 from sorvolo.station.state import (
@@ -55,14 +55,12 @@ from sorvolo.station.state import (
 from sorvolo.station.tokens import Holder, Role
 from sorvolo.store.atomic import take_lock, writing
 
-RUNNING, FINISHED, INCOMPLETE, FAILED, STOPPED, LOST = (
-    "running",
-    "finished",
-    "incomplete",
-    "failed",
-    "stopped",
-    "lost",
-)
+RUNNING = "running"
+FINISHED = "finished"
+INCOMPLETE = "incomplete"
+FAILED = "failed"
+STOPPED = "stopped"
+LOST = "lost"
 """States of a run. Incomplete: finished and kept, but pictures of its flight are missing, as where the disk was full.
 Lost: its process ended without a word, as when the machine was switched off."""
 
@@ -116,13 +114,11 @@ class Runs(ThreadOwner):
         show: Callable[[str, JsonView], None] = lambda *_: None,
     ) -> None:
         self._show = show
-        self._settings, self._state, self._shelf, self._events, self._inputs = (
-            settings,
-            state,
-            shelf,
-            events,
-            inputs,
-        )
+        self._settings = settings
+        self._state = state
+        self._shelf = shelf
+        self._events = events
+        self._inputs = inputs
         self._folder = settings.state_folder / RUNS_FOLDER
         self._lock = threading.RLock()
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
@@ -190,10 +186,8 @@ class Runs(ThreadOwner):
                 )
             }
             results = site / SEARCH_FOLDER if wish.mission == "search" else folder / "results"
-            stream, door = (
-                (wish.input.stream if wish.input else None) or "",
-                self._settings.camera_door,
-            )
+            stream = (wish.input.stream if wish.input else None) or ""
+            door = self._settings.camera_door
             is_camera = (
                 wish.input is not None and wish.input.stream_url is not None and door.is_socket()
             )
@@ -229,9 +223,8 @@ class Runs(ThreadOwner):
             run = replace(run, pid=process.pid)
             try:
                 self._begin(run)
-            except (
-                BaseException
-            ):  # a full disk: nobody would know of the mission, nor could stop it
+            except BaseException:
+                # a full disk: nobody would know of the mission, nor could stop it
                 process.kill()
                 process.wait()
                 raise
@@ -248,9 +241,8 @@ class Runs(ThreadOwner):
             run = self.get(run_id)
             if run.state != RUNNING:
                 raise Problem(409, f"this run is {run.state} already")
-            if run.pid is not None and not _has_ended(
-                self._folder / run.id
-            ):  # the number is still its own
+            # the number is still its own
+            if run.pid is not None and not _has_ended(self._folder / run.id):
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(run.pid, signal.SIGTERM)
             limits = self._settings.limits
@@ -329,10 +321,8 @@ class Runs(ThreadOwner):
 
         Missions that run carry a notice meanwhile.
         """
-        free_gb, floor_gb = (
-            shutil.disk_usage(self._settings.root).free / 1e9,
-            self._settings.free_floor_gb,
-        )
+        free_gb = shutil.disk_usage(self._settings.root).free / 1e9
+        floor_gb = self._settings.free_floor_gb
         short = shortage(self._settings.root, floor_gb)
         if not (is_low := bool(short)):
             self._reserve.hold()
@@ -413,9 +403,8 @@ class Runs(ThreadOwner):
 
     def _look_at(self, run: Run, offset: int) -> Run:
         folder = self._folder / run.id
-        has_ended = _has_ended(
-            folder
-        )  # asked first: lines written before the end are then all there
+        # asked first: lines written before the end are then all there
+        has_ended = _has_ended(folder)
         with self._lock:
             lines, end = _new_lines(folder / JOURNAL_FILE, offset)
             run, events = self._advanced(self.get(run.id), lines)
@@ -645,12 +634,12 @@ def run_routes(runs: Runs, inputs: Inputs, ingest: Ingest) -> APIRouter:
     """Missions by the API, as from the command line."""
     router = APIRouter(tags=["runs"])
 
-    @router.get("/api/inputs", dependencies=[needs(Role.VIEW)])
+    @router.get("/api/inputs", dependencies=FOR_VIEWERS)
     def list_inputs() -> list[Json]:
         """Videos, folders of photos, telemetry and camera files below the station's folder."""
         return [input_row(each) for each in inputs.all()]
 
-    @router.get("/api/runs", dependencies=[needs(Role.VIEW)])
+    @router.get("/api/runs", dependencies=FOR_VIEWERS)
     def all_runs(
         site: str = Query("", max_length=200),
         limit: int = Query(200, ge=1, le=1000),
@@ -663,17 +652,17 @@ def run_routes(runs: Runs, inputs: Inputs, ingest: Ingest) -> APIRouter:
         """Start a mission: map, compare, watch or search. 409 while another one writes into the site."""
         return run_row(runs.start(wish, holder.name))
 
-    @router.get("/api/runs/{run_id}", dependencies=[needs(Role.VIEW)])
+    @router.get("/api/runs/{run_id}", dependencies=FOR_VIEWERS)
     def one(run_id: str) -> Json:
         """A mission: its state (running, finished, incomplete, failed, stopped, lost), how far it is, how it ended."""
         return run_row(runs.get(run_id))
 
-    @router.post("/api/runs/{run_id}/stop", dependencies=[needs(Role.OPERATE)])
+    @router.post("/api/runs/{run_id}/stop", dependencies=FOR_OPERATORS)
     def stop(run_id: str) -> Json:
         """Ask it to end: a live flight is finished and kept, a recorded one is left out."""
         return run_row(runs.stop(run_id))
 
-    @router.delete("/api/runs/{run_id}", status_code=204, dependencies=[needs(Role.OPERATE)])
+    @router.delete("/api/runs/{run_id}", status_code=204, dependencies=FOR_OPERATORS)
     async def delete(run_id: str) -> None:
         """Take a mission that is over away: its record, what a watch found, the recording of its camera. The map that
         it made stays. 409 while it runs, 423 while another mission reads the recording."""

@@ -49,12 +49,10 @@ class Doorkeeper:
     def __init__(
         self, app: ASGIApp, settings: StationSettings, state: StationState, upload_path: str
     ) -> None:
-        self._app, self._settings, self._state, self._upload_path = (
-            app,
-            settings,
-            state,
-            upload_path,
-        )
+        self._app = app
+        self._settings = settings
+        self._state = state
+        self._upload_path = upload_path
         self._guesses = Guesses()
         self._live: Counter[str] = Counter()  # channels that are open, by address
 
@@ -108,9 +106,8 @@ class Doorkeeper:
             raise Problem(
                 401, "this station needs tokens and has none; make one with `sorvolo token`"
             )
-        if _ANYBODY.fullmatch(
-            connection.scope["path"]
-        ):  # not looked at: an old cookie must not keep its owner out
+        # not looked at: an old cookie must not keep its owner out
+        if _ANYBODY.fullmatch(connection.scope["path"]):
             return Holder("", Role.VIEW)
         token = sent_token(connection)
         if not token:
@@ -196,6 +193,11 @@ def needs(role: Role) -> Any:
         return holder
 
     return Depends(demanded)
+
+
+FOR_VIEWERS = [needs(Role.VIEW)]
+FOR_OPERATORS = [needs(Role.OPERATE)]
+"""The dependencies of routes for whoever may look, and for whoever may start, stop and delete."""
 
 
 def check_host(host: str, settings: StationSettings) -> None:
@@ -296,9 +298,8 @@ def _limited(connection: HTTPConnection, receive: Receive) -> Receive:
         message = await receive()
         taken += len(message.get("body", b""))
         if taken > _MOST_BODY_BYTES:
-            raise HTTPException(
-                413, too_large.detail
-            )  # what FastAPI passes on as it is while it reads a body
+            # what FastAPI passes on as it is while it reads a body
+            raise HTTPException(413, too_large.detail)
         return message
 
     return receiving

@@ -29,9 +29,8 @@ class StationLimits:
     """How much a station does at the same time, and how long it waits for missions that are to end."""
 
     most_connections: int = 1000  # of all clients; a browser opens six and a few live ones
-    most_live_per_address: int = (
-        64  # event and video channels: a crew behind one router is one address
-    )
+    # event and video channels: a crew behind one router is one address
+    most_live_per_address: int = 64
     most_missions: int = 4  # at the same time; each takes a core and a gigabyte or more
     most_streams: int = 16  # of drones that send at the same time
     most_uploads: int = 1000  # that are kept
@@ -64,9 +63,8 @@ class StationSettings:
     limits: StationLimits = StationLimits()
 
     def __post_init__(self) -> None:
-        object.__setattr__(
-            self, "root", self.root.absolute()
-        )  # missions run in folders of their own
+        # missions run in folders of their own
+        object.__setattr__(self, "root", self.root.absolute())
         if not 0 < self.port < 65536:
             raise SettingsError(f"--port {self.port}: a port from 1 to 65535 was needed")
         if not self.free_floor_gb >= 0:

@@ -17,9 +17,8 @@ from sorvolo.paths import Json
 from sorvolo.station.problems import Problem
 from sorvolo.station.reviews import Drawings, Reviews
 from sorvolo.station.runs import Runs
-from sorvolo.station.security import needs
+from sorvolo.station.security import FOR_OPERATORS
 from sorvolo.station.sites import SiteShelf
-from sorvolo.station.tokens import Role
 from sorvolo.store.atomic import writing
 from sorvolo.store.site.catalogue_place import CATALOGUE, catalogue_file
 from sorvolo.store.site.files import COPYING, ORIGIN, BusyError, lock_folder
@@ -157,7 +156,8 @@ class SiteDeletion:
         except (
             StoreError,
             Problem,
-        ):  # damaged, or a stranger's with links in it: all the more it may go
+        ):
+            # damaged, or a stranger's with links in it: all the more it may go
             return None, None, _mark(about.st_dev, about.st_ino)
         flights = len({each.flight_id for each in complete})
         newest = max((each.id for each in complete), default=0)
@@ -166,7 +166,7 @@ class SiteDeletion:
 
 def site_deletion_routes(deletion: SiteDeletion) -> APIRouter:
     """What a site's deletion would take, and the deletion itself."""
-    router = APIRouter(prefix="/api/sites", tags=["sites"], dependencies=[needs(Role.OPERATE)])
+    router = APIRouter(prefix="/api/sites", tags=["sites"], dependencies=FOR_OPERATORS)
 
     @router.get("/{site}/deletion")
     def loss(site: str, response: Response) -> Json:

@@ -15,9 +15,8 @@ from sorvolo.station.messages import Kind, Message, message_from_bytes
 from sorvolo.store.atomic import take_lock
 
 _RECORD = struct.Struct(">IIq")  # length, checksum, when it was taken (UTC, ns)
-_SEGMENT_BYTES = (
-    16_000_000  # of a file; what is acknowledged leaves the disk in such pieces; by choice
-)
+# of a file; what is acknowledged leaves the disk in such pieces; by choice
+_SEGMENT_BYTES = 16_000_000
 _FLIGHT, _HELLO, _LOCK = "flight", "hello.json", "lock"
 
 _Reason = Literal["late", "overflow"]

@@ -20,7 +20,7 @@ from sorvolo.station.events import EventLog, NewEvent
 from sorvolo.station.ingest import Announce, Ingest, LinkClosed
 from sorvolo.station.messages import REFUSED_CODE
 from sorvolo.station.runs import Runs
-from sorvolo.station.security import needs
+from sorvolo.station.security import FOR_OPERATORS, FOR_VIEWERS, needs
 from sorvolo.station.tokens import Role
 from sorvolo.station.video import Viewer
 
@@ -29,18 +29,18 @@ def stream_routes(ingest: Ingest, runs: Runs) -> APIRouter:
     """`/api/streams`, `/api/ingest/{stream}` and `/api/streams/{stream}/video`."""
     router = APIRouter(tags=["streams"])
 
-    @router.get("/api/streams", dependencies=[needs(Role.VIEW)])
+    @router.get("/api/streams", dependencies=FOR_VIEWERS)
     def streams() -> list[Json]:
         """Every stream of which flights are kept, how many bytes those are, and what those do that are being sent."""
         return [each | {"bytes": ingest.kept_bytes(each["stream"])} for each in ingest.streams()]
 
-    @router.get("/api/streams/{stream}", dependencies=[needs(Role.VIEW)])
+    @router.get("/api/streams/{stream}", dependencies=FOR_VIEWERS)
     def one_stream(stream: str) -> Json:
         """One stream: its flights, and how the one goes that is being sent."""
         kept = {"viewers": ingest.viewers(stream), "bytes": ingest.kept_bytes(stream)}
         return ingest.state(stream) | kept | {"time_us": time.time_ns() // 1000}
 
-    @router.delete("/api/streams/{stream}", status_code=204, dependencies=[needs(Role.OPERATE)])
+    @router.delete("/api/streams/{stream}", status_code=204, dependencies=FOR_OPERATORS)
     async def delete_all(stream: str) -> None:
         """Take all recordings of a stream away. 423 while a drone sends it, or a mission reads it."""
         with runs.unused_stream(stream):
@@ -49,7 +49,7 @@ def stream_routes(ingest: Ingest, runs: Runs) -> APIRouter:
     @router.delete(
         "/api/streams/{stream}/flights/{flight}",
         status_code=204,
-        dependencies=[needs(Role.OPERATE)],
+        dependencies=FOR_OPERATORS,
     )
     async def delete_one(stream: str, flight: str) -> None:
         """Take one recording of a stream away. 423 while a drone sends it, or a mission reads the stream."""
@@ -97,9 +97,8 @@ def announcing(events: EventLog) -> Announce:
 
     An event names the newest flight alone: thousands of events are kept in memory.
     """
-    writing = ThreadPoolExecutor(
-        1, thread_name_prefix="stream states"
-    )  # two threads could swap coming and going
+    # two threads could swap coming and going
+    writing = ThreadPoolExecutor(1, thread_name_prefix="stream states")
 
     def announce(stream: str, state: JsonView) -> None:
         event = NewEvent(

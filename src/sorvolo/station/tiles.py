@@ -24,9 +24,8 @@ from sorvolo.errors import SorvoloError
 from sorvolo.geometry.arrays import Floats, Floats32, ImageRGBA
 from sorvolo.geometry.grid import Grid, SiteGrid, TileIndex
 from sorvolo.station.problems import Problem
-from sorvolo.station.security import address, needs
+from sorvolo.station.security import FOR_VIEWERS, address
 from sorvolo.station.sites import SiteShelf, bounds_lonlat
-from sorvolo.station.tokens import Role
 from sorvolo.store.images import BytesCache
 from sorvolo.store.rasters.geotiff import crs_of_epsg, open_raster, quiet_gdal
 from sorvolo.store.site.archive import Archive
@@ -175,18 +174,16 @@ def halved(rgba: ImageRGBA) -> ImageRGBA:
     if len(at[0]):
         mixed = np.stack([each[at] for each in fours]).astype(np.float32)
         share = mixed[..., 3:]
-        colours = (mixed[..., :3] * share).sum(axis=0) / share.sum(
-            axis=0
-        )  # one alpha at least is above 0
+        # one alpha at least is above 0
+        colours = (mixed[..., :3] * share).sum(axis=0) / share.sum(axis=0)
         small[at] = np.round(np.column_stack([colours, share.mean(axis=0)])).astype(np.uint8)
     small.setflags(write=False)
     return small
 
 
 TILE_PX = 256  # a side, as web maps have it
-_SHALLOWEST_ZOOM = (
-    8  # a tile of 150 km: a map is less than a pixel there, and the site's plane is no plane
-)
+# a tile of 150 km: a map is less than a pixel there, and the site's plane is no plane
+_SHALLOWEST_ZOOM = 8
 _DEEPEST_ZOOM = 26  # 2 mm a pixel at the equator: finer than any map
 _LATTICE = 17  # places a side that are projected exactly; between them it is linear to a hundredth of a pixel
 _PICTURES_BYTES, _ANSWERS_BYTES = 192_000_000, 64_000_000
@@ -302,9 +299,8 @@ def render(
 
 def encoded(rgba: ImageRGBA, ending: str) -> bytes:
     """A picture as .webp or .png bytes."""
-    if (
-        ending == ".webp"
-    ):  # by Pillow: OpenCV's has no choice of the method, and takes 2.5 times as long
+    # by Pillow: OpenCV's has no choice of the method, and takes 2.5 times as long
+    if ending == ".webp":
         kept = BytesIO()
         Image.fromarray(rgba).save(kept, "WEBP", quality=_QUALITY, method=_QUICK_METHOD)
         return kept.getvalue()
@@ -402,7 +398,8 @@ class MapOverview:
             RasterioError,
             SorvoloError,
             OSError,
-        ):  # damaged or taken away: the tiles themselves have it all
+        ):
+            # damaged or taken away: the tiles themselves have it all
             return None
 
     def _corner(self, source: DatasetReader) -> tuple[int | None, int | None]:
@@ -449,9 +446,8 @@ def _mark(path: Path) -> tuple[int, int] | None:
     return about.st_ino, about.st_mtime_ns
 
 
-_FIRST_SCALE = (
-    559082264.0287178  # of zoom 0 at 0.28 mm a pixel: WMTS 1.0.0, annex E.4 (GoogleMapsCompatible)
-)
+# of zoom 0 at 0.28 mm a pixel: WMTS 1.0.0, annex E.4 (GoogleMapsCompatible)
+_FIRST_SCALE = 559082264.0287178
 _EDGE_M = 20037508.342789244  # half of the equator's length on the sphere of web maps (EPSG:3857)
 _ZOOMS = range(8, 25)
 _SET = "GoogleMapsCompatible"
@@ -465,9 +461,7 @@ class XmlResponse(Response):
 
 def wmts_routes(shelf: SiteShelf) -> APIRouter:
     """The capabilities of each site's tiles."""
-    router = APIRouter(
-        prefix="/api/sites/{site}", tags=["rasters"], dependencies=[needs(Role.VIEW)]
-    )
+    router = APIRouter(prefix="/api/sites/{site}", tags=["rasters"], dependencies=FOR_VIEWERS)
 
     @router.get("/WMTSCapabilities.xml", response_class=XmlResponse)
     def capabilities(request: Request, site: str) -> XmlResponse:

@@ -16,9 +16,8 @@ _PACKET, _BODY = 188, 184
 _PIDS = _PAT, _PMT, _VIDEO, _METADATA = 0x0000, 0x1000, 0x0100, 0x0101
 _MARK = 0x1FE0
 _TYPES = {"h264": 0x1B, "hevc": 0x24}
-_FIRST_90KHZ = (
-    900_000  # the flight's zero, 10 s: pictures that are decoded before they are shown stay above 0
-)
+# the flight's zero, 10 s: pictures that are decoded before they are shown stay above 0
+_FIRST_90KHZ = 900_000
 _PCR_LEAD_90KHZ = 18_000  # 0.2 s, what a receiver may hold back
 _MARK_HEAD = struct.Struct(">4sQqIIcB4B")
 _MARK_NAME = b"SVL1"

@@ -23,7 +23,7 @@ from sorvolo.child_process import python_command
 from sorvolo.paths import Json, JsonView
 from sorvolo.station.events import EventLog, NewEvent
 from sorvolo.station.problems import Problem, demand_room
-from sorvolo.station.security import needs
+from sorvolo.station.security import FOR_OPERATORS, needs
 from sorvolo.station.settings import StationSettings
 from sorvolo.station.state import utc_now
 from sorvolo.station.tokens import Holder, Role
@@ -59,9 +59,8 @@ _PART, _INFO, _FILES = "part", "info.json", "files"
 _CHECK_WITHIN_S = 1800.0  # for the check of a whole upload, by the clock; by choice
 _GIVEN_UP_S = 3600.0  # nothing came for so long: the room that an upload announced is free again
 _LOOK_EVERY_BYTES = 64_000_000  # written between two looks at the free space
-_SILENT_S = (
-    30.0  # a request that sends nothing for so long has lost its link: another one may go on
-)
+# a request that sends nothing for so long has lost its link: another one may go on
+_SILENT_S = 30.0
 _ID = re.compile(r"[0-9a-f]{24}")
 
 
@@ -117,7 +116,8 @@ class Uploads:
                 OSError,
                 ValueError,
                 TypeError,
-            ):  # being taken away, or broken by somebody: no upload
+            ):
+                # being taken away, or broken by somebody: no upload
                 continue
         return sorted(found, key=lambda each: (each.made_at, each.id))
 
@@ -420,7 +420,7 @@ def upload_routes(
     uploads: Uploads, unused: Callable[[str], AbstractContextManager[None]]
 ) -> APIRouter:
     """Begin, continue, ask after, end an upload."""
-    router = APIRouter(prefix="/api/uploads", tags=["uploads"], dependencies=[needs(Role.OPERATE)])
+    router = APIRouter(prefix="/api/uploads", tags=["uploads"], dependencies=FOR_OPERATORS)
 
     @router.options("", status_code=204)
     def about() -> Response:

@@ -20,10 +20,9 @@ Mode = Literal["annexb", "fmp4"]
 
 _MOST_WAITING = 90  # pictures, three seconds
 _MOST_WAITING_BYTES = 8_000_000  # three seconds at 20 Mbit/s
-_MOST_GROUP, _MOST_GROUP_BYTES = (
-    900,
-    64_000_000,
-)  # pictures since a key frame that are kept for new viewers
+# pictures since a key frame that are kept for new viewers
+_MOST_GROUP = 900
+_MOST_GROUP_BYTES = 64_000_000
 _STAMP_BYTES = 8  # of a picture's time before its data, us
 _CLOCK_HZ = 1_000_000  # us, as WebCodecs counts
 _STEP_US = 33_333  # how long a picture is shown where nobody states the rate
@@ -228,9 +227,8 @@ class Fragments:
         dts_us = max(0, message.pts_us if message.dts_us is None else message.dts_us)
         units = [each for each in nal_units(message.payload) if not is_delimiter(self._codec, each)]
         data = b"".join(len(each).to_bytes(4, "big") + each for each in units)
-        flags = (
-            0x0200_0000 if message.is_key else 0x0101_0000
-        )  # needs no other; needs one, is no place to begin
+        # needs no other; needs one, is no place to begin
+        flags = 0x0200_0000 if message.is_key else 0x0101_0000
         tfhd = _box(b"tfhd", struct.pack(">II", 0x02_0000, 1))  # offsets count from the fragment
         tfdt = _box(b"tfdt", struct.pack(">IQ", 0x0100_0000, dts_us))
         run = (0x0100_0F01, 1, 0, self._step_us, len(data), flags, message.pts_us - dts_us)

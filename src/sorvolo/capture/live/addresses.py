@@ -18,9 +18,8 @@ ADDRESS_FORMS = "rtsp://HOST/live, rtmp://HOST/live, udp://:PORT, tcp://:PORT, h
 
 _WAITING = frozenset({"udp", "rtp"})  # a sender may begin at any time; nothing has to be dialled
 _OPEN_S = 6.0  # for the other side's first answer and pictures; by choice
-_LISTEN_S = (
-    3  # a listener that nobody calls is opened anew so often, so that it can be stopped; by choice
-)
+# a listener that nobody calls is opened anew so often, so that it can be stopped; by choice
+_LISTEN_S = 3
 # without a host: the usual port, and FFmpeg's options to be the server that a drone pushes its video to; what ends is
 # the wait for a call, not a call that has come
 _LISTENING: Mapping[str, tuple[int, Mapping[str, str]]] = {

@@ -14,9 +14,8 @@ _POLL_S = 0.01  # pictures wait for it
 _PACKET_BYTES = 188  # ISO/IEC 13818-1
 _TABLE = b"\x47\x00\x00"  # a packet of the program association table: its first bytes without their flags
 _SEARCHED_PACKETS = 10_000  # at a time
-_NEWEST_BYTES = (
-    16_000_000  # of a transport stream, some ten seconds: who wants the newest frames begins there
-)
+# of a transport stream, some ten seconds: who wants the newest frames begins there
+_NEWEST_BYTES = 16_000_000
 
 
 class GrowingFile:

@@ -26,6 +26,7 @@ from sorvolo.survey.flight import TELEMETRY_COLUMNS, CameraModel, Notice, Teleme
 FORMAT = "klv"
 """The name that `Telemetry.format` carries."""
 
+# named as their columns
 _OWN_TAGS = (
     "height_above_takeoff_m",
     "horizontal_sigma_m",
@@ -34,10 +35,9 @@ _OWN_TAGS = (
     "heading_sigma_deg",
     "course_deg",
     "speed_m_s",
-)  # named as their columns
-_FOV_SIGMA = (
-    0.03  # of a focal length from the field of view: operators round it, and zooms lag behind it
 )
+# of a focal length from the field of view: operators round it, and zooms lag behind it
+_FOV_SIGMA = 0.03
 _LEAST_DOWN = radians(5)  # of a view whose middle is on the ground; flatter ones meet it far away
 _LEVEL_FROM_CAMERA = site_from_gimbal_rotation(0.0, 0.0, 0.0)
 
@@ -57,11 +57,9 @@ def columns_of(stated: LocalSet) -> dict[str, float]:
         "ellipsoidal_height_m": full_m if isfinite(full_m) else stated["sensor_ellipsoid_height_m"],
         **{name: stated[name] for name in _OWN_TAGS},
     }
-    heading, pitch, roll = (
-        stated["platform_heading_deg"],
-        _first_known(stated["platform_pitch_full_deg"], stated["platform_pitch_deg"]),
-        _first_known(stated["platform_roll_full_deg"], stated["platform_roll_deg"]),
-    )
+    heading = stated["platform_heading_deg"]
+    pitch = _first_known(stated["platform_pitch_full_deg"], stated["platform_pitch_deg"])
+    roll = _first_known(stated["platform_roll_full_deg"], stated["platform_roll_deg"])
     columns |= {"body_yaw_deg": heading, "body_pitch_deg": pitch, "body_roll_deg": roll}
     relative = stated["sensor_relative_azimuth_deg"], stated["sensor_relative_elevation_deg"]
     if all(map(isfinite, (heading, pitch, roll, *relative))):
@@ -254,7 +252,7 @@ def mux_klv(
             pictures = source.streams.video[0]
             size_px = pictures.codec_context.width, pictures.codec_context.height
             packets = []
-            for sample, heading_deg in zip(samples, headings_deg, strict=True):
+            for sample, heading_deg in zip(samples, headings_deg):
                 seen = detections.get(sample.video_s, ())
                 packet = packet_of(sample, heading_deg, height_reference, seen, size_px)
                 packets.append((sample.video_s, packet))

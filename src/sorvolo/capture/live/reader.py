@@ -49,9 +49,8 @@ class Backlog:
 
     def __init__(self) -> None:
 
-        self._delays_s: deque[tuple[float, float]] = (
-            deque()
-        )  # when, and how much: ever more, so the first is the least
+        # when, and how much: ever more, so the first is the least
+        self._delays_s: deque[tuple[float, float]] = deque()
         self._stamp_ns: int | None = None
         self._leaves_out_since: tuple[float, float] | None = None  # the clock and the stamp
         self._has_caught_up = False

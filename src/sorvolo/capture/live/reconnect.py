@@ -17,24 +17,19 @@ _LOG = logging.getLogger("sorvolo.live")
 class LiveSettings:
     """How a live source is read."""
 
-    keeps_all: bool = (
-        False  # (mapping); else a slow computer leaves out what it cannot decode in time (watching)
-    )
-    silent_s: float = (
-        3.0  # without a packet: the source counts as silent, which is reported, and is opened anew
-    )
+    # (mapping); else a slow computer leaves out what it cannot decode in time (watching)
+    keeps_all: bool = False
+    # without a packet: the source counts as silent, which is reported, and is opened anew
+    silent_s: float = 3.0
     first_s: float = 20.0  # to wait for the first frame before giving up
     give_up_s: float = 30.0  # a source that was silent for so long has ended
-    fix_wait_s: float = (
-        1.0  # a frame waits so long for the fix that follows it, if every frame is kept
-    )
+    # a frame waits so long for the fix that follows it, if every frame is kept
+    fix_wait_s: float = 1.0
     most_bytes: int = 256_000_000  # of decoded frames that wait
-    most_bytes_of_file: int = (
-        32_000_000  # the same of a growing file, which itself keeps what nobody has read yet
-    )
-    same_flight_s: float = (
-        900.0  # a run that was killed goes on with a stream that returns within so long
-    )
+    # the same of a growing file, which itself keeps what nobody has read yet
+    most_bytes_of_file: int = 32_000_000
+    # a run that was killed goes on with a stream that returns within so long
+    same_flight_s: float = 900.0
 
     follows_redirects: bool = True  # of an RTSP camera; else it is read over its connection alone
 
@@ -108,9 +103,8 @@ class Backoff:
 
     def next_s(self) -> float:
         """The pause before the next attempt."""
-        pause_s = self._next_s * random.uniform(
-            0.75, 1.25
-        )  # so that many ground stations do not knock at once
+        # so that many ground stations do not knock at once
+        pause_s = self._next_s * random.uniform(0.75, 1.25)
         self._next_s = min(2 * self._next_s, self._most_s)
         return pause_s
 

@@ -238,17 +238,14 @@ _HOLD_FOR_METADATA_S = 2.0  # where the stream has some, it states the frames' t
 _FIRST_FIXES = 2  # enough for where a flight begins, and how fast
 _FIRST_FIXES_S = 10.0  # waited for them; then the flight begins without
 _CLOCKS_AGREE_NS = 5_000_000_000  # further apart, one of the two clocks was set wrong; by choice
-_DELAYS_KEPT = (
-    60  # of the newest fixes, whose least delay ties the clocks: a minute at one a second
-)
-_NEWEST_SAMPLES = (
-    4096  # of telemetry, which place the frames that come: seven minutes at ten a second; by choice
-)
+# of the newest fixes, whose least delay ties the clocks: a minute at one a second
+_DELAYS_KEPT = 60
+# of telemetry, which place the frames that come: seven minutes at ten a second; by choice
+_NEWEST_SAMPLES = 4096
 _ZOOMED = 0.03  # relative change of the field of view: more than its rounding in the metadata
 _POLL_S = 0.25  # how soon an end is noticed; by choice
-_TIMELY_NS = (
-    5_000_000  # a frame so little before its turn is taken: the next one comes a whole frame later
-)
+# a frame so little before its turn is taken: the next one comes a whole frame later
+_TIMELY_NS = 5_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -339,11 +336,9 @@ class LiveStream:
         self._size_px = (0, 0)
         self._lens: LocalSet | None = None
         self._grounds_m: deque[float] = deque(maxlen=1000)
-        self.name, self.fingerprint, self.inputs = (
-            "",
-            "",
-            (address.shown, *([link] if link else [])),
-        )
+        self.name = ""
+        self.fingerprint = ""
+        self.inputs = (address.shown, *([link] if link else []))
         self.start_ns, self.start_origin = 0, ""
         self.camera: CameraModel = None  # type: ignore[assignment]  # set by `open_stream` once the size is known
         self.gaps_s: tuple[float, ...] = ()
@@ -466,9 +461,8 @@ class LiveStream:
     def continue_from(self, so_far: FlightSoFar) -> None:
         """Go on with a flight that an earlier process read; before `frames` is asked for, and telemetry."""
         if self._is_whole and self._clock.tie is ClockTie.ARRIVAL:
-            self._later_ns = (
-                so_far.start_ns - self.start_ns
-            )  # each process has timed it by when it began to read
+            # each process has timed it by when it began to read
+            self._later_ns = so_far.start_ns - self.start_ns
         if not self.is_reread:
             self._first_index = so_far.next_index
             began_ns = self.start_ns + self._later_ns
@@ -626,9 +620,8 @@ class LiveStream:
 
     def frame(self, decoded: av.VideoFrame, stamp_ns: int, arrived_s: float) -> None:
         """See `reader.StreamListener`."""
-        if (
-            not self._is_file or self._held_since is None
-        ):  # a file is read faster than it was written
+        # a file is read faster than it was written
+        if not self._is_file or self._held_since is None:
             self._clock.arrived(stamp_ns, time.time_ns())
         held = _Held(decoded, stamp_ns, arrived_s)
         if self._held is None:
@@ -645,11 +638,9 @@ class LiveStream:
         since_s, since_ns = self._held_since
         stated = sum(bool(each.time_ns) for _, each in self._held_metadata)
         if self._is_file:  # its frames come at once: what counts is how much of the flight was read
-            passed_s, usual_s, is_stated = (
-                (newest.stamp_ns - since_ns) / 1e9,
-                0.0,
-                stated >= _FIRST_FIXES,
-            )
+            passed_s = (newest.stamp_ns - since_ns) / 1e9
+            usual_s = 0.0
+            is_stated = stated >= _FIRST_FIXES
         else:
             passed_s, usual_s, is_stated = newest.arrived_s - since_s, _HOLD_S, stated > 0
         held_bytes = len(self._held) * newest.decoded.width * newest.decoded.height * 3 // 2
@@ -748,11 +739,9 @@ class LiveStream:
     # ---- pictures ---------------------------------------------------------------------------------------------
 
     def _converted(self, arrived: Arrived) -> Frame | LostFrame:
-        index, time_ns, decoded = (
-            arrived.index + self._first_index,
-            arrived.time_ns + self._later_ns,
-            arrived.decoded,
-        )
+        index = arrived.index + self._first_index
+        time_ns = arrived.time_ns + self._later_ns
+        decoded = arrived.decoded
         name = str(index)
         width_px, height_px = self._size_px
         fitted: dict[str, Any] = {}

@@ -83,10 +83,8 @@ class TelemetryLog:
             chosen = (0 if newest is None else max(0, self._count - newest), self._count)
             if chosen == self._known_rows:
                 return self._known
-            times_ns, rows = (
-                self._times_ns[slice(*chosen)].copy(),
-                self._rows[slice(*chosen)].copy(),
-            )
+            times_ns = self._times_ns[slice(*chosen)].copy()
+            rows = self._rows[slice(*chosen)].copy()
             late = notice(
                 "backward_time", self._late, "{} samples came out of order and are not used"
             )
@@ -116,8 +114,6 @@ class TelemetryLog:
         """Keep these, with room for as many more."""
         self._count = len(times_ns)
         room = max(_FIRST_ROWS, 2 * self._count)
-        self._times_ns, self._rows = (
-            np.empty(room, np.int64),
-            np.empty((room, len(TELEMETRY_COLUMNS))),
-        )
+        self._times_ns = np.empty(room, np.int64)
+        self._rows = np.empty((room, len(TELEMETRY_COLUMNS)))
         self._times_ns[: self._count], self._rows[: self._count] = times_ns, samples

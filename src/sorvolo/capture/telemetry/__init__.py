@@ -15,9 +15,8 @@ from sorvolo.survey.flight import Telemetry
 LARGEST_FILE_BYTES = 500_000_000
 """A telemetry file beyond this is some other file; a day at 10 Hz with 60 columns is a tenth of it."""
 
-_HEAD_BYTES = (
-    65_536  # of a file, by which its format is recognised; a flight table's header has thousands
-)
+# of a file, by which its format is recognised; a flight table's header has thousands
+_HEAD_BYTES = 65_536
 _SUFFIXES = (
     ".srt",
     ".ass",

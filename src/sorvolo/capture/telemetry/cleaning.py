@@ -99,13 +99,11 @@ def clean(
         kept["longitude_deg"] = np.where(
             np.abs(longitude) > 180, (longitude + 180) % 360 - 180, longitude
         )
-    table, reported = (
-        kept,
-        notice(
-            "out_of_range",
-            count,
-            "{} values lie outside any possible range and are taken as unknown",
-        ),
+    table = kept
+    reported = notice(
+        "out_of_range",
+        count,
+        "{} values lie outside any possible range and are taken as unknown",
     )
     found += reported
     if "latitude_deg" in table and "longitude_deg" in table:
@@ -128,17 +126,15 @@ def _cleaned_fixes(
     latitude, longitude = table["latitude_deg"], table["longitude_deg"]
     unknown = np.isnan(latitude) | np.isnan(longitude)
     null = (np.abs(latitude) < 1e-6) & (np.abs(longitude) < 1e-6)
-    table, found = (
-        _without_fixes(table, unknown | null),
-        [
-            *notice("no_fix", int(unknown.sum()), "{} samples have no position"),
-            *notice(
-                "null_fix",
-                int(null.sum()),
-                "{} positions are 0/0, written before the receiver's first fix",
-            ),
-        ],
-    )
+    table = _without_fixes(table, unknown | null)
+    found = [
+        *notice("no_fix", int(unknown.sum()), "{} samples have no position"),
+        *notice(
+            "null_fix",
+            int(null.sum()),
+            "{} positions are 0/0, written before the receiver's first fix",
+        ),
+    ]
     if decimals is not None and decimals <= _COARSE_DECIMALS:
         rounding = rounding_sigma_m(decimals)
         placed = np.isfinite(table["latitude_deg"])
@@ -301,11 +297,9 @@ def _without_jumps(times: TimesNs, table: _Table) -> tuple[_Table, list[Notice]]
     fixes = np.flatnonzero(np.isfinite(latitude))
     if len(fixes) < 2:
         return table, []
-    lat, lon, seconds = (
-        latitude[fixes],
-        longitude[fixes],
-        (times[fixes] - times[fixes[0]]) / SECOND_NS,
-    )
+    lat = latitude[fixes]
+    lon = longitude[fixes]
+    seconds = (times[fixes] - times[fixes[0]]) / SECOND_NS
     sigma = np.nan_to_num(table.get("horizontal_sigma_m", np.zeros(len(times)))[fixes])
     fresh = np.concatenate([[True], (np.diff(lat) != 0) | (np.diff(lon) != 0)])
     starts = np.flatnonzero(fresh)  # one run per distinct fix, from its first sample to its last

@@ -58,9 +58,8 @@ _DATASET_RATE_HZ = 10.0  # thesis, section 2.2
 # DatCon's Tick# is the flight controller's counter, of later drones or of the Phantom 3. DatCon writes 200 rows a
 # second at most: the step between rows shows which it is, and a smaller one counts rows.
 _TICK_RATES_HZ = ((20_000.0, 4_500_000.0), (3.0, 600.0))
-_SAME_HEIGHT_M = (
-    1.5  # DJI's apps write the height above take-off into the column of altitudes as well
-)
+# DJI's apps write the height above take-off into the column of altitudes as well
+_SAME_HEIGHT_M = 1.5
 _LONGEST_HEADER = 20_000  # characters; a log of hundreds of columns has thousands; by choice
 _LARGEST_S = 1e9  # a counter beyond thirty years is broken
 _EPOCH_S = (3e8, 7e9)  # 1979 to 2191: what a number must be to count as a time since 1970

@@ -23,9 +23,8 @@ _FIXES = frozenset(
         "foxglove_msgs/msg/LocationFix",
     }
 )
-_DATED_NS = (
-    946_684_800 * 10**9
-)  # the year 2000: an earlier stamp counts from when a robot was switched on
+# the year 2000: an earlier stamp counts from when a robot was switched on
+_DATED_NS = 946_684_800 * 10**9
 
 _LARGEST_CHUNK_BYTES = 50_000_000  # recorders write chunks of about 4 MB
 

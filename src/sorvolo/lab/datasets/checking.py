@@ -132,9 +132,8 @@ def nothing_maps(place: str, counts: Mapping[str, int], known: Iterable[str]) ->
 
 _SAME_SHAPE = 0.01  # of the aspect: thumbnails and halved frames are rounded to whole pixels
 _CLIPPED_PX = 1.5  # less is rounding, or counting from 1
-_LEAST_LEFT = (
-    0.1  # share of a box's area within the picture below which it shows nothing of the object
-)
+# share of a box's area within the picture below which it shows nothing of the object
+_LEAST_LEFT = 0.1
 
 
 def labelled_set(

@@ -62,9 +62,8 @@ def read_coco(place: Path) -> ParsedSet:
     # the images whose picture is there, and those that have none
     pictures, missing = [], []
     folders = _folders(path)
-    by_name = cache(
-        partial(_by_name, path.parent)
-    )  # for pictures that are not where the file has them
+    # for pictures that are not where the file has them
+    by_name = cache(partial(_by_name, path.parent))
     for image_id, row in images.items():
         name = _inside(path, str(row.get("file_name", "")).replace("\\", "/"))
         found = _found(name, folders, by_name) if name else None

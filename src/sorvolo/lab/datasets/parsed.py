@@ -218,9 +218,8 @@ def shown_size_px(path: Path) -> tuple[int, int, int]:
     """
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter(
-                "ignore"
-            )  # a survey's orthophoto is large, not an attack: pixels are not read here
+            # a survey's orthophoto is large, not an attack: pixels are not read here
+            warnings.simplefilter("ignore")
             with Image.open(path) as picture:
                 width, height = picture.size
                 orientation = _orientation(picture)

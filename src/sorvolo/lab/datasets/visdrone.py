@@ -109,9 +109,8 @@ def _separate_pictures(
     result = []
     for path in pictures:
         found = rows[label_of[path]] if path in label_of else []
-        sequence = re.fullmatch(
-            r"(\d{7})_\d+_d_\d+", path.stem
-        )  # the video it was taken from comes first
+        # the video it was taken from comes first
+        sequence = re.fullmatch(r"(\d{7})_\d+_d_\d+", path.stem)
         result.append(
             ParsedPicture(path, tuple(map(_box, found)), None, sequence[1] if sequence else "")
         )

@@ -289,9 +289,8 @@ def _evaluate(
                 announced = properties["announced"]
                 announced_ns = behind_ns + (time_ns_of(announced) if announced else ended_ns)
             world_sigma_m = _known(properties.get("sigma_m"))
-            sigma_m = _known(
-                properties.get("sigma_in_map_m", world_sigma_m)
-            )  # earlier versions stated one for both
+            # earlier versions stated one for both
+            sigma_m = _known(properties.get("sigma_in_map_m", world_sigma_m))
             found.append(
                 FoundEvent(
                     str(properties["id"]),

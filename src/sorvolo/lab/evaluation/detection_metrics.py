@@ -165,15 +165,13 @@ def match_pictures(
                 _annotation(len(annotations) + 1 + k, index, k, region) | {"iscrowd": 1}
                 for k in range(len(judged))
             ]
-    truth, truth_rows = (
-        {
-            "info": {},
-            "images": [_image(index, each) for index, each in enumerate(labelled.pictures)],
-            "categories": [{"id": k, "name": name} for k, name in enumerate(judged)],
-            "annotations": annotations,
-        },
-        rows,
-    )
+    truth = {
+        "info": {},
+        "images": [_image(index, each) for index, each in enumerate(labelled.pictures)],
+        "categories": [{"id": k, "name": name} for k, name in enumerate(judged)],
+        "annotations": annotations,
+    }
+    truth_rows = rows
     with redirect_stdout(io.StringIO()):  # pycocotools prints as it goes
         judge = COCOeval(
             _indexed(truth), _indexed(truth | {"annotations": _candidates(found, judged)}), "bbox"
@@ -320,10 +318,8 @@ def confusion(
     for picture, rows in missed.items():
         for c, g in rows:
             table[c, size] += 1
-            box, score = (
-                matches[c].true_boxes_px[g],
-                float(np.nan_to_num(matches[c].true_scores[g])),
-            )
+            box = matches[c].true_boxes_px[g]
+            score = float(np.nan_to_num(matches[c].true_scores[g]))
             mistakes.append(Mistake("miss", picture, _tuple(box), "", score, matches[c].label))
     return table, tuple(mistakes)
 

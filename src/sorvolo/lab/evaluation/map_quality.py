@@ -90,11 +90,9 @@ def spread_of(distances_m: Floats, gsd_m: float) -> Spread:
     if not len(distances_m):
         nan = float("nan")
         return Spread(nan, nan, nan, nan, nan, nan, 0)
-    rms, p95, most = (
-        np.sqrt((distances_m**2).mean()),
-        np.percentile(distances_m, 95),
-        distances_m.max(),
-    )
+    rms = np.sqrt((distances_m**2).mean())
+    p95 = np.percentile(distances_m, 95)
+    most = distances_m.max()
     return Spread(
         float(rms),
         float(p95),
@@ -118,10 +116,8 @@ def corner_errors(
     `true_cameras_m` and `fixes_m`, (M, 2) each, give the floor; the fixes may be of more frames than were
     placed, because the floor is a property of the flight.
     """
-    estimated, true = (
-        np.asarray(estimated_m, dtype=np.float64),
-        np.asarray(true_m, dtype=np.float64),
-    )
+    estimated = np.asarray(estimated_m, dtype=np.float64)
+    true = np.asarray(true_m, dtype=np.float64)
     estimated, true = estimated.reshape(-1, 2), true.reshape(-1, 2)
     none = spread_of(np.zeros(0), gsd_m)
     if not len(true):
@@ -272,10 +268,8 @@ class MapDeviation:
         x, y, z = site_from_image @ np.array([width / 2, height / 2, 1.0])
         grid_from_site = self._site_grid.grid_from_site_affine(np.array([x / z, y / z]), 100.0)
         frame = CanvasFrame(0, 0, width, height, grid_from_site @ site_from_image)
-        low, high = (
-            np.floor(frame.outline_px.min(axis=0)),
-            np.ceil(frame.outline_px.max(axis=0)) + 1,
-        )
+        low = np.floor(frame.outline_px.min(axis=0))
+        high = np.ceil(frame.outline_px.max(axis=0)) + 1
         window = int(low[0]), int(low[1]), int(high[0]), int(high[1])
         mosaic = self._crop(window, self._site_grid.grid.tile_px)
         mask = (coverage(frame, window) > 0) & (mosaic[..., 3] > 0)

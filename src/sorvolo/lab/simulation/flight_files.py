@@ -96,18 +96,20 @@ UMCD_COLUMNS = [
 ]
 """The sixty columns of the thesis's Table 2.2, spelled as there."""
 
+# acceleration, rotation, magnetometer
 _UMCD_IDLE_INSTRUMENTS = (
     "0.0",
     "0.0",
     "-9.81",
     *["0.0"] * 3,
     *["0"] * 4,
-)  # acceleration, rotation, magnetometer
+)
+# errors, size of the acceleration and of the rotation
 _UMCD_IDLE_ERRORS = (
     *["0.0"] * 4,
     "9.81",
     "0.0",
-)  # errors, size of the acceleration and of the rotation
+)
 _UMCD_MOTORS = (*["5200"] * 4, *["38"] * 4)  # speed and load of the four motors
 _MOST_GROUND_PX = 500_000_000  # of an orthophoto to simulate over: its colours take 1.5 GB then
 _GPX = "http://www.topografix.com/GPX/1/1"

@@ -244,9 +244,8 @@ def _urban(canvas: GroundCanvas) -> GroundLayout:
             canvas.stroke(np.array([[at, south - 3.6], [at + 2.5, south - 3.6]]), 0.12, white)
         for at in np.arange(south, north - 2, 5.0):
             canvas.stroke(np.array([[west - 3.6, at], [west - 3.6, at + 2.5]]), 0.12, white)
-        for at in np.arange(
-            south - 6.3, south - 0.6, 0.9
-        ):  # a zebra crossing at each block's corner
+        # a zebra crossing at each block's corner
+        for at in np.arange(south - 6.3, south - 0.6, 0.9):
             canvas.polygon(
                 np.array(
                     [

@@ -62,10 +62,8 @@ class GroundRaster:
     def resampled(self, m_per_px: float) -> "GroundRaster":
         """The same ground averaged to coarser pixels; itself when its own are not finer."""
         height, width = self.rgb.shape[:2]
-        new_width, new_height = (
-            round(width * self.m_per_px[0] / m_per_px),
-            round(height * self.m_per_px[1] / m_per_px),
-        )
+        new_width = round(width * self.m_per_px[0] / m_per_px)
+        new_height = round(height * self.m_per_px[1] / m_per_px)
         if new_width >= width or new_height >= height:
             return self
         size = (new_width, new_height)
@@ -203,10 +201,8 @@ class GroundCanvas:
         """Scatter stones, each with a lit face and a dark foot, more where `cover` is high."""
         width_m, height_m = self.area.size_m
         count = int(min(per_m2 * width_m * height_m, 60000))
-        x, y = (
-            self.rng.uniform(0, self.size_px[0], count),
-            self.rng.uniform(0, self.size_px[1], count),
-        )
+        x = self.rng.uniform(0, self.size_px[0], count)
+        y = self.rng.uniform(0, self.size_px[1], count)
         radii = (
             sizes_m[0]
             * (sizes_m[1] / sizes_m[0]) ** (self.rng.uniform(0, 1, count) ** 2.2)

@@ -91,10 +91,8 @@ def planned_waypoints(settings: PathSettings) -> PointsM:
     # along the heading and to its right
     local = np.array([(along, row) for row, pair in zip(rows, ends) for along in pair])
     heading = np.radians(settings.heading_deg)
-    forward, right = (
-        np.array([np.sin(heading), np.cos(heading)]),
-        np.array([np.cos(heading), -np.sin(heading)]),
-    )
+    forward = np.array([np.sin(heading), np.cos(heading)])
+    right = np.array([np.cos(heading), -np.sin(heading)])
     return local[:, :1] * forward + local[:, 1:] * right
 
 
@@ -232,10 +230,8 @@ class Observation:
         sound = self.is_sound
         if not sound.any():
             return np.full(len(time_s), np.nan), np.full(len(time_s), np.nan)
-        latitude, longitude = (
-            self.telemetry["latitude_deg"][sound],
-            self.telemetry["longitude_deg"][sound],
-        )
+        latitude = self.telemetry["latitude_deg"][sound]
+        longitude = self.telemetry["longitude_deg"][sound]
         true_s = self.true_s[sound]
         return np.interp(time_s, true_s, latitude), np.interp(time_s, true_s, longitude)
 

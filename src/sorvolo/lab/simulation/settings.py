@@ -121,9 +121,8 @@ class MotionSettings(_Checked):
     drift_rms_m: float = 0.4  # east and north each, wind over ten seconds
     camera_pitch_deg: float = -90.0  # -90 looks straight down
     roll_rms_deg: float | None = None  # of roll alone; None: as tilt_rms_deg
-    is_fixed_wing: bool = (
-        False  # banks into turns, and keeps its speed through the air instead of over the ground
-    )
+    # banks into turns, and keeps its speed through the air instead of over the ground
+    is_fixed_wing: bool = False
     wind_m_s: float = 0.0  # of a fixed wing: it is carried along and turns its nose into the wind
     wind_from_deg: float = 0.0  # clockwise from north
 
@@ -142,13 +141,14 @@ class ImagingSettings(_Checked):
     width_px: int = 960
     height_px: int = 540
     angle_of_view_deg: float = 62.0  # horizontal, of the lens without its distortion
+    # k1 k2 p1 p2 k3
     distortion: tuple[float, float, float, float, float] = (
         -0.08,
         0.02,
         0.0004,
         -0.0003,
         0.0,
-    )  # k1 k2 p1 p2 k3
+    )
     fps: float = 25.0
     exposure_s: float = 1 / 1000
     exposure_drift: float = 0.06  # rms, relative

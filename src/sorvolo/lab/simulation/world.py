@@ -35,9 +35,8 @@ from sorvolo.search.drawing.objects import (
 )
 from sorvolo.search.drawing.view import DrawnPatch, DrawnView, blend, map_view, sample_patches
 
-_FIRST_NS = (
-    1_775_133_840 * 10**9
-)  # 2026-04-02 12:44 UTC at the default origin; elsewhere at the same solar time
+# 2026-04-02 12:44 UTC at the default origin; elsewhere at the same solar time
+_FIRST_NS = 1_775_133_840 * 10**9
 _YEAR_DAYS = 365  # so long after a flight, at the same hour, the sun stands where it stood within 0.1 degrees
 _STEP_NS = 60 * 10**9  # the minute in which a flight begins is drawn
 
@@ -85,10 +84,9 @@ def _sun(time_ns: int, settings: SimulationSettings) -> Vector3:
 
 
 _WAVES = 5  # that are summed to hills
-_SHORTEST, _LONGEST = (
-    2.5,
-    5.0,
-)  # lengths of the waves, in heights of the flight: hills that a survey flies over
+# lengths of the waves, in heights of the flight: hills that a survey flies over
+_SHORTEST = 2.5
+_LONGEST = 5.0
 _COARSE_PX = 4  # the hills are smooth: rays are followed on a coarse grid of the picture
 _MOST_STEPS = 200  # of following a ray down
 _NEAR_M = 1e-4  # to the ground: the ray has arrived
@@ -116,10 +114,8 @@ class Relief:
         heading = rng.uniform(0, np.pi, count)
         turns = 2 * np.pi / lengths[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
         raw = cls(turns, rng.uniform(0, 2 * np.pi, count), rng.uniform(0.5, 1.0, count))
-        east, north = (
-            np.linspace(area.west_m, area.east_m, 64),
-            np.linspace(area.south_m, area.north_m, 64),
-        )
+        east = np.linspace(area.west_m, area.east_m, 64)
+        north = np.linspace(area.south_m, area.north_m, 64)
         up = raw.up_m(np.dstack(np.meshgrid(east, north)))
         scale = relief_m / np.ptp(up)
         return cls(
@@ -559,15 +555,13 @@ def _with_shadows(
     depth = np.zeros((height, width), np.uint8)
     sun_view = map_view(ground.west_m, ground.north_m, ground.m_per_px, (width, height), light.sun)
     for thing in things:
-        foot = np.append(
-            thing.place_m(0.0)[:2], 0.0
-        )  # the ground around is as high as it: its shadow begins there
+        # the ground around is as high as it: its shadow begins there
+        foot = np.append(thing.place_m(0.0)[:2], 0.0)
         cast_shadow(bodies[thing.id].placed(thing.turn, foot, sun_view.eye_m), sun_view, depth)
     if not depth.any():
         return ground
-    depth[:] = cv2.GaussianBlur(
-        depth, (0, 0), max(0.6, 0.03 / ground.m_per_px[0])
-    )  # the sun is no point
+    # the sun is no point
+    depth[:] = cv2.GaussianBlur(depth, (0, 0), max(0.6, 0.03 / ground.m_per_px[0]))
     rgb = ground.rgb.copy()
     for top in range(0, height, 512):
         part = slice(top, top + 512)

@@ -30,17 +30,14 @@ class ThesisSettings:
 
     averaging_px: tuple[int, int] = (10, 10)  # W_a
     pattern_px: tuple[int, int] = (15, 15)  # W_l
-    gray_threshold: int | None = (
-        _TABLE_LEVEL  # T_gray, called T_diff in section 3.2; None: from each pair's light
-    )
-    hamming_share: float | None = (
-        _TABLE_SHARE  # T_H, of the three strings together; None: from each pair's light
-    )
+    # T_gray, called T_diff in section 3.2; None: from each pair's light
+    gray_threshold: int | None = _TABLE_LEVEL
+    # T_H, of the three strings together; None: from each pair's light
+    hamming_share: float | None = _TABLE_SHARE
     isolation_px: tuple[int, int] = (37, 37)  # W_i
     isolation_share: float = 0.25  # T_iso
-    isolation_as_printed: bool = (
-        False  # at most T_iso of a window black; else at least T_iso white: see docs/errata.md
-    )
+    # at most T_iso of a window black; else at least T_iso white: see docs/errata.md
+    isolation_as_printed: bool = False
     area_share: float = 0.000648  # T_area, of the frame
     least_distance: float = 0.3  # T_B
 

@@ -24,17 +24,14 @@ STEP_NAMES = ("1/4 proposals", "2/4 classifier", "3/4 proposals refined", "4/4 c
 LOSS_NAMES = ("proposals: score", "proposals: box", "classifier: score", "classifier: box")
 
 _RATE, _MOMENTUM = 1e-4, 0.9  # of stochastic gradient descent, the thesis's
-_ANCHORS = (
-    256  # per picture for the proposals, half of them positives at most (Ren et al. 2015, 3.1.3)
-)
-_REGIONS, _POSITIVE = (
-    128,
-    0.25,
-)  # per picture for the classifier, and the share of positives at most
+# per picture for the proposals, half of them positives at most (Ren et al. 2015, 3.1.3)
+_ANCHORS = 256
+# per picture for the classifier, and the share of positives at most
+_REGIONS = 128
+_POSITIVE = 0.25
 _PROPOSED = 300  # regions per picture out of which those are drawn
-_IGNORED_SHARE = (
-    0.5  # an anchor or region that is by this much in an ignored region teaches nothing
-)
+# an anchor or region that is by this much in an ignored region teaches nothing
+_IGNORED_SHARE = 0.5
 
 
 class FourStepTraining:

@@ -81,11 +81,9 @@ class InceptionC(nn.Module):
 
     def __init__(self, channels: int, branches: Sequence[tuple[int, int]]) -> None:
         super().__init__()
-        narrow, out, inner = (
-            branches[0][0],
-            branches[1][0],
-            448,
-        )
+        narrow = branches[0][0]
+        out = branches[1][0]
+        inner = 448
         self.first = convolution(channels, narrow, 1)
         self.near = convolution(channels, out, 1)
         self.far = nn.Sequential(convolution(channels, inner, 1), convolution(inner, out, 3))

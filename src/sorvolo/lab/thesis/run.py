@@ -240,9 +240,8 @@ class _Work:
         return content_sha256(build(), task.id, files, of_kind.get(task.kind))
 
     def _look_into(self, each: UmcdVideo) -> VideoInput:
-        camera = (
-            None if each.environment == ENVIRONMENT else self._dataset.camera
-        )  # another drone flew those
+        # another drone flew those
+        camera = None if each.environment == ENVIRONMENT else self._dataset.camera
         return video_input(each, camera, self._site(each, "photos"))
 
     def _site(self, each: UmcdVideo, name: str) -> Path:
@@ -306,9 +305,8 @@ class _Work:
         return {"sequence": later.key, "method": title, **values}, pictures
 
     def _time(self, first: UmcdVideo, later: UmcdVideo) -> _Made:
-        before, after = (
-            self._input(replace(each, has_telemetry=False)) for each in (first, later)
-        )  # it needs none
+        # it needs none
+        before, after = (self._input(replace(each, has_telemetry=False)) for each in (first, later))
         return {
             "sequence": later.key,
             **comparisons.time_comparison(before, after, self._settings.repeats),

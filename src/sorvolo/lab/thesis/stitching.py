@@ -31,9 +31,8 @@ from sorvolo.registration.features import gray_from_rgb
 
 _NOISE_LEVELS, _GAIN_SIGMA = 10.0, 0.1  # sigma_N and sigma_g of Brown and Lowe (2007), 4
 _SHRINK = 8  # times smaller are the pictures whose overlaps give the gains
-_MOST_OVERLAPS = (
-    12  # of a frame, the nearest: what a hovering drone sees over and over adds nothing
-)
+# of a frame, the nearest: what a hovering drone sees over and over adds nothing
+_MOST_OVERLAPS = 12
 
 
 SIDE_PX = 1024
@@ -48,12 +47,10 @@ _ROI_FRAMES = 3.0  # side of the region, in frames ("three times the size of a f
 class RoiStitchingSettings:
     """What section 3.1.1 leaves open."""
 
-    max_features: int = (
-        6000  # the strongest, in frame and region each: matching costs their product
-    )
-    transform: Literal["similarity", "homography"] = (
-        "similarity"  # homography: the thesis's Figure 3.12a
-    )
+    # the strongest, in frame and region each: matching costs their product
+    max_features: int = 6000
+    # homography: the thesis's Figure 3.12a
+    transform: Literal["similarity", "homography"] = "similarity"
     ransac_px: float = 3.0  # OpenCV's own for homographies
 
     def __post_init__(self) -> None:
@@ -259,7 +256,7 @@ def solve_gains(
             right[i] += size * _GAIN_SIGMA**-2
     for lonely in np.flatnonzero(right == 0):
         normal[lonely, lonely] = right[lonely] = 1.0
-    return dict(zip(frames, np.atleast_1d(spsolve(normal.tocsc(), right)).tolist(), strict=True))
+    return dict(zip(frames, np.atleast_1d(spsolve(normal.tocsc(), right)).tolist()))
 
 
 def georeference(barycentres_mosaic_px: PointsPx, fixes_site_m: PointsM) -> Matrix3:
