@@ -3,11 +3,12 @@
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import isfinite, nan
+from math import isfinite
 from pathlib import Path
 
 from pyproj import CRS
 
+from sorvolo.capture.photo_xmp import finite
 from sorvolo.capture.photos import PhotoSource
 from sorvolo.capture.small_files import read_small_file, text_of
 from sorvolo.capture.source import Source
@@ -244,7 +245,7 @@ def _line(path: Path, number: int, text: str) -> _Line:
         raise InputError(
             f"{path}, line {number}: {len(fields)} columns, {text[:60]!r}; x y z px py image was needed"
         )
-    numbers = [_number(each) for each in fields[:5]]
+    numbers = [finite(each) for each in fields[:5]]
     wrong = [
         fields[at] for at in (0, 1, 3, 4) if not isfinite(numbers[at])
     ]  # a height may be missing: NaN
@@ -293,11 +294,3 @@ def _no_place(crs: CRS) -> str:
     if crs.is_geographic:
         return "it is in degrees, longitude before latitude: for metres name their CRS, as WGS84 UTM 32N"
     return "give x (easting, longitude) before y, in the CRS of the first line"
-
-
-def _number(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        return nan
-    return value if isfinite(value) else nan

@@ -93,7 +93,7 @@ def stated_lens(properties: Mapping[str, str], width_px: int, height_px: int) ->
     The size is that of the photo as the camera wrote it, whose pixels the numbers count.
     """
     numbers = [
-        _finite(text) for text in properties.get("dji:DewarpData", "").rpartition(";")[2].split(",")
+        finite(text) for text in properties.get("dji:DewarpData", "").rpartition(";")[2].split(",")
     ]
     if len(numbers) == 9 and all(map(isfinite, numbers)):
         fx_px, fy_px, cx_px, cy_px, k1, k2, p1, p2, k3 = numbers
@@ -212,10 +212,10 @@ def height_columns(
 def number(properties: Mapping[str, str], name: str) -> float:
     """The number of texts such as "+39.80" or "3980/100"; NaN otherwise."""
     numerator, slash, denominator = properties.get(name, "").strip().partition("/")
-    value = _finite(numerator)
+    value = finite(numerator)
     if not slash:
         return value
-    divisor = _finite(denominator)
+    divisor = finite(denominator)
     return value / divisor if divisor else nan
 
 
@@ -286,7 +286,8 @@ def _first(properties: Mapping[str, str], *names: str) -> float:
     return next((value for name in names if isfinite(value := number(properties, name))), nan)
 
 
-def _finite(text: str) -> float:
+def finite(text: str) -> float:
+    """The number that a text is; NaN for any other text."""
     try:
         value = float(text)
     except ValueError:

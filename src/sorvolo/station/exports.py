@@ -35,6 +35,7 @@ from sorvolo.station.sites import SiteShelf
 from sorvolo.station.tokens import Role
 from sorvolo.store.exports.geopackage import LAYER_STYLES, qgs_of, qml_of, write_geopackage
 from sorvolo.store.exports.places import network_link
+from sorvolo.store.exports.plain import rounded
 from sorvolo.store.nofollow import open_below
 from sorvolo.store.site.archive import Archive
 
@@ -371,8 +372,8 @@ def _profile(folder: Path, line: str, step_m: float) -> dict[str, Any]:
     known = [each.sigma_m for each in points if math.isfinite(each.sigma_m)]
     return {
         "distance_m": [each.way_m for each in points],
-        "height_m": [_number(each.surface_m) for each in points],
-        "ground_m": [_number(each.ground_m) for each in points],
+        "height_m": [rounded(each.surface_m, 3) for each in points],
+        "ground_m": [rounded(each.ground_m, 3) for each in points],
         "sigma_m": sum(known) / len(known) if known else None,
     }
 
@@ -386,7 +387,3 @@ def _places(line: str) -> list[str]:
             f"line={line[:80]}: 2 to {_MOST_PROFILE_PLACES} places LON,LAT;LON,LAT;... were needed",
         )
     return [f"{lat},{lon}" for lon, lat in places]
-
-
-def _number(value: float) -> float | None:
-    return round(value, 3) if math.isfinite(value) else None

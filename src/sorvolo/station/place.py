@@ -15,7 +15,7 @@ from sorvolo.errors import StoreError
 from sorvolo.geometry.arrays import PointsM
 from sorvolo.geometry.units import M_PER_DEG_LATITUDE
 from sorvolo.missions.archive.index import update_site
-from sorvolo.paths import Json
+from sorvolo.paths import Json, JsonView
 from sorvolo.station.collections import Collection, SiteCollections
 from sorvolo.station.crops import FlightVideos
 from sorvolo.station.found import Feature
@@ -170,19 +170,10 @@ def place_routes(
             for flight in views
             for each in _best(flight, Point(lon, lat), kept)[:most_per_flight]
         ]
-        flights = [each.flight for each in views]
-        there = videos.of(archive, flights)
-        films = {
-            flight: _Film(
-                flight in there, archive.report(flight).get("flown") if flight in there else None
-            )
-            for flight in flights
-        }
+        there = videos.of(archive, [each.flight for each in views])
+        began = {each: archive.report(each).get("flown") for each in there}
         base = f"/api/sites/{quote(site, safe=':')}"
-        rows = [
-            _row(base, each, place_m, kept, films[each["properties"]["flight"]], found)
-            for each in chosen
-        ]
+        rows = [_row(base, each, place_m, kept, began, found) for each in chosen]
         return sorted(rows, key=lambda each: (str(each["time"]), each["frame_id"]))
 
     return router
@@ -291,26 +282,18 @@ def _best(views: _Views, place: Point, kept: set[tuple[str, int]]) -> list[Featu
     return [frames.features[each] for each in sorted(views.seen, key=rank)]
 
 
-@dataclass(frozen=True)
-class _Film:
-    """Whether a flight's video is there, and when it began as the flight's report has it."""
-
-    is_there: bool
-    began: Any
-
-
 def _row(
     base: str,
     frame: Feature,
     place_m: PointsM,
     kept: set[tuple[str, int]],
-    film: _Film,
+    began: JsonView,
     found: Mapping[str, list[Json]],
 ) -> Json:
-    """A frame that shows the place; `base` is the site's address."""
+    """A frame that shows the place; `base` is the site's address, `began` when those flights did whose video is there."""
     values = frame["properties"]
     flight, name = values["flight"], values.get("frame")
-    seconds = _seconds(values.get("time"), film.began) if film.is_there else None
+    seconds = _seconds(values.get("time"), began[flight]) if flight in began else None
     here, named = found.get(flight, []), quote(flight, safe="")
     source = (
         "frame"
@@ -327,7 +310,7 @@ def _row(
         "frame_id": frame["id"],
         "crop_url": crop,
         "video_s": seconds,
-        "video_url": f"{base}/flights/{named}/video" if film.is_there else None,
+        "video_url": f"{base}/flights/{named}/video" if flight in began else None,
         "height_m": values.get("height_above_ground_m"),
         "sigma_m": values.get("sigma_m"),
         **_found_here(here),

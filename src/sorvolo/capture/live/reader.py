@@ -10,7 +10,7 @@ import ssl
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
@@ -284,7 +284,7 @@ class StreamReader:
         self.refused = ""
         self.failure = ""  # why the last attempt to open it failed
         self.is_over = threading.Event()
-        self._counts: Counter[str] = Counter()
+        self.counts: Counter[str] = Counter()  # of what is odd in the stream and its metadata
         self._heard_s = time.monotonic()
         self._has_spoken = False
         self._stamp_ns = -1
@@ -305,7 +305,7 @@ class StreamReader:
 
     def notices(self) -> list[Notice]:
         """What was found in the stream so far and survived."""
-        counts = self._counts
+        counts = self.counts
         return [
             *self.outages.notices(),
             *notice("decode_error", counts["packet"], "damaged places in the stream, skipped: {}"),
@@ -321,11 +321,6 @@ class StreamReader:
                 "frames without a time stamp, set by the usual step: {}",
             ),
         ]
-
-    @property
-    def metadata_counts(self) -> Mapping[str, int]:
-        """What was wrong with metadata packets, as `klv.local_sets` counts it."""
-        return self._counts
 
     # ---- inside, in the thread --------------------------------------------------------------------------------
 
@@ -396,7 +391,7 @@ class StreamReader:
             self._lost("the sender ended the stream")
         except (av.FFmpegError, OSError, ValueError, IndexError, MemoryError) as error:
             self._lost(self._why(error))
-            self._counts["packet"] += self._file is not None and self._has_spoken
+            self.counts["packet"] += self._file is not None and self._has_spoken
             if isinstance(error, REFUSALS) and not self._has_spoken:
                 self.refused = self.failure
         return came
@@ -425,27 +420,27 @@ class StreamReader:
             return True
         stamp_ns = _stamp_of(packet, packet.time_base, by_order=True)
         decodes = backlog.decodes(stamp_ns, is_key=packet.is_keyframe, now_s=time.monotonic())
-        self._counts["behind"] += not decodes
+        self.counts["behind"] += not decodes
         return decodes
 
     def _take(self, packet: Any) -> bool:
         """Give on what is in a packet; whether a frame was."""
         if packet.stream.type == "data":
             stamp_ns = _stamp_of(packet, packet.time_base)
-            for stated in local_sets(bytes(packet), self._counts):
+            for stated in local_sets(bytes(packet), self.counts):
                 self._listener.metadata(stated, self._stamp_ns if stamp_ns is None else stamp_ns)
             return False
         self._note_sender_report(packet)
-        self._counts["packet"] += packet.is_corrupt
+        self.counts["packet"] += packet.is_corrupt
         try:
             decoded = packet.decode()
         except (av.FFmpegError, ValueError, MemoryError):
-            self._counts["packet"] += 1
+            self.counts["packet"] += 1
             return False
         came = False
         for frame in decoded:
             if frame.width * frame.height <= PIXEL_LIMIT:
-                self._counts["frame"] += frame.is_corrupt
+                self.counts["frame"] += frame.is_corrupt
                 self._has_spoken = came = True
                 self._listener.frame(frame, self._next_stamp_ns(frame), time.monotonic())
         return came
@@ -453,7 +448,7 @@ class StreamReader:
     def _next_stamp_ns(self, frame: av.VideoFrame) -> int:
         stamp_ns = _stamp_of(frame, frame.time_base)
         if stamp_ns is None:
-            self._counts["missing"] += 1
+            self.counts["missing"] += 1
             stamp_ns = self._stamp_ns + self._step_ns
         elif self._stamp_ns >= 0 and not 0 < stamp_ns - self._stamp_ns < STAMP_JUMP_NS:
             self._listener.restarted()  # the sender began anew, or set its clock

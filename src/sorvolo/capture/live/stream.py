@@ -332,9 +332,11 @@ class LiveStream:
         self._asking = threading.Lock()  # `wanted` is asked of one frame after the other
         self._glance: _Glance | None = None
         self._count = self._resized = self._lost = self._zooms = 0
-        self._arrived_s = time.monotonic()
-        self._size_px = (0, 0)
-        self._lens: LocalSet | None = None
+        # when the frame was there that was given last, by the monotonic clock
+        self.arrived_s = time.monotonic()
+        self.size_px = (0, 0)  # of the frames as delivered: those of the first one
+        # the first metadata packet that states the field of view
+        self.lens: LocalSet | None = None
         self._grounds_m: deque[float] = deque(maxlen=1000)
         self.name = ""
         self.fingerprint = ""
@@ -346,16 +348,6 @@ class LiveStream:
         self._after_ns = -1  # frames of a file that an earlier process had read
 
     # ---- what a mission asks ----------------------------------------------------------------------------------
-
-    @property
-    def size_px(self) -> tuple[int, int]:
-        """Width and height of the frames as delivered: those of the first one."""
-        return self._size_px
-
-    @property
-    def lens(self) -> LocalSet | None:
-        """The first metadata packet that states the field of view."""
-        return self._lens
 
     @property
     def facts(self) -> StreamFacts:
@@ -412,11 +404,6 @@ class LiveStream:
         return self._reader.outages.silent_s
 
     @property
-    def arrived_s(self) -> float:
-        """When the frame was there that was given last, by the monotonic clock."""
-        return self._arrived_s
-
-    @property
     def is_behind(self) -> bool:
         """Whether the next frame is there already, for whoever looks at them is slower than they come."""
         return self._queue.holds_any
@@ -441,7 +428,7 @@ class LiveStream:
         """
         if self._settings.keeps_all and self._log.version:
             self._log.wait_past(
-                time_ns - self._later_ns, self._arrived_s + self._settings.fix_wait_s
+                time_ns - self._later_ns, self.arrived_s + self._settings.fix_wait_s
             )
 
     def samples(self, since: int) -> tuple[TimesNs, Floats]:
@@ -528,7 +515,7 @@ class LiveStream:
             while not self._is_ended:
                 arrived = self._queue.take(_POLL_S)
                 if arrived is not None:
-                    self._arrived_s = arrived.arrived_s
+                    self.arrived_s = arrived.arrived_s
                     yield arrived.arrived_s, self._converted(arrived)
                 elif self._queue.is_over:
                     return
@@ -608,8 +595,8 @@ class LiveStream:
             self._clock.stated(ClockTie.METADATA, stamp_ns, stated.time_ns)
         across_deg = stated["sensor_horizontal_fov_deg"]
         if isfinite(across_deg):
-            self._lens = self._lens or stated
-            self._zooms += abs(across_deg / self._lens["sensor_horizontal_fov_deg"] - 1) > _ZOOMED
+            self.lens = self.lens or stated
+            self._zooms += abs(across_deg / self.lens["sensor_horizontal_fov_deg"] - 1) > _ZOOMED
         with self._lock:
             if isfinite(ground_m := ground_elevation_m(stated)):
                 self._grounds_m.append(ground_m)
@@ -657,7 +644,7 @@ class LiveStream:
                 return
             first = self._held[0]
             if not self._is_ready.is_set():
-                self._size_px = first.decoded.width, first.decoded.height
+                self.size_px = first.decoded.width, first.decoded.height
                 tie = self._clock.settle()
                 self.start_ns = self._clock.utc_ns(first.stamp_ns)
                 self.start_origin = (
@@ -687,7 +674,7 @@ class LiveStream:
         if self._is_file:
             self._is_asked.wait()
         if self._glance is not None:
-            self._glance.show(time_ns + self._later_ns, held.decoded, self._size_px)
+            self._glance.show(time_ns + self._later_ns, held.decoded, self.size_px)
         with self._asking:
             is_passed_over = self._wanted is None and not self._settings.keeps_all
             if is_passed_over or self._closing.is_set():
@@ -704,7 +691,7 @@ class LiveStream:
     # ---- telemetry on the frames' clock -----------------------------------------------------------------------
 
     def _telemetry(self, newest: int | None) -> Telemetry:
-        found = self._link.notices() if self._link else klv_notices(self._reader.metadata_counts)
+        found = self._link.notices() if self._link else klv_notices(self._reader.counts)
         known = self._log.telemetry(found, newest)
         return replace(known, time_ns=known.time_ns + self._later_ns) if self._later_ns else known
 
@@ -743,14 +730,14 @@ class LiveStream:
         time_ns = arrived.time_ns + self._later_ns
         decoded = arrived.decoded
         name = str(index)
-        width_px, height_px = self._size_px
+        width_px, height_px = self.size_px
         fitted: dict[str, Any] = {}
         own_px = decoded.width, decoded.height
-        if own_px != self._size_px:
+        if own_px != self.size_px:
             # a sender that saves bandwidth shows the same in fewer pixels; another shape is another view
-            if not is_same_shape(own_px, self._size_px):
+            if not is_same_shape(own_px, self.size_px):
                 self._lost += 1
-                return LostFrame(index, name, time_ns, other_size(own_px, self._size_px))
+                return LostFrame(index, name, time_ns, other_size(own_px, self.size_px))
             self._resized += 1
             fitted = {"width": width_px, "height": height_px}
         try:

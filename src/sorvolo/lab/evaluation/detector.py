@@ -242,10 +242,22 @@ def evaluate_detector(
     if len(set(names)) < len(names):
         raise InputError(f"two data sets have one name ({', '.join(names)}); rename a folder")
     reader = _PictureReader()
-    seen = _seen_by_all(arms, labelled, settings, progress, reader)
+    # what every model of every arm finds in the pictures that can be read
+    seen = [[_found(place, labelled, settings, progress, reader) for place in arm] for arm in arms]
+    seen = [[_without(each, labelled, reader.damaged) for each in arm] for arm in seen]
     labelled = [_readable(each, reader.damaged) for each in labelled]
     first = seen[0][0]
-    scores = tuple(_scores(each, first, settings) for each in labelled)
+    scores = tuple(
+        score_set(
+            each,
+            (mine := first.sets[each.name]).detections,
+            first.classes,
+            mine.thresholds,
+            draws=settings.draws,
+            seed=settings.seed,
+        )
+        for each in labelled
+    )
     comparisons = tuple(_side_by_side(each, seen, settings) for each in labelled if len(seen) > 1)
     worst = {
         each.name: tuple(_worst(each, score, first.sets[each.name]))
@@ -257,30 +269,6 @@ def evaluate_detector(
         *tuple(dict.fromkeys(text for arm in seen for each in arm for text in each.notices)),
     )
     return DetectorEvaluation(first, scores, comparisons, worst, notices)
-
-
-def _scores(labelled: LabelledSet, found: FoundSets, settings: EvaluationSettings) -> SetScores:
-    mine = found.sets[labelled.name]
-    return score_set(
-        labelled,
-        mine.detections,
-        found.classes,
-        mine.thresholds,
-        draws=settings.draws,
-        seed=settings.seed,
-    )
-
-
-def _seen_by_all(
-    arms: Sequence[Sequence[str]],
-    labelled: Sequence[LabelledSet],
-    settings: EvaluationSettings,
-    progress: Callable[[EvaluationProgress], None],
-    reader: "_PictureReader",
-) -> list[list[FoundSets]]:
-    """What every model of every arm finds in the pictures that can be read."""
-    seen = [[_found(place, labelled, settings, progress, reader) for place in arm] for arm in arms]
-    return [[_without(each, labelled, reader.damaged) for each in arm] for arm in seen]
 
 
 def write_evaluation(

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 
 import cv2
 import numpy as np
@@ -19,6 +18,7 @@ from sorvolo.lab.simulation.rendering import Labels, render_labels
 from sorvolo.lab.simulation.world import World
 from sorvolo.paths import Json
 from sorvolo.search.drawing.objects import Body, Thing, ThingLabel
+from sorvolo.store.exports.plain import feature, utc_text
 
 CATEGORIES = (ThingLabel.PERSON, ThingLabel.CAR, ThingLabel.SMALL)
 """The COCO categories; their ids count from 1."""
@@ -44,7 +44,7 @@ def frame_features(flight: SimulatedFlight) -> list[Json]:
         properties = {
             "flight": flight.name,
             "frame": flight.frame_name(index) if flight.settings.output.photos else index,
-            "time": iso_time(int(flight.frame_times_ns[index])),
+            "time": utc_text(int(flight.frame_times_ns[index]) // 1000 * 1000),
             "camera_longitude_deg": round(float(longitudes[index]), DEGREE_DECIMALS),
             "camera_latitude_deg": round(float(latitudes[index]), DEGREE_DECIMALS),
             "camera_height_m": round(float(heights[index]), 6),
@@ -57,13 +57,7 @@ def frame_features(flight: SimulatedFlight) -> list[Json]:
             "fix_latitude_deg": _degrees_or_null(fixes[index, 0]),
         }
         outline = _outline_m(flight, pose)
-        features.append(
-            {
-                "type": "Feature",
-                "geometry": polygon_geometry(outline, flight.site),
-                "properties": properties,
-            }
-        )
+        features.append(feature(polygon_geometry(outline, flight.site), properties))
     return features
 
 
@@ -236,14 +230,6 @@ def map_tiles(ground: GroundRaster, site_grid: SiteGrid) -> dict[TileIndex, Imag
     return tiles
 
 
-def iso_time(time_ns: int) -> str:
-    """UTC with microseconds and a Z."""
-    moment = datetime.fromtimestamp(time_ns // 10**9, UTC).replace(
-        microsecond=time_ns % 10**9 // 1000
-    )
-    return moment.isoformat(timespec="microseconds").replace("+00:00", "Z")
-
-
 def _degrees_or_null(value: float) -> float | None:
     return round(float(value), DEGREE_DECIMALS) if np.isfinite(value) else None
 
@@ -378,7 +364,9 @@ def _feature(number: int, event: TruthEvent, flight: SimulatedFlight) -> Json:
             "width_m": round(thing.size_m[1], 4),
             "height_m": round(thing.size_m[2], 4),
             "velocity_m_s": [round(speed, 4) for speed in thing.velocity_m_s],
-            "clear_views": [iso_time(int(times_ns[index])) for index in event.clear_views],
+            "clear_views": [
+                utc_text(int(times_ns[index]) // 1000 * 1000) for index in event.clear_views
+            ],
             "path": _degrees(event.path_m, flight.site) if event.kind == "moving" else [],
         },
     }
