@@ -357,12 +357,12 @@ def _project(site: str, archive: Archive, collections: SiteCollections) -> Respo
         )
     archive.require_sound(archive.mosaic_path.name)
     name = _plain_name(site)
-    layers = [each for each in TITLES if collections.get(site, each).features]
+    layers = (each for each in TITLES if collections.get(site, each).features)
     with (
         open_below(archive.folder, archive.mosaic_path.name),  # refuses a link
         rasterio.open(archive.mosaic_path, driver="GTiff") as map_,
     ):
-        made = qgs_of(name, layers, f"{name}.gpkg", f"{name}-mosaic.tif", map_)
+        made = qgs_of(name, layers, map_)  # the other exports' names begin with it
     return Response(made, media_type="application/x-qgis", headers=_as_file(f"{name}.qgs"))
 
 

@@ -136,7 +136,7 @@ def coloured_heights(archive: Archive, version: VersionEntry) -> Iterator[PointC
     for x0, y0, x1, y1 in lattice.windows(1024):  # bounds the memory
         rows, columns = np.nonzero(np.isfinite(surface.up_m[y0:y1, x0:x1]))
         at = rows + y0, columns + x0
-        places_m = cells.projected_from_grid(np.column_stack(at[::-1]) + np.array(lattice.first))
+        places_m = cells.projected_from_grid(np.column_stack(at[::-1]) + lattice.first)
         pixels = np.rint(grid.grid_from_projected(places_m)).astype(int)
         tiles, which = np.unique(pixels // grid.tile_px, axis=0, return_inverse=True)
         rgb = np.zeros((len(pixels), 3), np.uint8)

@@ -456,11 +456,11 @@ def _detections(folder: Path, source: Source) -> dict[int, list[VmtiTarget]]:
             for number, line in enumerate(lines, _UNTRACKED):
                 row = json.loads(line)
                 place = (float(row.get(name, nan)) for name in ("latitude", "longitude"))
-                others, box_px = seen.setdefault(int(row["frame"]), []), map(float, row["box_px"])
+                others = seen.setdefault(int(row["frame"]), [])
                 is_free = row["track"] not in (None, *(each.number for each in others))
                 track = row["track"] if is_free else number  # a number stands once in a frame
-                target = VmtiTarget(track, row["class"], float(row["score"]), [*box_px], *place)
-                others.append(target)
+                box_px = [*map(float, row["box_px"])]
+                others.append(VmtiTarget(track, row["class"], float(row["score"]), box_px, *place))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
             f"{folder / LINES} is gone or damaged ({error!r}); watch the flight again"

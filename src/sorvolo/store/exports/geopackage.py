@@ -5,14 +5,13 @@ import re
 import sqlite3
 import struct
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
 from datetime import UTC, datetime
 from importlib.resources import files
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
-from xml.etree.ElementTree import fromstring, tostring
 
 import shapely
 from rasterio import DatasetReader
@@ -201,36 +200,26 @@ LAYER_STYLES: Mapping[str, Mapping[str, Any]] = tomllib.loads(
 
 def qml_of(style: Mapping[str, Any]) -> str:
     """A layer's style as a QML document (QGIS 3)."""
-    head = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
-    return head + xml_of("layer_style", package="sorvolo.store.exports", **style).decode()
+    return _for_qgis("layer_style", **style)
 
 
-def qgs_of(
-    name: str, layers: Sequence[str], geopackage: str, mosaic: str, map_: DatasetReader
-) -> bytes:
-    """A project of QGIS 3: layers of a GeoPackage in their styles over a map, both files beside the project's own.
+def qgs_of(name: str, layers: Iterable[str], map_: DatasetReader) -> str:
+    """A project of QGIS 3: layers of `name`.gpkg in their styles over the map `name`-mosaic.tif, both beside it.
 
     Layers without a style are switched off.
     """
-    project = fromstring(
-        xml_of(
-            "project",
-            package="sorvolo.store.exports",
-            name=name,
-            layers=layers,
-            styled=LAYER_STYLES,
-            geopackage=geopackage,
-            mosaic=mosaic,
-            crs=map_.crs,
-            wkt=map_.crs.to_wkt(),
-            wgs84_wkt=_WGS84_WKT,
-            bounds=map_.bounds,
-            alpha_band=4 if map_.count == 4 else -1,
-        )
+    return _for_qgis(
+        "project",
+        name=name,
+        layers={layer: LAYER_STYLES.get(layer) for layer in layers},
+        crs=map_.crs,
+        wkt=map_.crs.to_wkt(),
+        wgs84_wkt=_WGS84_WKT,
+        bounds=map_.bounds,
+        alpha_band=4 if map_.count == 4 else -1,
     )
-    for layer in project.iter("maplayer"):
-        style = LAYER_STYLES.get(layer.findtext("id", ""))
-        if style is not None:
-            layer.extend(fromstring(qml_of(style)).findall("renderer-v2"))
-    head = b"<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
-    return head + bytes(tostring(project, encoding="utf-8"))
+
+
+def _for_qgis(template: str, **values: Any) -> str:
+    head = "<!DOCTYPE qgis PUBLIC 'http://mrcc.com/qgis.dtd' 'SYSTEM'>\n"
+    return head + xml_of(template, package="sorvolo.store.exports", **values).decode()
