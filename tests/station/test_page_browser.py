@@ -37,6 +37,7 @@ from test_stream_messages import units
 from watch_runs import watch_run
 from websockets.sync.client import ClientConnection, connect
 
+import sorvolo
 from faulty_link import FaultyLink
 from sealing import write_again
 from sorvolo.geometry.coordinates import Coordinates, place_text
@@ -65,6 +66,7 @@ TRANSFERRED = (
     "performance.getEntriesByType('resource').reduce((sum, each) => sum + each.transferSize, 0)"
 )
 KNOWN = "#sentence[data-loaded=yes]"  # all that is found is loaded
+LANGUAGES = Path(sorvolo.__file__).parent / "station" / "page" / "languages"
 PANELS = ("live", "findings", "compare", "layers", "measure", "place", "share")
 
 
@@ -530,7 +532,8 @@ def covers_nothing(page: Any, below: str) -> None:
 def test_a_reload_in_the_field_shows_what_was_known_and_keeps_verdicts(
     browser: Any, served: Served
 ) -> None:
-    context = context_of(browser, keeps=True)
+    """In Italian: the language is kept, too."""
+    context = context_of(browser, keeps=True, locale="it-IT")
     with FaultyLink(served.port) as link:
         url = f"http://127.0.0.1:{link.port}"
         watched = Watched(context, url)
@@ -543,19 +546,19 @@ def test_a_reload_in_the_field_shows_what_was_known_and_keeps_verdicts(
         link.cut()
         page.reload(wait_until="commit")
         page.locator(KNOWN).wait_for()
-        expect(page.locator("#sentence")).to_contain_text("may be old")
+        expect(page.locator("#sentence")).to_contain_text("possono essere vecchi")
         mark = "fetch('/api/sites/field').then(each => each.headers.get('x-kept'))"
         assert page.evaluate(mark) == "1"
         page.locator("#rooms [data-panel=findings]").click()
         page.locator(".strip button").first.wait_for()
         chosen = page.locator(".strip [aria-current]").get_attribute("data-id")
         page.keyboard.press("c")
-        expect(page.locator("#link-state")).to_contain_text("1 waiting")
+        expect(page.locator("#link-state")).to_contain_text("1 in attesa")
         page.reload(wait_until="commit")
         page.locator(f".strip button.confirmed[data-id='{chosen}']").wait_for()
         link.mend()
         page.evaluate("dispatchEvent(new Event('focus')), dispatchEvent(new Event('online'))")
-        expect(page.locator("#link-state")).to_have_text("Connected", timeout=60_000)
+        expect(page.locator("#link-state")).to_have_text("Connesso", timeout=60_000)
         votes = served.ask(f"/api/sites/field/reviews?kind=change&id={chosen}")
         assert votes[0]["verdict"] == "confirmed"
         context.close()
@@ -2112,6 +2115,115 @@ def test_a_vote_on_what_a_watch_has_just_found_is_shown(opened: Watched, served:
         expect(page.locator(".strip button[data-id='run-8:1']")).to_have_count(0)
     finally:
         (results / "tracks.geojson").unlink()
+
+
+OVER_THE_EDGE = """() => {
+  const width = document.documentElement.clientWidth;
+  return [...document.querySelectorAll('button, select, input, h1, h2, .field, .segments, .note, #sentence > *')].filter((each) =>
+    each.checkVisibility() && !each.closest('.film, .timeline, .strip, .swipe-names, .maplibregl-map, details:not([open])'))
+    .filter((each) => each.getBoundingClientRect().right > width + 1 || each.scrollWidth > each.clientWidth + 2 && each.matches('button, .segments'))
+    .map((each) => each.outerHTML.slice(0, 120));
+}"""
+UNSAID = """() => {
+  const theirs = 'code, pre, .files, .run > p, .facts dd, .card h3, #title h1, .timeline small, .drawn input, option[value=en], script, style, noscript';
+  const bare = (text) => {
+    let [before, rest] = ['', text];
+    while (before !== rest) [before, rest] = [rest, rest.replace(/⟦[^⟦⟧]*⟧/g, ' ')];
+    return rest.replace(/⟦[^⟧]*$/, '').replace(/^[^⟦]*⟧/, '').trim(); // an element may stand within a text
+  };
+  const texts = [];
+  for (const each of document.querySelectorAll('html, body *')) {
+    if (each.closest(theirs)) continue;
+    for (const name of ['aria-label', 'title', 'placeholder', 'alt']) texts.push(each.getAttribute(name) ?? '');
+    for (const node of each.childNodes) if (node.nodeType === 3) texts.push(node.data);
+  }
+  return texts.map(bare).filter((each) => /[a-z]{3,}/i.test(each));
+}"""
+SAME_EVERYWHERE = re.compile(  # names, formats, keys, what the station calls a flight; addresses
+    r"Sorvolo|GeoJSON|CSV|KMZ|CalTopo|UTM|UTC|MGRS|OpenAPI|API|Esc|field|http.*|Español|Français|Deutsch|Italiano"
+    r"|\d: .* \([ab]\)|run-\d+|[( ]*v\d\)"
+)
+
+
+@pytest.mark.parametrize("locale", ["de-DE", "it-IT"])
+def test_the_page_in_another_language_fits_a_phone_and_a_laptop(
+    browser: Any, served: Served, locale: str
+) -> None:
+    """Nothing lies beyond an edge, nothing is serious for axe-core; a language that is chosen is kept."""
+    context = context_of(browser, locale=locale)
+    watched = Watched(context, served.url)
+    page, beyond, found = watched.page, {}, {}
+    for width, height in ((390, 844), (1280, 720)):
+        page.set_viewport_size({"width": width, "height": height})
+        page.goto(f"{served.url}/#/")
+        page.locator(".card").first.wait_for()
+        page.evaluate(AXE)
+
+        def look(name: str, width: int = width) -> None:
+            beyond[f"{name}, {width}"] = page.evaluate(OVER_THE_EDGE)
+            assert page.evaluate("document.documentElement.scrollWidth") <= width, name
+
+        look("sites")
+        show(watched, served)
+        for panel in PANELS:
+            page.locator(f"button[data-panel={panel}]").first.click()
+            page.locator(f".body.{panel}").wait_for()
+            look(panel)
+            if width == 390 and panel in ("live", "findings"):
+                found[panel] = serious(page)
+        page.locator("#settings-button").click()
+        look("settings")
+        page.keyboard.press("Escape")
+    assert {name: each for name, each in (beyond | found).items() if each} == {}
+    assert page.locator("html").get_attribute("lang") == locale[:2]
+    page.locator("#settings-button").click()
+    page.locator("dialog select").first.select_option("es")
+    page.locator("html[lang=es]").wait_for()
+    expect(page.locator("#link-state")).to_have_text("Conectado")
+    page.reload()
+    expect(page.locator("#link-state")).to_have_text("Conectado")
+    assert watched.faults == []
+    context.close()
+
+
+def test_no_english_is_left_among_the_page_s_own_words(browser: Any, served: Served) -> None:
+    """In a made-up language, whose texts stand in brackets; without its file the page is English."""
+    there = json.loads((LANGUAGES / "de.json").read_text(encoding="utf-8"))
+    context = context_of(browser, locale="de-AT")
+    watched = Watched(context, served.url)
+    page = watched.page
+    page.route("**/page/languages/de.json", lambda route: route.fulfill(status=503))
+    page.goto(f"{served.url}/#/")
+    expect(page.locator("#link-state")).to_have_text("Connected")
+    assert page.locator("html").get_attribute("lang") == "en"
+    page.unroute_all()
+    made_up = {each: "|".join(f"⟦{form}⟧" for form in each.split("|")) for each in there}
+    page.route("**/page/languages/de.json", lambda route: route.fulfill(json=made_up))
+    page.reload()
+    expect(page.locator("#link-state")).to_have_text("⟦Connected⟧")
+    left = {}
+
+    def look(name: str) -> None:
+        page.evaluate("document.querySelectorAll('details').forEach(each => { each.open = true; })")
+        texts = page.evaluate(UNSAID)
+        left[name] = [each for each in texts if not SAME_EVERYWHERE.fullmatch(each)]
+
+    page.locator(".card .more summary").first.click()
+    page.locator(".card .more button").first.click()
+    page.locator("dialog form").wait_for()
+    look("sites")
+    show(watched, served)
+    for panel in PANELS:
+        page.locator(f"button[data-panel={panel}]").first.click()
+        page.locator(f".body.{panel}").wait_for()
+        page.wait_for_timeout(300)
+        look(panel)
+    page.locator("#settings-button").click()
+    look("settings")
+    assert {name: each for name, each in left.items() if each} == {}
+    faults = [each for each in watched.faults if "503" not in each]
+    assert faults == []
+    context.close()
 
 
 def serious(page: Any, within: str = "document", rules: list[str] | None = None) -> list[str]:

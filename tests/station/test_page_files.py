@@ -12,6 +12,18 @@ import sorvolo
 PAGE = Path(sorvolo.__file__).parent / "station" / "page"
 TESTS_OWN = Path(__file__).parent / "vendor"
 MOST_BYTES = 2_500_000  # of the page, cold
+LANGUAGES = sorted((PAGE / "languages").iterdir())
+SAID = re.compile(r'(?<![\w.])say\(\s*("(?:[^"\\]|\\.)*")?')
+COMMENT = re.compile(r"/\*\*.*?\*/|(?:^|(?<=[\s;{,]))//[^\n]*", re.DOTALL | re.MULTILINE)
+READABLE = re.compile(  # a sentence, or one word that begins as a label does
+    r"[A-Z][a-z]+ [a-z]|[a-z]{2,} [a-z]{2,} [a-z]|^[A-Z][a-z]{2,}$|^[A-Z][a-z]+ "
+)
+UNSAID = {  # read by machines, the same in all languages, or keys of a table whose values are said
+    *("Arrow", "Enter", "Escape", "Backspace", "Esc", "Problem", "English", "Deutsch", "Italiano"),
+    *("Feature", "Point", "Polygon", "Marker", "Shape", "Placemark", "Style", "Document"),
+    *("Parameter", "Configuration", "Contents", "Content", "the PMTiles library did not load"),
+    *("too few views", "rarely found anywhere"),
+}
 OURS = sorted(each for each in PAGE.iterdir() if each.suffix in {".js", ".css", ".html", ".svg"})
 
 
@@ -81,3 +93,56 @@ def test_every_drawing_that_is_named_is_there() -> None:
     named = {name for each in ways for name in re.findall(each, text)}
     assert named
     assert named <= drawn
+
+
+def scripts() -> dict[str, str]:
+    """The page's own scripts without comments; what makes `say` is none of those that call it."""
+    ours = [each for each in OURS if each.suffix == ".js"]
+    return {each.name: COMMENT.sub("", each.read_text(encoding="utf-8")) for each in ours}
+
+
+def said() -> set[str]:
+    """What the page says, in English."""
+    calls = [
+        call
+        for name, text in scripts().items()
+        if name != "languages.js"
+        for call in SAID.findall(text)
+    ]
+    assert "" not in calls  # a text stands where it is said, or no test could find it
+    return {json.loads(each) for each in calls}
+
+
+@pytest.mark.parametrize("path", LANGUAGES, ids=lambda each: each.stem)
+def test_a_language_has_every_text_of_the_page_and_no_other(path: Path) -> None:
+    texts = json.loads(path.read_text(encoding="utf-8"))
+    assert len(texts) > 400
+    assert set(texts) == said()
+    for english, text in texts.items():
+        values = re.findall(r"\{\w+\}", text)
+        assert set(values) == set(re.findall(r"\{\w+\}", english)), english
+        for form in text.split("|"):
+            assert form.strip() == form != "", english
+            assert set(re.findall(r"\{\w+\}", form)) == set(values), english
+        assert text.count("|") == english.count("|") <= 1, english
+        assert ("{n}" in english) or "|" not in english, english
+
+
+def test_the_page_lists_the_languages_that_are_there() -> None:
+    (listed,) = re.findall(r"LANGUAGES = \{(.*)\}", scripts()["languages.js"])
+    assert sorted(re.findall(r"(\w+): ", listed)) == sorted(
+        ["en", *(each.stem for each in LANGUAGES)]
+    )
+
+
+def test_what_is_read_on_the_page_is_said_in_the_reader_s_language() -> None:
+    """Sentences and labels; a single word in small letters cannot be told from a key: the browser's test finds it."""
+    read = set()
+    for name, text in scripts().items():
+        rest = SAID.sub("(", text)
+        plain = [each[1:-1] for each in re.findall(r'"(?:[^"\\\n]|\\.)*"', rest)]
+        filled = re.findall(r"`((?:[^`\\]|\\.)*)`", rest)
+        parts = [part for each in filled for part in re.split(r"\$\{[^{}]*\}", each)]
+        read |= {(name, each) for each in plain + parts if READABLE.search(each)}
+    assert len(said()) > 400
+    assert {each for each in read if each[1] not in UNSAID} == set()

@@ -1,5 +1,7 @@
 // Requests to the station: JSON in and out, every failure a Problem in words.
 
+import { say } from "./languages.js";
+
 /** What the station, or the network, answered instead: RFC 9457 fields, `status` 0 where nothing came back. */
 export class Problem extends Error {
   constructor(status, title, detail, more = {}) {
@@ -8,7 +10,7 @@ export class Problem extends Error {
   }
 }
 
-const UNREACHABLE = "Check that the station runs and that this device is in its network. The page tries again by itself.";
+const UNREACHABLE = say("Check that the station runs and that this device is in its network. The page tries again by itself.");
 
 /** Who wants to know that a token is needed. */
 export const session = new EventTarget();
@@ -34,14 +36,14 @@ export async function send(path, init) {
     answer = await fetch(path, { credentials: "same-origin", ...init });
   } catch (error) {
     if (error.name === "AbortError") throw error;
-    throw new Problem(0, "The station does not answer", UNREACHABLE);
+    throw new Problem(0, say("The station does not answer"), UNREACHABLE);
   }
   if (answer.headers.has("x-kept")) kept.answers += 1;
   if (answer.ok) return answer;
   const problem = await answer.json().catch(() => ({}));
   if (answer.status === 401) session.dispatchEvent(new Event("needed"));
-  throw new Problem(answer.status, problem.title || `The station answered ${answer.status}`,
-    problem.detail || "Try again; if it stays so, look at the station's own messages.", problem);
+  throw new Problem(answer.status, problem.title || say("The station answered {status}", { status: String(answer.status) }),
+    problem.detail || say("Try again; if it stays so, look at the station's own messages."), problem);
 }
 
 export const get = (path, options) => ask("GET", path, undefined, options);

@@ -2,17 +2,17 @@
 
 import { get } from "./api.js";
 import { el, fill } from "./dom.js";
+import { say } from "./languages.js";
 import { grouped } from "./site_data.js";
 
 /** List the station's addresses for who writes a program of their own. */
 export async function showApi(main, title) {
   const { paths, components } = await get("/openapi.json");
   fill(title, el("h1", "API"));
-  document.title = "API – Sorvolo station";
+  document.title = `API – ${say("Sorvolo station")}`;
   const all = Object.entries(paths).flatMap(([path, methods]) => Object.entries(methods).map(([method, asked]) => ({ path, method, asked })));
   fill(main, el("div.sites.api",
-    el("p", "What a program may ask of this station. The same for tools, as OpenAPI: ", el("a", { href: "/openapi.json" }, "openapi.json"),
-      ". Where the station has tokens, send one as Authorization: Bearer TOKEN. ", el("a", { href: "#/" }, "All sites")),
+    el("p", say("What a program may ask of this station. The same for tools, as OpenAPI: {link}. Where the station has tokens, send one as {header}.", { link: el("a", { href: "/openapi.json" }, "openapi.json"), header: "Authorization: Bearer TOKEN" }), " ", el("a", { href: "#/" }, say("All sites"))),
     [...grouped(all, ({ asked }) => asked.tags?.[0] ?? "station")].map(([name, list]) => [el("h2", name),
       list.map(({ path, method, asked }) => address(method.toUpperCase(), path, asked, components?.schemas ?? {}))])));
   return { close() {} };
@@ -23,15 +23,15 @@ function address(method, path, asked, schemas) {
   const plain = method === "GET" && !(asked.parameters ?? []).some((each) => each.required);
   return el("details",
     el("summary", el("code", `${method} ${path}`)),
-    el("p", asked.description ?? asked.summary, plain ? [" ", el("a", { href: path }, "Ask it")] : null),
-    rows((asked.parameters ?? []).map((each) => [each.name, `${each.in}${each.required ? ", needed" : ""}`, typeOf(each.schema, schemas), each.description])),
-    body.map(([kind, { schema }]) => [el("p", "Body: ", el("code", kind)), rows(fieldsOf(schema, schemas))]),
-    el("p.soft", "Answers ", Object.keys(asked.responses).join(", ")));
+    el("p", asked.description ?? asked.summary, plain ? [" ", el("a", { href: path }, say("Ask it"))] : null),
+    rows((asked.parameters ?? []).map((each) => [each.name, `${each.in}${each.required ? `, ${say("needed")}` : ""}`, typeOf(each.schema, schemas), each.description])),
+    body.map(([kind, { schema }]) => [el("p", say("Body: {kind}", { kind: el("code", kind) })), rows(fieldsOf(schema, schemas))]),
+    el("p.soft", say("Answers {codes}", { codes: Object.keys(asked.responses).join(", ") })));
 }
 
 function fieldsOf(schema, schemas) {
   const { properties = {}, required = [] } = resolved(schema, schemas);
-  return Object.entries(properties).map(([name, each]) => [name, required.includes(name) ? "needed" : "", typeOf(each, schemas), each.description]);
+  return Object.entries(properties).map(([name, each]) => [name, required.includes(name) ? say("needed") : "", typeOf(each, schemas), each.description]);
 }
 
 function rows(lines) {

@@ -3,6 +3,7 @@
 import * as maplibre from "./vendor/maplibre-gl.mjs";
 import { isDark } from "./choices.js";
 import { button, el, message, quiet } from "./dom.js";
+import { say } from "./languages.js";
 
 const VECTOR = 1; // the tile type in a PMTiles header
 
@@ -25,14 +26,14 @@ async function pmtiles() {
 
 /** A control to choose a file of this device, or the station's own where it has one. */
 export function chooseBaseMap(screen) {
-  const input = el("input", { type: "file", accept: ".pmtiles", "aria-label": "Base map file (PMTiles)" });
+  const input = el("input", { type: "file", accept: ".pmtiles", "aria-label": say("Base map file (PMTiles)") });
   input.addEventListener("change", async () => {
     if (!input.files.length) return;
     const { PMTiles, FileSource } = await pmtiles();
     await showBaseMap(screen, new PMTiles(new FileSource(input.files[0])));
   });
   const own = screen.station.status.base_map_url;
-  return el("div.stack", input, own ? button("The station's base map", () => showStationMap(screen)) : null, quiet("No base map", () => { if (screen.view) takeOut(screen.view.map); }));
+  return el("div.stack", input, own ? button(say("The station's base map"), () => showStationMap(screen)) : null, quiet(say("No base map"), () => { if (screen.view) takeOut(screen.view.map); }));
 }
 
 export async function showStationMap(screen) {
@@ -57,7 +58,7 @@ async function showBaseMap(screen, archive) {
     for (const layer of isVector ? vectorLayers(isDark()) : [{ id: "base-raster", type: "raster" }]) map.addLayer({ ...layer, source: "base" }, first);
     if (!screen.data.detail.bounds_wgs84) map.jumpTo({ center: [header.centerLon, header.centerLat], zoom: header.centerZoom });
   } catch (error) {
-    message("This base map cannot be read", { kind: "error", todo: `A PMTiles file (version 3) was needed: ${error.message}` });
+    message(say("This base map cannot be read"), { kind: "error", todo: say("A PMTiles file (version 3) was needed: {why}", { why: error.message }) });
   }
 }
 

@@ -2,7 +2,7 @@
 
 const KEY = "sorvolo-choices";
 const FIRST = {
-  units: "metric", coordinates: "latlon", theme: "auto", clock: "local", sound: true, holdForBoxes: false,
+  units: "metric", coordinates: "latlon", theme: "auto", language: "auto", clock: "local", sound: true, holdForBoxes: false,
   layers: {},
 };
 

@@ -3,7 +3,8 @@
 import { button, choice, el, field, fill, press, tick } from "./dom.js";
 import { MapView, tie } from "./map_view.js";
 import { badge, titleOf } from "./feature_card.js";
-import { counted, day } from "./words.js";
+import { say } from "./languages.js";
+import { day } from "./words.js";
 
 const BLINK_MS = 700;
 const dayOf = (version) => day(version.flown_at ?? version.made_at);
@@ -30,20 +31,20 @@ export class Compare {
   tooFew() {
     const only = this.versions.length;
     this.versions = this.put = null;
-    fill(this.body, el("p.hint", only ? "The site has one version. Fly again and start a “compare” mission in “Live”: then two dates can be compared here."
-      : "There is no map yet. Start a “map” mission in “Live”."));
+    fill(this.body, el("p.hint", only ? say("The site has one version. Fly again and start a “compare” mission in “Live”: then two dates can be compared here.")
+      : say("There is no map yet. Start a “map” mission in “Live”.")));
   }
 
   build() {
     const pairs = this.versions.map((each) => [each.n, `${each.n}: ${dayOf(each)} (${each.flight})`]);
     const pick = (name) => choice(pairs, this[name], (n) => { this[name] = Number(n); this.apply(); }, { data: { which: name } });
-    const modes = [["swipe", "Swipe"], ["side", "Side by side"], ["blink", "Blink"], ["difference", "Difference"], ["before", "Before"], ["after", "After"]];
+    const modes = [["swipe", say("Swipe")], ["side", say("Side by side")], ["blink", say("Blink")], ["difference", say("Difference")], ["before", say("Before")], ["after", say("After")]];
     fill(this.body,
-      field("Before", this.pickBefore = pick("before")), field("After", this.pickAfter = pick("after")),
-      el("div.segments", { role: "group", "aria-label": "How to compare" }, this.buttons = modes.map(([mode, words]) =>
+      field(say("Before"), this.pickBefore = pick("before")), field(say("After"), this.pickAfter = pick("after")),
+      el("div.segments", { role: "group", "aria-label": say("How to compare") }, this.buttons = modes.map(([mode, words]) =>
         button(words, () => this.use(mode), { data: { mode } }))),
       this.timeline(),
-      this.overlays = tick("Show what was found (O)", true, (on) => this.bare(!on)),
+      this.overlays = tick(say("Show what was found (O)"), true, (on) => this.bare(!on)),
       this.list);
   }
 
@@ -53,11 +54,11 @@ export class Compare {
     const whole = Math.max(...times) - Math.min(...times) || 1;
     this.marks = this.versions.map((each, k) => {
       const mark = button([el("span.dot", { "aria-hidden": true }), el("span", dayOf(each)), el("small", each.flight)],
-        () => this.jump(each.n), { class: "mark", title: `Version ${each.n}: ${each.flight}` });
+        () => this.jump(each.n), { class: "mark", title: say("Version {number}: {flight}", { number: String(each.n), flight: each.flight }) });
       mark.style.flexGrow = k ? Math.max(0.05, (times[k] - times[k - 1]) / whole) : 0;
       return mark;
     });
-    return el("div.timeline", { role: "group", "aria-label": "Flights in order of time" }, this.marks);
+    return el("div.timeline", { role: "group", "aria-label": say("Flights in order of time") }, this.marks);
   }
 
   jump(n) {
@@ -74,7 +75,7 @@ export class Compare {
     if (this.closed) return;
     const { stage, view, data } = this.screen;
     this.cover = el("div.before-map", { inert: true });
-    this.edge = el("input", { type: "range", min: 0, max: 100, step: 0.5, ".value": "50", class: "swipe", "aria-label": "Swipe between before and after", on: { input: () => this.cut(Number(this.edge.value)) } });
+    this.edge = el("input", { type: "range", min: 0, max: 100, step: 0.5, ".value": "50", class: "swipe", "aria-label": say("Swipe between before and after"), on: { input: () => this.cut(Number(this.edge.value)) } });
     this.handle = el("div.swipe-edge", { "aria-hidden": true }, el("span", "↔"));
     this.names = el("div.swipe-names", { "aria-hidden": true });
     stage.append(this.cover, this.names, this.handle, this.edge);
@@ -129,7 +130,7 @@ export class Compare {
 
   named(before = this.mode === "before") {
     const one = (words, n) => el("span", `${words}: ${dayOf(this.versions.find((each) => each.n === n))}`, el("small", ` (v${n})`));
-    fill(this.names, ["swipe", "side", "difference"].includes(this.mode) ? [one("Before", this.before), one("After", this.after)] : before ? one("Before", this.before) : one("After", this.after));
+    fill(this.names, ["swipe", "side", "difference"].includes(this.mode) ? [one(say("Before"), this.before), one(say("After"), this.after)] : before ? one(say("Before"), this.before) : one(say("After"), this.after));
   }
 
   apply() {
@@ -169,10 +170,10 @@ export class Compare {
   refresh() {
     if (!this.versions) return;
     const shown = this.screen.data.shown("changes");
-    fill(this.list, el("h3", counted(shown.length, "change")), el("ol.changes", shown.map((each, k) =>
+    fill(this.list, el("h3", say("{n} change|{n} changes", { n: shown.length })), el("ol.changes", shown.map((each, k) =>
       el("li", button([badge(each), ` ${titleOf(each)}`], () => this.fly(k), { class: "link", "aria-current": k === this.at || null })))),
-    el("p.note", "Arrow keys fly from one to the next. Hatched ground could not be compared."),
-    shown.length ? button("Review them", () => this.screen.open("findings"), { icon: "review" }) : null);
+    el("p.note", say("Arrow keys fly from one to the next. Hatched ground could not be compared.")),
+    shown.length ? button(say("Review them"), () => this.screen.open("findings"), { icon: "review" }) : null);
     if (this.other) this.put();
   }
 

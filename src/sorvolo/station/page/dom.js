@@ -1,5 +1,7 @@
 // Elements made in code: whatever comes from outside becomes a text node or an attribute, never markup.
 
+import { say } from "./languages.js";
+
 /** An element, as "p.note" names its tag and classes. `props`, if any: attributes; `on` {event: listener}; `data` {name: value}; properties by `.name`. */
 export function el(name, ...children) {
   const [tag, ...classes] = name.split(".");
@@ -78,7 +80,7 @@ export function tick(words, checked, listener, props = {}) {
 export function dialog(title, ...children) {
   const heading = el("h2", { id: "dialog-title" }, title);
   const box = el("dialog", { "aria-labelledby": "dialog-title" },
-    el("div.dialog-head", heading, quiet("Close", () => box.close(), { icon: "close" })),
+    el("div.dialog-head", heading, quiet(say("Close"), () => box.close(), { icon: "close" })),
     children);
   box.addEventListener("close", () => box.remove());
   document.body.append(box);
@@ -93,7 +95,7 @@ new ResizeObserver(() => document.body.style.setProperty("--said", `${messages.o
 export function message(words, { kind = "note", todo = "", act = null } = {}) {
   const box = el("div", { class: `message ${kind}` },
     el("div", el("b", words), todo ? el("p", todo) : null),
-    act, cross("Close message", () => box.remove()));
+    act, cross(say("Close message"), () => box.remove()));
   act?.addEventListener("click", () => box.remove());
   messages.append(box);
   while (messages.children.length > 4) (messages.querySelector(".message:not(.person)") ?? messages.firstElementChild).remove(); // a person found stays
@@ -103,5 +105,5 @@ export function message(words, { kind = "note", todo = "", act = null } = {}) {
 
 export function report(problem) {
   if (problem?.name === "AbortError") return;
-  message(problem.title || "This did not work", { kind: `error${problem.status === 0 ? " away" : ""}`, todo: problem.detail || String(problem.message || problem) });
+  message(problem.title || say("This did not work"), { kind: `error${problem.status === 0 ? " away" : ""}`, todo: problem.detail || String(problem.message || problem) });
 }

@@ -3,16 +3,17 @@
 import { get, Problem, put, siteUrl } from "./api.js";
 import { button, cross, el, fill, message, press, quiet, svg } from "./dom.js";
 import { isWritten } from "./feature_card.js";
+import { say } from "./languages.js";
 import { area_m2, boundsOf, featureOf, length_m } from "./places.js";
 import { waypointsFor } from "./waypoints.js";
 import * as words from "./words.js";
 
 const TOOLS = {
-  distance: ["Distance", "line", "Tap points along the line; a double tap ends it."], area: ["Area", "ring", "Tap the corners; a double tap ends it."],
-  profile: ["Height profile", "line", "Tap points along the line. It needs a map with heights (a flight mapped with heights, or “sorvolo heights”)."],
-  interest: ["Area of interest", "ring", "Tap the corners; filters and exports can be kept to it."],
-  alert: ["Alert zone", "ring", "Tap the corners; what is found in it raises an alert on every open page."],
-  waypoint: ["Waypoint", "point", "Tap the place to fly to."], found: ["Person seen", "point", "Tap where somebody is: a finding of the site."],
+  distance: [say("Distance"), "line", say("Tap points along the line; a double tap ends it.")], area: [say("Area"), "ring", say("Tap the corners; a double tap ends it.")],
+  profile: [say("Height profile"), "line", say("Tap points along the line. It needs a map with heights (a flight mapped with heights, or “sorvolo heights”).")],
+  interest: [say("Area of interest"), "ring", say("Tap the corners; filters and exports can be kept to it.")],
+  alert: [say("Alert zone"), "ring", say("Tap the corners; what is found in it raises an alert on every open page.")],
+  waypoint: [say("Waypoint"), "point", say("Tap the place to fly to.")], found: [say("Person seen"), "point", say("Tap where somebody is: a finding of the site.")],
 };
 
 export async function loadDrawings(screen) {
@@ -49,9 +50,9 @@ export class Draw {
     this.may = screen.station.reviews;
     this.buttons = Object.entries(TOOLS).map(([tool, [name]]) => button(name, () => this.take(tool), { data: { tool }, "aria-pressed": false,
       hidden: !this.may && ["interest", "alert", "waypoint", "found"].includes(tool) }));
-    fill(body, el("div.tools", { role: "group", "aria-label": "Tools" }, this.buttons), this.live, this.list,
-      this.may ? el("details", el("summary", "Re-fly gaps"), el("p.note", "A route over ground that a measured search saw badly; without one, over ground without pictures."),
-        button("Plan a route", () => this.plan())) : null);
+    fill(body, el("div.tools", { role: "group", "aria-label": say("Tools") }, this.buttons), this.live, this.list,
+      this.may ? el("details", el("summary", say("Re-fly gaps")), el("p.note", say("A route over ground that a measured search saw badly; without one, over ground without pictures.")),
+        button(say("Plan a route"), () => this.plan())) : null);
     screen.on("drawings.changed", () => loadDrawings(screen).then(() => { if (!isWritten(this.list)) this.showList(); }), this.over);
     loadDrawings(screen).then(() => this.showList());
   }
@@ -110,16 +111,16 @@ export class Draw {
     const closed = shape === "ring";
     fill(this.live,
       el("p.size", closed ? words.area(area_m2(points)) : words.length(length_m(points)),
-        closed ? el("small", ` perimeter ${words.length(length_m([...points, points[0]]))}`) : null),
-      el("div.row.wrap", button("Done", () => this.finish(), { class: "main" }),
-        quiet("Remove last point", () => this.back()), quiet("Cancel", () => this.take(null))));
+        closed ? el("small", ` ${say("perimeter {length}", { length: words.length(length_m([...points, points[0]])) })}`) : null),
+      el("div.row.wrap", button(say("Done"), () => this.finish(), { class: "main" }),
+        quiet(say("Remove last point"), () => this.back()), quiet(say("Cancel"), () => this.take(null))));
   }
 
   async finish() {
     const { tool, points } = this;
     const [name, shape] = TOOLS[tool];
     if (points.length < { point: 1, line: 2, ring: 3 }[shape]) {
-      message(`${name}: ${shape === "ring" ? "three corners are" : "two points are"} needed`);
+      message(`${name}: ${shape === "ring" ? say("three corners are needed") : say("two points are needed")}`);
       return;
     }
     this.pointer = null;
@@ -151,11 +152,11 @@ export class Draw {
     try {
       if (!this.screen.data.detail.is_new) await this.screen.data.loadDetail(); // heights made in a terminal are announced by nobody
       if (!this.screen.data.detail.has_heights) {
-        fill(this.live, el("p.hint", "This site has no heights yet. Whoever runs the station can make them with “sorvolo heights”; then try again."));
+        fill(this.live, el("p.hint", say("This site has no heights yet. Whoever runs the station can make them with “sorvolo heights”; then try again.")));
         return;
       }
       const found = await get(`${siteUrl(this.screen.data.id, "profile")}?line=${line}`);
-      fill(this.live, profilePlot(found), quiet("Clear", () => this.take(null)));
+      fill(this.live, profilePlot(found), quiet(say("Clear"), () => this.take(null)));
     } catch (problem) {
       fill(this.live, el("p.hint", problem.detail));
     }
@@ -164,7 +165,7 @@ export class Draw {
   async plan() {
     const made = waypointsFor(this.screen.data);
     if (!made.length) {
-      fill(this.live, el("p.hint", "No gaps to re-fly: no search, flight or comparison of this site left out ground that another flight would show."));
+      fill(this.live, el("p.hint", say("No gaps to re-fly: no search, flight or comparison of this site left out ground that another flight would show.")));
       return;
     }
     await saveDrawings(this.screen, (list) => [...list.filter((each) => !each.properties.planned), ...made]);
@@ -175,15 +176,15 @@ export class Draw {
     const { data } = this.screen;
     const zones = this.screen.zones ?? [];
     const route = zones.filter((each) => each.properties.planned);
-    fill(this.list, zones.length ? el("h3", "Drawn here") : null, el("ul.plain.drawn", zones.filter((each) => !each.properties.planned).map((each) => el("li",
-      this.may ? el("input", { type: "text", ".value": each.properties.name ?? "", "aria-label": "Name", maxlength: 80, on: { change: (event) => this.rename(each, event.target.value) } }) : each.properties.name,
-      el("span.soft", sizeOf(each.geometry), each.properties.by ? ` · ${each.properties.by}` : ""),
-      quiet("Show", () => this.screen.view?.go(each.geometry.type === "Point" ? each.geometry.coordinates : boundsOf([each.geometry]))),
-      each.properties.purpose === "interest" ? quiet("Filter", () => this.narrow(each), { "aria-pressed": data.filters.area === each.geometry.coordinates[0] }) : null,
-      this.may ? cross(`Delete ${each.properties.name ?? ""}`, () => this.remove([each.id])) : null)),
-    route.length ? el("li.route", el("b", "Re-fly route"), el("span.soft", `${words.counted(route.length, "point")}, ${words.length(length_m(route.map((each) => each.geometry.coordinates)))}`),
-      quiet("Show", () => this.screen.view?.go(boundsOf(route.map((each) => each.geometry)))),
-      this.may ? quiet("Delete", () => this.remove(route.map((each) => each.id))) : null) : null));
+    fill(this.list, zones.length ? el("h3", say("Drawn here")) : null, el("ul.plain.drawn", zones.filter((each) => !each.properties.planned).map((each) => el("li",
+      this.may ? el("input", { type: "text", ".value": each.properties.name ?? "", "aria-label": say("Name"), maxlength: 80, on: { change: (event) => this.rename(each, event.target.value) } }) : each.properties.name,
+      el("span.soft", sizeOf(each.geometry), each.properties.by ? ` · ${words.nameOf(each.properties.by)}` : ""),
+      quiet(say("Show"), () => this.screen.view?.go(each.geometry.type === "Point" ? each.geometry.coordinates : boundsOf([each.geometry]))),
+      each.properties.purpose === "interest" ? quiet(say("Filter"), () => this.narrow(each), { "aria-pressed": data.filters.area === each.geometry.coordinates[0] }) : null,
+      this.may ? cross(say("Delete {name}", { name: each.properties.name ?? "" }), () => this.remove([each.id])) : null)),
+    route.length ? el("li.route", el("b", say("Re-fly route")), el("span.soft", `${say("{n} point|{n} points", { n: route.length })}, ${words.length(length_m(route.map((each) => each.geometry.coordinates)))}`),
+      quiet(say("Show"), () => this.screen.view?.go(boundsOf(route.map((each) => each.geometry)))),
+      this.may ? quiet(say("Delete"), () => this.remove(route.map((each) => each.id))) : null) : null));
   }
 
   narrow(zone) {
@@ -228,7 +229,7 @@ function sizeOf({ type, coordinates }) {
 /** Heights along a line as a drawing with its axis. `found`: distance_m, height_m (null: not known), and sigma_m. */
 function profilePlot({ distance_m: along, height_m: heights, sigma_m: sigma }) {
   const known = heights.filter((each) => each !== null);
-  if (!known.length) return el("p.hint", "No height is known along this line.");
+  if (!known.length) return el("p.hint", say("No height is known along this line."));
   const [low, high] = [Math.min(...known), Math.max(...known)];
   const [wide, tall] = [300, 130];
   const x = (m) => 4 + (m / along.at(-1)) * (wide - 8);
@@ -236,7 +237,7 @@ function profilePlot({ distance_m: along, height_m: heights, sigma_m: sigma }) {
   let path = "";
   heights.forEach((each, k) => { if (each !== null) path += `${path && heights[k - 1] !== null ? "L" : "M"}${x(along[k]).toFixed(1)} ${y(each).toFixed(1)}`; });
   const label = (text, at, top, anchor) => svg("text", { x: at, y: top, "text-anchor": anchor, class: "label" }, text);
-  return el("figure.profile", svg("svg", { viewBox: `0 0 ${wide} ${tall}`, role: "img", "aria-label": `Heights from ${words.length(low)} to ${words.length(high)} over ${words.length(along.at(-1))}` },
+  return el("figure.profile", svg("svg", { viewBox: `0 0 ${wide} ${tall}`, role: "img", "aria-label": say("Heights from {low} to {high} over {length}", { low: words.length(low), high: words.length(high), length: words.length(along.at(-1)) }) },
     svg("path", { d: path, class: "line" }), label(words.length(high), 4, 12, "start"), label(words.length(low), 4, tall - 24, "start"), label(words.length(along.at(-1)), wide - 4, tall - 6, "end"), label("0", 4, tall - 6, "start")),
-  el("figcaption", `Difference ${words.length(high - low)}${sigma ? `, accuracy of a height ${words.length(sigma)} (1 sigma)` : ""}`));
+  el("figcaption", [say("Difference {length}", { length: words.length(high - low) }), sigma ? `, ${say("accuracy of a height {sigma} (1 sigma)", { sigma: words.length(sigma) })}` : ""]));
 }

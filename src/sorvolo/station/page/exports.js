@@ -3,15 +3,16 @@
 import { get, roomUrl, siteUrl } from "./api.js";
 import { button, el, fill, report } from "./dom.js";
 import { lookOf, titleOf } from "./feature_card.js";
+import { say } from "./languages.js";
 import { middleOf } from "./places.js";
 import { copy } from "./share.js";
 import { siteName } from "./sites.js";
-import { bytes, counted, length, place, time } from "./words.js";
+import { bytes, length, place, time, VERDICTS } from "./words.js";
 import { zip } from "./zip.js";
 
 const COLUMNS = ["id", "what", "kind", "class", "score", "latitude", "longitude", "coordinates", "sigma_m", "length_m", "area_m2", "first_seen", "last_seen", "flight", "review", "reviewer", "note"];
 const DAY_MS = 86400000;
-const FORMATS = [["GeoJSON", ".geojson", geojson], ["CSV", ".csv", csv], ["KMZ", ".kmz", kmz, true], ["CalTopo", "-caltopo.json", caltopo, true], ["TAK package", "-tak.zip", tak, true]];
+const FORMATS = [["GeoJSON", ".geojson", geojson], ["CSV", ".csv", csv], ["KMZ", ".kmz", kmz, true], ["CalTopo", "-caltopo.json", caltopo, true], [say("TAK package"), "-tak.zip", tak, true]];
 
 export function exportPanel(screen, body) {
   const shown = el("div");
@@ -19,16 +20,16 @@ export function exportPanel(screen, body) {
   const copied = el("span.soft", { role: "status" });
   const link = async () => {
     await copy(`${location.origin}/${roomUrl(screen.data.id, screen.room)}`);
-    fill(copied, "Link copied");
+    fill(copied, say("Link copied"));
   };
-  fill(body, el("div.row.wrap", button("Copy link", link, { class: "main" }), copied),
-    el("p.note", "Who opens it needs a token of their own where the station has tokens."), el("h3", "What is shown"), shown,
-    el("div.row.wrap", button("Print or PDF", () => print(screen))), el("details", { open: true }, el("summary", "All files"), files));
+  fill(body, el("div.row.wrap", button(say("Copy link"), link, { class: "main" }), copied),
+    el("p.note", say("Who opens it needs a token of their own where the station has tokens.")), el("h3", say("What is shown")), shown,
+    el("div.row.wrap", button(say("Print or PDF"), () => print(screen))), el("details", { open: true }, el("summary", say("All files")), files));
 
   function refresh() {
     const features = shownFeatures(screen);
     const local = screen.data.detail.is_local;
-    fill(shown, el("p.soft", `${counted(features.length, "feature")}: the filters and the area of interest apply.`),
+    fill(shown, el("p.soft", say("{n} feature: the filters and the area of interest apply.|{n} features: the filters and the area of interest apply.", { n: features.length })),
       el("div.row.wrap", FORMATS.filter(([, , , isOnEarth]) => !(isOnEarth && local)).map(([words, ending, made]) =>
         button(words, () => save(made(features, screen.data.detail.name, screen.data.id), ending)))));
   }
@@ -38,14 +39,14 @@ export function exportPanel(screen, body) {
   }
 
   async function load() {
-    fill(files, el("p.soft", "Looking…"));
+    fill(files, el("p.soft", say("Looking…")));
     try {
       const list = await get(siteUrl(screen.data.id, "exports"));
       fill(files, list.length ? el("ul.plain.files", list.map((each) => el("li",
         el("a", { href: each.url, download: each.name ?? "" }, each.title ?? each.name), el("span.soft", each.bytes ? ` ${bytes(each.bytes)}` : "", each.note ? ` · ${each.note}` : ""))))
-        : el("p.hint", "No files yet: they come with the first map."));
+        : el("p.hint", say("No files yet: they come with the first map.")));
     } catch (problem) {
-      if (problem.status === 404) fill(files, el("p.hint", "This station offers no files; they lie in the site's folder."));
+      if (problem.status === 404) fill(files, el("p.hint", say("This station offers no files; they lie in the site's folder.")));
       else report(problem);
     }
   }
@@ -72,13 +73,13 @@ function download(blob, name) {
 
 function extentWords(screen) {
   const { middle, width_m: width, bearing_deg: bearing } = screen.view.extent();
-  const up = Math.abs(bearing) < 0.5 ? "north up" : `up is ${Math.round((bearing + 360) % 360)}° from north`;
-  return `the picture is ${length(width)} wide, ${up}, its middle at ${place(middle, { local: screen.data.detail.is_local })}`;
+  const up = Math.abs(bearing) < 0.5 ? say("north up") : say("up is {angle}° from north", { angle: Math.round((bearing + 360) % 360) });
+  return say("the picture is {width} wide, {up}, its middle at {place}", { width: length(width), up, place: place(middle, { local: screen.data.detail.is_local }) });
 }
 
 const listed = (features) => `{"type": "FeatureCollection", "features": [\n${features.map((each) => JSON.stringify(each)).join(",\n")}\n]}\n`;
 const nameOf = (feature) => feature.properties.name ?? titleOf(feature);
-const saidOf = ({ id, properties: { review, note } }) => [id, review, note].filter(Boolean).join(" · ");
+const saidOf = ({ id, properties: { review, note } }) => [id, VERDICTS[review], note].filter(Boolean).join(" · ");
 const colourOf = (feature) => (feature.properties.purpose ? "#ffe066" : lookOf(feature)[1]);
 
 function geojson(features) {
@@ -154,11 +155,11 @@ function tak(features, name, site) {
 
 async function print(screen) {
   const features = shownFeatures(screen);
-  const picture = screen.view ? el("img", { alt: "The map", src: await screen.view.picture() }) : null;
+  const picture = screen.view ? el("img", { alt: say("The map"), src: await screen.view.picture() }) : null;
   const sheet = el("section.sheet", el("h1", siteName(screen.data.detail)), el("p", `${time(new Date().toISOString())}${screen.view ? ` · ${extentWords(screen)}` : ""}`), picture,
-    el("table", el("thead", el("tr", ["Id", "What", "Place", "Score", "Verdict", "Note"].map((each) => el("th", each)))),
+    el("table", el("thead", el("tr", [say("Id"), say("What"), say("Place"), say("Score"), say("Verdict"), say("Note")].map((each) => el("th", each)))),
       el("tbody", features.map((each) => el("tr", [each.id, each.properties.name ?? titleOf(each), place(middleOf(each.geometry), { local: screen.data.detail.is_local }), each.properties.score ? Math.round(each.properties.score * 100) : "",
-        each.properties.review ?? "", each.properties.note ?? ""].map((value) => el("td", String(value))))))));
+        VERDICTS[each.properties.review] ?? "", each.properties.note ?? ""].map((value) => el("td", String(value))))))));
   document.body.append(sheet);
   const done = () => sheet.remove();
   addEventListener("afterprint", done, { once: true });

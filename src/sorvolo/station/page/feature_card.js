@@ -2,6 +2,7 @@
 
 import { choices } from "./choices.js";
 import { button, cross, el, fill, quiet } from "./dom.js";
+import { numeral, say } from "./languages.js";
 import { CLASSES, KINDS, OTHER_CLASS } from "./map_style.js";
 import { middleOf } from "./places.js";
 import { handover } from "./share.js";
@@ -13,7 +14,7 @@ const SHOWN_IN = new Set(["live", "layers", "compare", "place"]); // elsewhere t
 
 /** The card over the map; `show(feature)`, null hides it. */
 export function featureCard(screen) {
-  const box = el("aside.card-over", { hidden: true, "aria-label": "What is chosen" });
+  const box = el("aside.card-over", { hidden: true, "aria-label": say("What is chosen") });
   screen.stage.append(box);
   let told = "";
   return {
@@ -41,19 +42,19 @@ function cardOf(screen, feature, box) {
   const place = middleOf(feature.geometry);
   return [
     el("div.card-head", badge(feature), el("h3", titleOf(feature)),
-      button("More", () => { box.classList.toggle("whole"); screen.view?.reveal(place); }, { class: "quiet only-phone" }),
-      cross("Close", () => screen.data.choose(null))),
+      button(say("More"), () => { box.classList.toggle("whole"); screen.view?.reveal(place); }, { class: "quiet only-phone" }),
+      cross(say("Close"), () => screen.data.choose(null))),
     screen.data.detail.is_local ? null : handover(screen.data.id, titleOf(feature), place, feature.properties.sigma_m),
     pictures(feature),
     verdictForm(screen, feature),
     facts(feature, screen.data.detail.is_local),
     el("div.row.wrap",
-      quiet("Memory of this place", () => { screen.open("place"); screen.opened.look(place); }, { icon: "place" }),
-      quiet("Zoom in", () => screen.goTo(feature), { icon: "target" })),
+      quiet(say("Memory of this place"), () => { screen.open("place"); screen.opened.look(place); }, { icon: "place" }),
+      quiet(say("Zoom in"), () => screen.goTo(feature), { icon: "target" })),
   ];
 }
 
-export const titleOf = (feature) => (isChange(feature) ? words.changeWords(feature.properties) : feature.properties.class);
+export const titleOf = (feature) => (isChange(feature) ? words.changeWords(feature.properties) : words.className(feature.properties.class));
 
 /** Its kind's or class's words, colour and letter on the map. */
 export const lookOf = (feature) => (isChange(feature) ? KINDS[feature.properties.kind] : CLASSES[feature.properties.class]) ?? OTHER_CLASS;
@@ -68,9 +69,9 @@ export function badge(feature) {
 
 /** The pictures of a feature: before and after of a change, the latest view of an object. */
 export function pictures(feature) {
-  const names = isChange(feature) ? ["before", "after"] : ["latest view"];
+  const names = isChange(feature) ? [say("before"), say("after")] : [say("latest view")];
   const crops = isChange(feature) ? cropsOf(feature) : cropsOf(feature).slice(-1); // of an object the latest, as in the lists
-  if (!crops.length) return el("p.hint", "Pictures come when the mission has ended.");
+  if (!crops.length) return el("p.hint", say("Pictures come when the mission has ended."));
   return el("div", { class: `pictures n${names.length}` }, crops.map((src, k) =>
     el("figure", picture(src, `${titleOf(feature)}, ${names[k] ?? ""}`), el("figcaption", names[k] ?? ""))));
 }
@@ -79,32 +80,32 @@ export function pictures(feature) {
 export function picture(src, alt) {
   const image = el("img", { src, alt, loading: "lazy", decoding: "async" });
   image.addEventListener("load", () => { image.style.maxWidth = `${4 * image.naturalWidth}px`; });
-  image.addEventListener("error", () => image.replaceWith(el("div.gone", "no picture")));
+  image.addEventListener("error", () => image.replaceWith(el("div.gone", say("no picture"))));
   return image;
 }
 
 /** How much higher its ground lies than before, with the accuracy; null where that was not measured. */
 function risenWords({ height_change_m: risen, height_change_sigma_m: sigma }) {
   if (risen === undefined || risen === null) return null;
-  return `${risen > 0 ? "+" : ""}${risen.toFixed(2)} m (accuracy ${words.length(sigma)}, 1 sigma)`;
+  return say("{change} m (accuracy {sigma}, 1 sigma)", { change: `${risen > 0 ? "+" : ""}${numeral(risen)}`, sigma: words.length(sigma) });
 }
 
 /** What is known of a feature, as a list of terms. */
 export function facts(feature, local) {
   const values = feature.properties;
   const rows = [
-    ["Place", words.place(middleOf(feature.geometry), { local })],
-    ["Position accuracy", values.sigma_m === undefined || values.sigma_m === null ? null : `${words.length(values.sigma_m)} (1 sigma)`],
-    ["Position on this map", values.sigma_in_map_m ? `${words.length(values.sigma_in_map_m)} (1 sigma)` : null],
-    ["Height change", risenWords(values)],
-    ["Score", words.percent(values.score)],
-    ["Seen", values.views ? `in ${words.counted(values.views, "frame")}${values.possible_views ? ` of ${values.possible_views}` : ""}` : null],
-    ["Size", values.length_m ? (values.width_m ? `${words.length(values.length_m)} × ${words.length(values.width_m)}` : words.length(values.length_m)) : null],
-    ["Area", values.area_m2 ? words.area(values.area_m2) : null],
-    ["Speed", values.velocity_m_s ? words.speed(Math.hypot(...values.velocity_m_s)) : null],
-    ["First seen", values.first_seen ? words.time(values.first_seen) : null],
-    ["Flight", values.flight],
-    ["Id", feature.id],
+    [say("Place"), words.place(middleOf(feature.geometry), { local })],
+    [say("Position accuracy"), values.sigma_m === undefined || values.sigma_m === null ? null : say("{length} (1 sigma)", { length: words.length(values.sigma_m) })],
+    [say("Position on this map"), values.sigma_in_map_m ? say("{length} (1 sigma)", { length: words.length(values.sigma_in_map_m) }) : null],
+    [say("Height change"), risenWords(values)],
+    [say("Score"), words.percent(values.score)],
+    [say("Seen"), values.views ? (values.possible_views ? say("in {n} of {all} frames", { n: values.views, all: values.possible_views }) : say("in {n} frame|in {n} frames", { n: values.views })) : null],
+    [say("Size"), values.length_m ? (values.width_m ? `${words.length(values.length_m)} × ${words.length(values.width_m)}` : words.length(values.length_m)) : null],
+    [say("Area"), values.area_m2 ? words.area(values.area_m2) : null],
+    [say("Speed"), values.velocity_m_s ? words.speed(Math.hypot(...values.velocity_m_s)) : null],
+    [say("First seen"), values.first_seen ? words.time(values.first_seen) : null],
+    [say("Flight"), values.flight],
+    [say("Id"), feature.id],
   ];
   return el("dl.facts", rows.filter(([, value]) => value).map(([name, value]) => [el("dt", name), el("dd", value)]));
 }

@@ -1,7 +1,10 @@
 // Which objects and changes are shown: by class and kind, score, time, area and verdict.
 
 import { button } from "./dom.js";
+import { say } from "./languages.js";
+import { CLASSES, KINDS } from "./map_style.js";
 import { inRing, middleOf } from "./places.js";
+import { percent, VERDICTS } from "./words.js";
 
 export const ALL = { hidden: [], minScore: 0, from: "", to: "", flight: "", verdict: "all", area: null, minArea_m2: 0 };
 
@@ -29,10 +32,10 @@ function passes(feature, filters) {
 export function chips(data) {
   const { filters } = data;
   const said = {
-    hidden: filters.hidden.length ? `Without ${filters.hidden.join(", ")}` : null, minScore: filters.minScore ? `Score of ${Math.round(filters.minScore * 100)} % and more` : null,
-    from: filters.from && `Seen from ${filters.from}`, to: filters.to && `Seen until ${filters.to}`, flight: filters.flight && `Flight ${filters.flight}`,
-    verdict: filters.verdict !== "all" ? `Only ${filters.verdict === "none" ? "unreviewed" : filters.verdict}` : null,
-    area: filters.area && "Only in the area of interest", minArea_m2: filters.minArea_m2 ? `Changes of ${filters.minArea_m2} m² and more` : null,
+    hidden: filters.hidden.length ? say("Without {what}", { what: filters.hidden.map((each) => (KINDS[each] ?? CLASSES[each] ?? [each])[0]).join(", ") }) : null, minScore: filters.minScore ? say("Score of {share} and more", { share: percent(filters.minScore) }) : null,
+    from: filters.from && say("Seen from {date}", { date: filters.from }), to: filters.to && say("Seen until {date}", { date: filters.to }), flight: filters.flight && say("Flight {name}", { name: filters.flight }),
+    verdict: filters.verdict !== "all" ? say("Only {verdict}", { verdict: filters.verdict === "none" ? say("unreviewed") : VERDICTS[filters.verdict] }) : null,
+    area: filters.area && say("Only in the area of interest"), minArea_m2: filters.minArea_m2 ? say("Changes of {area} m² and more", { area: filters.minArea_m2 }) : null,
   };
-  return Object.entries(said).filter(([, words]) => words).map(([name, words]) => button(words, () => data.filter({ [name]: ALL[name] }), { class: "chip", icon: "close", title: "Show everything again" }));
+  return Object.entries(said).filter(([, words]) => words).map(([name, words]) => button(words, () => data.filter({ [name]: ALL[name] }), { class: "chip", icon: "close", title: say("Show everything again") }));
 }

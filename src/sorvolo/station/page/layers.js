@@ -7,28 +7,29 @@ import { badge } from "./feature_card.js";
 import { FADED, GROUPS, KINDS, CLASSES, PLACED, POD_RAMP } from "./map_style.js";
 import { lookedAt } from "./sentence.js";
 import { chooseBaseMap } from "./base_map.js";
+import { say } from "./languages.js";
 import { grouped } from "./site_data.js";
-import { counted, day, percent } from "./words.js";
+import { day, percent, VERDICTS } from "./words.js";
 
 /** The panel's life: `refresh` after data changed. */
 export function layersPanel(screen, body) {
   const { data, view } = screen;
   const legend = el("div");
-  const layers = el("fieldset.ticks", el("legend", "Layers"),
+  const layers = el("fieldset.ticks", el("legend", say("Layers")),
     Object.entries(GROUPS).map(([group, [words]]) => [tick(words, choices.get("layers")[group] ?? GROUPS[group][1],
       (shown) => { view?.show(group, shown); refresh(); }),
-    FADED[group] && el("input", { type: "range", min: 0.1, max: 1, step: 0.05, "aria-label": `Opacity: ${words}`, ".value": String(view?.opacity(group) ?? 1), on: { input: (event) => view?.fade(group, Number(event.target.value)) } })]));
+    FADED[group] && el("input", { type: "range", min: 0.1, max: 1, step: 0.05, "aria-label": say("Opacity: {layer}", { layer: words }), ".value": String(view?.opacity(group) ?? 1), on: { input: (event) => view?.fade(group, Number(event.target.value)) } })]));
   const found = el("div");
   const coverage = el("div");
   fill(body, legend, found, coverage, layers, filterForm(data), base(screen));
 
   function refresh() {
     const { detail } = data;
-    fill(legend, el("p.soft", counted(detail.flights?.length ?? 0, "flight"), " · ",
-      detail.versions?.length ? `latest ${day(detail.versions.at(-1).flown_at ?? detail.versions.at(-1).made_at)}` : detail.bounds_wgs84 ? "a first one is being mapped" : "nothing mapped yet"),
+    fill(legend, el("p.soft", say("{n} flight|{n} flights", { n: detail.flights?.length ?? 0 }), " · ",
+      detail.versions?.length ? say("latest {date}", { date: day(detail.versions.at(-1).flown_at ?? detail.versions.at(-1).made_at) }) : detail.bounds_wgs84 ? say("a first one is being mapped") : say("nothing mapped yet")),
       whyEmpty(data));
     fill(coverage, coverageCard(data));
-    fill(found, kinds(data, "changes", "Changes"), kinds(data, "objects", "Objects"), placedLegend(data));
+    fill(found, kinds(data, "changes", say("Changes")), kinds(data, "objects", say("Objects")), placedLegend(data));
   }
   refresh();
   return { refresh };
@@ -36,14 +37,14 @@ export function layersPanel(screen, body) {
 
 function whyEmpty(data) {
   if (data.detail.versions?.length || data.detail.is_new || data.detail.bounds_wgs84) return null;
-  return el("p.hint", "This site has no map yet. Start a mission in “Live”.");
+  return el("p.hint", say("This site has no map yet. Start a mission in “Live”."));
 }
 
 function kinds(data, name, title) {
   const all = data.all[name];
   if (!all.length) return null;
   const shown = data.shown(name).length;
-  return el("fieldset.ticks", el("legend", shown === all.length ? `${title}: ${all.length}` : `${title}: ${shown} of ${all.length} shown`),
+  return el("fieldset.ticks", el("legend", shown === all.length ? `${title}: ${all.length}` : `${title}: ${say("{n} of {all} shown", { n: shown, all: all.length })}`),
     [...grouped(all, sortOf)].map(([sort, list]) => {
       const words = (KINDS[sort] ?? CLASSES[sort] ?? [sort])[0];
       const hidden = data.filters.hidden;
@@ -59,7 +60,7 @@ function placedLegend(data) {
     const mark = el("span.badge.line");
     mark.style.setProperty("--colour", colour);
     return el("div.kind", mark, words);
-  }), rejected ? el("p.soft", `${counted(rejected, "frame")} rejected: no place, so not drawn`) : null);
+  }), rejected ? el("p.soft", say("{n} frame rejected: no place, so not drawn|{n} frames rejected: no place, so not drawn", { n: rejected })) : null);
 }
 
 function filterForm(data) {
@@ -69,31 +70,31 @@ function filterForm(data) {
   const least = el("input", { type: "number", min: 0, step: "any", inputmode: "decimal", ".value": data.filters.minArea_m2 || "",
     on: { input: (event) => data.filter({ minArea_m2: Number(event.target.value) || 0 }) } });
   const date = (name) => el("input", { type: "date", ".value": data.filters[name], on: { change: (event) => data.filter({ [name]: event.target.value }) } });
-  return el("details.filters", el("summary", "Filter"),
-    field("Verdict", choice([["all", "all"], ["none", "not reviewed"], ["confirmed", "confirmed"], ["rejected", "rejected"], ["disputed", "disputed"], ["unsure", "not sure"]],
+  return el("details.filters", el("summary", say("Filter")),
+    field(say("Verdict"), choice([["all", say("all")], ["none", say("not reviewed")], ...["confirmed", "rejected", "disputed", "unsure"].map((each) => [each, VERDICTS[each]])],
       data.filters.verdict, (verdict) => data.filter({ verdict }))),
-    el("div.row", field("Score at least", slider), score),
-    field("Flight", choice([["", "all"], ...(data.detail.flights ?? []).map((each) => [each.id, each.id])], data.filters.flight, (flight) => data.filter({ flight }))),
-    el("div.row", field("Seen from", date("from")), field("until", date("to"))),
-    field("Changes of at least (m²)", least),
-    el("p.note", data.filters.area ? "Only what lies in the area of interest." : "Draw an area of interest with “Measure and draw” to filter by it."),
-    quiet("Show everything", () => data.filter(ALL)));
+    el("div.row", field(say("Score at least"), slider), score),
+    field(say("Flight"), choice([["", say("all")], ...(data.detail.flights ?? []).map((each) => [each.id, each.id])], data.filters.flight, (flight) => data.filter({ flight }))),
+    el("div.row", field(say("Seen from"), date("from")), field(say("until"), date("to"))),
+    field(say("Changes of at least (m²)"), least),
+    el("p.note", data.filters.area ? say("Only what lies in the area of interest.") : say("Draw an area of interest with “Measure and draw” to filter by it.")),
+    quiet(say("Show everything"), () => data.filter(ALL)));
 }
 
 /** How well the ground was looked at, with the legend of its layer. */
 function coverageCard(data) {
   const looked = lookedAt(data.all.pod);
-  if (!looked) return el("p.hint", "How well the ground was searched is not measured. A search mission in “Live” does it.");
-  return el("fieldset.ticks.coverage", el("legend", "Chance to have seen a person"),
-    el("ol.ramp", { "aria-label": "Colours" }, POD_RAMP.map((colour, k) => {
+  if (!looked) return el("p.hint", say("How well the ground was searched is not measured. A search mission in “Live” does it."));
+  return el("fieldset.ticks.coverage", el("legend", say("Chance to have seen a person")),
+    el("ol.ramp", { "aria-label": say("Colours") }, POD_RAMP.map((colour, k) => {
       const step = el("li", `${20 * k}–${20 * k + 20} %`);
       step.style.setProperty("--colour", colour);
       return step;
-    })), el("p.note", `${percent(looked.share)} of the ground was looked at. Somebody on it would have been seen with ${percent(looked.from)} to ${percent(looked.to)}. Tap the coloured ground for its value, dashed ground for the reason.`));
+    })), el("p.note", say("{share} of the ground was looked at. Somebody on it would have been seen with {from} to {to}. Tap the coloured ground for its value, dashed ground for the reason.", { share: percent(looked.share), from: percent(looked.from), to: percent(looked.to) })));
 }
 
 function base(screen) {
-  return el("details", el("summary", "Base map"),
-    el("p.note", "A PMTiles file of this device or the station, shown under the mosaic. Nothing is loaded from the network."),
+  return el("details", el("summary", say("Base map")),
+    el("p.note", say("A PMTiles file of this device or the station, shown under the mosaic. Nothing is loaded from the network.")),
     chooseBaseMap(screen));
 }

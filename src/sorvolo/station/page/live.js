@@ -4,6 +4,7 @@ import { choices } from "./choices.js";
 import { button, el, fill, message } from "./dom.js";
 import { featureOf, inRing, middleOf } from "./places.js";
 import { titleOf } from "./feature_card.js";
+import { say } from "./languages.js";
 import { openOf, thereOf } from "./sentence.js";
 import * as words from "./words.js";
 
@@ -126,8 +127,8 @@ export class Live {
   }
 
   alert(zone, feature) {
-    message(`${zone.properties.name || "Alert zone"}: ${titleOf(feature)}`, { kind: "alert", todo: words.place(middleOf(feature.geometry)),
-      act: button("Show", () => this.showFound(feature)) });
+    message(`${zone.properties.name || say("Alert zone")}: ${titleOf(feature)}`, { kind: "alert", todo: words.place(middleOf(feature.geometry)),
+      act: button(say("Show"), () => this.showFound(feature)) });
     if (choices.get("sound")) beep();
   }
 
@@ -143,9 +144,9 @@ export class Live {
     const mission = this.of(run);
     mission.people = (mission.people ?? 0) + 1;
     this.banner?.remove();
-    const place = local || !feature.geometry ? "without a place on Earth" : words.place(middleOf(feature.geometry));
-    this.banner = message(mission.people > 1 ? `${mission.people} people found, the last:` : "Person found", { kind: "alert person", todo: place,
-      act: local || !feature.geometry ? null : button("Show", () => this.showFound(watched(feature, run))) });
+    const place = local || !feature.geometry ? say("without a place on Earth") : words.place(middleOf(feature.geometry));
+    this.banner = message(mission.people > 1 ? say("{n} people found, the last:", { n: mission.people }) : say("Person found"), { kind: "alert person", todo: place,
+      act: local || !feature.geometry ? null : button(say("Show"), () => this.showFound(watched(feature, run))) });
     if (choices.get("sound")) beep();
   }
 
@@ -153,8 +154,8 @@ export class Live {
     this.flown.delete(event.run);
     this.drones.delete(this.droneOf(event.run));
     this.drawSoon();
-    if (type === "run.failed") message("The mission failed", { kind: "error", todo: data.error || data.headline || "“Live” states why.", act: this.screen.shown === "live" ? null : button("Live", () => this.screen.open("live", true)) });
-    else if (data.state === "incomplete") message("Check this result before you use it", { kind: "warning", todo: data.headline });
+    if (type === "run.failed") message(say("The mission failed"), { kind: "error", todo: data.error || data.headline || say("“Live” states why."), act: this.screen.shown === "live" ? null : button(say("Live"), () => this.screen.open("live", true)) });
+    else if (data.state === "incomplete") message(say("Check this result before you use it"), { kind: "warning", todo: data.headline });
   }
 
   /** A mission ended well, and what it found is loaded: what is there to be looked at, people first. */
@@ -162,8 +163,8 @@ export class Live {
     const { objects, changes } = this.screen.data.all;
     const people = thereOf(objects).filter(({ properties }) => properties.class === "person").length;
     const open = openOf(objects, changes).length;
-    const result = [people ? words.counted(people, "person", "people") : null, open ? `${open} to review` : "nothing new to review"].filter(Boolean).join(", ");
-    message(`The mission is done: ${result}`, { todo: headline });
+    const result = [people ? say("{n} person|{n} people", { n: people }) : null, open ? say("{n} to review", { n: open }) : say("nothing new to review")].filter(Boolean).join(", ");
+    message(say("The mission is done: {result}", { result }), { todo: headline });
   }
 
   figures(id) {
@@ -173,9 +174,9 @@ export class Live {
     const byGps = run.statuses["gps-only"] ?? 0;
     const rejected = selected === undefined ? 0 : Math.max(0, selected - matched - byGps);
     const delay_s = latency_s ?? run.delay_s;
-    return [selected === undefined ? null : `${matched} of ${words.counted(selected, "frame")} matched`, byGps ? `${byGps} placed by GPS` : null,
-      rejected ? `${rejected} rejected${Object.keys(run.reasons).length ? ` (${Object.entries(run.reasons).map(([why, count]) => `${count} × ${why}`).join(", ")})` : ""}` : null,
-      delay_s === undefined ? null : `${words.number(delay_s, 2)} s behind`].filter(Boolean).join(", ");
+    return [selected === undefined ? null : say("{matched} of {n} frame matched|{matched} of {n} frames matched", { matched, n: selected }), byGps ? say("{n} placed by GPS", { n: byGps }) : null,
+      rejected ? `${say("{n} rejected", { n: rejected })}${Object.keys(run.reasons).length ? ` (${Object.entries(run.reasons).map(([why, count]) => `${count} × ${why}`).join(", ")})` : ""}` : null,
+      delay_s === undefined ? null : say("{seconds} s behind", { seconds: delay_s })].filter(Boolean).join(", ");
   }
 
   close() {

@@ -4,9 +4,10 @@ import { get, post, remove, session, Problem } from "./api.js";
 import { applyTheme, choices } from "./choices.js";
 import { button, choice, dialog, el, field, fill, message, quiet, report, tick } from "./dom.js";
 import { Events } from "./events.js";
+import { LANGUAGES, say } from "./languages.js";
 import { showSites } from "./sites.js";
 import { votes } from "./votes.js";
-import { bytes } from "./words.js";
+import { bytes, nameOf } from "./words.js";
 
 const main = document.getElementById("main");
 const title = document.getElementById("title");
@@ -22,12 +23,23 @@ export const station = {
   get reviews() { return this.status.role !== "view"; },
 };
 
+const LINKS = { live: say("Connected"), waiting: say("Connecting"), lost: say("No connection") };
+const ROLES = { view: say("view"), review: say("review"), operate: say("operate") };
 let screen = null;
 let turn = 0;
 
 const siteScreen = () => import("./site.js");
 
+/** What index.html says before there is a script. */
+function speak() {
+  const texts = { ".skip": say("To the content"), "#settings-button .sr": say("Settings"), ".starting": say("Connecting to the station…") };
+  const labels = { ".brand": say("Sorvolo: all sites"), "#rooms": say("Rooms"), "#sentence": say("What is known"), "#messages": say("Messages") };
+  for (const [each, words] of Object.entries(texts)) document.querySelector(each).textContent = words;
+  for (const [each, words] of Object.entries(labels)) document.querySelector(each).setAttribute("aria-label", words);
+}
+
 async function begin() {
+  speak();
   if (location.hash.startsWith("#/site/")) siteScreen(); // beside the first question to the station
   applyTheme();
   document.getElementById("settings-button").addEventListener("click", showSettings);
@@ -57,12 +69,11 @@ const blank = (heading, words, ...more) => fill(main, el("div.starting", el("h1"
 
 function listen() {
   station.events = new Events(station.status.last_event ?? 0);
-  const words = { live: "Connected", waiting: "Connecting", lost: "No connection" };
   const show = () => {
     const state = station.events.state;
     linkState.className = state;
     const { length } = votes.waiting;
-    fill(linkState, words[state], length ? ` · ${length} waiting` : "");
+    fill(linkState, LINKS[state], length ? ` · ${say("{n} waiting", { n: length })}` : "");
     if (state !== "live") return;
     for (const each of document.querySelectorAll(".message.away")) each.remove();
     votes.send();
@@ -77,9 +88,9 @@ function listen() {
 /** The station's disk fell below its floor of free space, or has room again. */
 function disk({ is_low: isLow, free_gb: free, floor_gb: floor }) {
   document.querySelector(".message.disk")?.remove();
-  if (!isLow) return void message("The station's disk has room again", { todo: "Streams and uploads go on by themselves." });
-  return void message("The station's disk is full", { kind: "error disk",
-    todo: `${free} GB are free, and ${floor} GB must stay so. No upload, mission or stream is taken in until there is room: delete uploads, recordings or flights.` });
+  if (!isLow) return void message(say("The station's disk has room again"), { todo: say("Streams and uploads go on by themselves.") });
+  return void message(say("The station's disk is full"), { kind: "error disk",
+    todo: say("{free} GB are free, and {floor} GB must stay so. No upload, mission or stream is taken in until there is room: delete uploads, recordings or flights.", { free, floor }) });
 }
 
 async function route() {
@@ -112,8 +123,8 @@ async function route() {
     if (!(problem instanceof Problem)) throw problem;
     if (problem.status === 401) return;
     const isAwaited = problem.status === 404 && kind === "site";
-    blank(problem.title, problem.detail, isAwaited ? el("p", "Once a first mission has put something on its map, it is shown here.") : null,
-      el("p", el("a", { href: "#/" }, "All sites"), " ", button("Try again", () => route())));
+    blank(problem.title, problem.detail, isAwaited ? el("p", say("Once a first mission has put something on its map, it is shown here.")) : null,
+      el("p", el("a", { href: "#/" }, say("All sites")), " ", button(say("Try again"), () => route())));
     if (isAwaited) screen = whenMade(id, route);
   }
 }
@@ -133,9 +144,8 @@ function showLogin() {
   const input = el("input", { type: "password", autocomplete: "current-password", required: true, maxlength: 200 });
   const note = el("p.note", { role: "alert" });
   const form = el("form.stack",
-    el("p", "This station is shared: it needs a token to know who you are. Who runs it makes one with ",
-      el("code", "sorvolo token"), "."),
-    field("Token", input), note, el("button.main", "Log in"));
+    el("p", say("This station is shared: it needs a token to know who you are. Who runs it makes one with {command}.", { command: el("code", "sorvolo token") })),
+    field(say("Token"), input), note, el("button.main", say("Log in")));
   form.addEventListener("submit", async (event) => {
     event.preventDefault();
     try {
@@ -149,13 +159,13 @@ function showLogin() {
     }
   });
   let isLoggedIn = false;
-  loginBox = dialog("Log in", form);
+  loginBox = dialog(say("Log in"), form);
   loginBox.addEventListener("close", () => { // by Escape: the way in stays
     if (isLoggedIn) return;
     declined = true;
     screen?.close?.();
     screen = null;
-    blank("You are not logged in", "This station shows its sites to those who have a token.", button("Log in", showLogin, { class: "main" }));
+    blank(say("You are not logged in"), say("This station shows its sites to those who have a token."), button(say("Log in"), showLogin, { class: "main" }));
   });
   input.focus();
 }
@@ -163,23 +173,24 @@ function showLogin() {
 function showSettings() {
   const set = (name) => (value) => choices.set(name, value);
   const who = station.status;
-  dialog("Settings",
+  dialog(say("Settings"),
     el("div.stack",
-      field("Units", choice([["metric", "Metres, hectares"], ["imperial", "Feet, acres"]], choices.get("units"), set("units"))),
-      field("Coordinates", choice([["latlon", "Latitude, longitude"], ["utm", "UTM"], ["mgrs", "MGRS"]],
+      field(say("Language"), choice([["auto", say("As the browser")], ...Object.entries(LANGUAGES)], choices.get("language"), (value) => { choices.set("language", value); location.reload(); })),
+      field(say("Units"), choice([["metric", say("Metres, hectares")], ["imperial", say("Feet, acres")]], choices.get("units"), set("units"))),
+      field(say("Coordinates"), choice([["latlon", say("Latitude, longitude")], ["utm", "UTM"], ["mgrs", "MGRS"]],
         choices.get("coordinates"), set("coordinates"))),
-      field("Times", choice([["local", "This device's time zone"], ["utc", "UTC"]], choices.get("clock"), set("clock"))),
-      field("Colours", choice([["auto", "As the device"], ["light", "Light"], ["dark", "Dark"]], choices.get("theme"), set("theme"))),
-      tick("Sound when something appears in an alert zone", choices.get("sound"), set("sound")),
-      el("h3", "Keys"),
+      field(say("Times"), choice([["local", say("This device's time zone")], ["utc", "UTC"]], choices.get("clock"), set("clock"))),
+      field(say("Colours"), choice([["auto", say("As the device")], ["light", say("Light")], ["dark", say("Dark")]], choices.get("theme"), set("theme"))),
+      tick(say("Sound when something appears in an alert zone"), choices.get("sound"), set("sound")),
+      el("h3", say("Keys")),
       el("dl.keys", [
-        ["1 2 3", "Live, Findings, Compare"], ["4 5 6", "layers, measure, memory of a place"], ["F", "follow the drone"], ["J / K", "next and previous finding"], ["C or Y / R / ? / U", "confirm, reject, not sure, withdraw"],
-        ["N", "note"], ["M", "show on the map"], ["B", "blink before and after"], ["O", "hide what was found, in Compare"], ["← →", "from change to change, in Compare"], ["Esc", "end drawing, close"],
+        ["1 2 3", say("Live, Findings, Compare")], ["4 5 6", say("layers, measure, memory of a place")], ["F", say("follow the drone")], ["J / K", say("next and previous finding")], ["C, Y / R / ? / U", say("confirm, reject, not sure, withdraw")],
+        ["N", say("note")], ["M", say("show on the map")], ["B", say("blink before and after")], ["O", say("hide what was found, in Compare")], ["← →", say("from change to change, in Compare")], ["Esc", say("end drawing, close")],
       ].map(([key, words]) => [el("dt", key), el("dd", words)])),
-      who ? el("details", el("summary", "Diagnostics"), el("p.note.diagnostics", `memory ${bytes((who.memory_mb ?? NaN) * 1e6)}, disk left ${bytes(who.disk_free_gb * 1e9)}, connection ${station.events?.state}`)) : null,
-      el("p.note", el("a", { href: "#/api" }, "Addresses for programs (API)")),
-      who ? el("p.note", `Sorvolo ${who.version}. Logged in as ${who.name || "this machine"} (${who.role}). `,
-        who.name && who.name !== "this machine" ? quiet("Log out", logOut) : null) : null));
+      who ? el("details", el("summary", say("Diagnostics")), el("p.note.diagnostics", say("memory {memory}, disk left {disk}, connection: {connection}", { memory: bytes((who.memory_mb ?? NaN) * 1e6), disk: bytes(who.disk_free_gb * 1e9), connection: LINKS[station.events?.state] }))) : null,
+      el("p.note", el("a", { href: "#/api" }, say("Addresses for programs (API)"))),
+      who ? el("p.note", say("Sorvolo {version}. Logged in as {name} ({role}).", { version: who.version, name: nameOf(who.name || "this machine"), role: ROLES[who.role] }), " ",
+        who.name && who.name !== "this machine" ? quiet(say("Log out"), logOut) : null) : null));
 }
 
 async function logOut() {
@@ -198,7 +209,7 @@ addEventListener("unhandledrejection", (event) => {
     event.preventDefault();
     if (problem.status !== 401) report(problem);
   } else if (problem?.name === "AbortError") event.preventDefault();
-  else message("Something on this page went wrong", { kind: "error", todo: "Reload it; if it comes back, report it with what you did." });
+  else message(say("Something on this page went wrong"), { kind: "error", todo: say("Reload it; if it comes back, report it with what you did.") });
 });
 
 begin();

@@ -1,14 +1,16 @@
 // How the map looks: sources and layers, their colours, patterns and order.
 
+import { say } from "./languages.js";
+
 export const KINDS = {
-  appeared: ["appeared", "#12b886"], disappeared: ["disappeared", "#f03e3e"], replaced: ["replaced", "#9c6bff"],
-  area: ["ground changed", "#228be6"], moving: ["moving", "#fd9e14"],
+  appeared: [say("appeared"), "#12b886"], disappeared: [say("disappeared"), "#f03e3e"], replaced: [say("replaced"), "#9c6bff"],
+  area: [say("ground changed"), "#228be6"], moving: [say("moving"), "#fd9e14"],
 };
 export const CLASSES = {
-  person: ["people", "#ff4fa3", "P"], car: ["cars", "#22c3e6", "C"], "small object": ["small objects", "#ffd43b", "S"],
+  person: [say("people"), "#ff4fa3", "P"], car: [say("cars"), "#22c3e6", "C"], "small object": [say("small objects"), "#ffd43b", "S"],
 };
-export const OTHER_CLASS = ["others", "#e9ecef", "?"];
-export const PLACED = { vision: ["placed by vision", "#35b98a"], "gps-only": ["placed by GPS alone", "#f0a835"] };
+export const OTHER_CLASS = [say("others"), "#e9ecef", "?"];
+export const PLACED = { vision: [say("placed by vision"), "#35b98a"], "gps-only": [say("placed by GPS alone"), "#f0a835"] };
 
 /** Chances of 0 to 20 % and so on that somebody would have been seen: cividis, told apart by every eye. */
 export const POD_RAMP = ["#00224e", "#444d6b", "#7d7c78", "#bcae6c", "#fee838"];
@@ -21,9 +23,9 @@ const matched = (property, table, other) => ["match", ["get", property], ...Obje
 
 /** Layers by group: what a tick in the panel shows and hides. */
 export const GROUPS = {
-  mosaic: ["Map", true], frames: ["Footprints of the frames", false], track: ["Track", true],
-  objects: ["Objects", true], changes: ["Changes", true], coverage: ["Coverage gaps", false],
-  pod: ["Chance to have seen a person", false], drone: ["Drone and field of view", true], drawings: ["Drawings and zones", true],
+  mosaic: [say("Map"), true], frames: [say("Footprints of the frames"), false], track: [say("Track"), true],
+  objects: [say("Objects"), true], changes: [say("Changes"), true], coverage: [say("Coverage gaps"), false],
+  pod: [say("Chance to have seen a person"), false], drone: [say("Drone and field of view"), true], drawings: [say("Drawings and zones"), true],
 };
 
 /** What is laid over ground and can be made fainter: its property of opacity, and that at first. */

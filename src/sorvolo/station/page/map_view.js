@@ -3,6 +3,7 @@
 import * as maplibre from "./vendor/maplibre-gl.mjs";
 import { siteUrl } from "./api.js";
 import { choices, isDark } from "./choices.js";
+import { say } from "./languages.js";
 import { FADED, GROUPS, groundColour, mapStyle, pictures } from "./map_style.js";
 import { distance_m, tileColumn, tileRow } from "./places.js";
 
@@ -34,7 +35,8 @@ export class MapView {
       container, style, attributionControl: false, maxZoom: 24, dragRotate: true, fadeDuration: 0, boxZoom: false, maxTileCacheSize: 0,
       ...(site.bounds_wgs84 ? { bounds: site.bounds_wgs84, fitBoundsOptions: { padding: 30 } } : { center: [0, 20], zoom: 1.5 }),
       transformRequest: (url) => ({ url: this.tileAddress(url) }),
-      locale: { "Map.Title": "Map of the site. Arrow keys move it, plus and minus zoom." },
+      locale: { "Map.Title": say("Map of the site. Arrow keys move it, plus and minus zoom."), "NavigationControl.ZoomIn": say("Zoom in"), "NavigationControl.ZoomOut": say("Zoom out"),
+        "NavigationControl.ResetBearing": say("Drag to rotate, click for north up"), "GeolocateControl.FindMyLocation": say("Where am I?"), "GeolocateControl.LocationNotAvailable": say("This device gives no place") },
     });
     this.map.on("error", (event) => { if (event.error && event.error.status !== 404) console.warn(event.error.message); });
     if (!bare) {

@@ -4,18 +4,19 @@ import { get, siteUrl } from "./api.js";
 import { choices } from "./choices.js";
 import { button, choice, el, fill, icon, press, quiet, svg, tick } from "./dom.js";
 import { badge, facts, isWritten, picture, pictures, titleOf } from "./feature_card.js";
+import { say } from "./languages.js";
 import { middleOf } from "./places.js";
 import { handover } from "./share.js";
 import { jump } from "./place.js";
-import { time } from "./words.js";
+import { time, VERDICTS } from "./words.js";
 import { cropsOf, isChange, newestFirst, peopleFirst } from "./site_data.js";
 import { judge, verdictForm } from "./verdicts.js";
 
 const ORDERS = {
-  score: ["Highest confidence", (one, other) => (other.properties.score ?? 0) - (one.properties.score ?? 0)],
-  doubt: ["Lowest confidence", (one, other) => (one.properties.score ?? 0) - (other.properties.score ?? 0)],
-  size: ["Largest first", (one, other) => (other.properties.area_m2 ?? other.properties.length_m ?? 0) - (one.properties.area_m2 ?? one.properties.length_m ?? 0)],
-  time: ["Newest first", newestFirst],
+  score: [say("Highest confidence"), (one, other) => (other.properties.score ?? 0) - (one.properties.score ?? 0)],
+  doubt: [say("Lowest confidence"), (one, other) => (one.properties.score ?? 0) - (other.properties.score ?? 0)],
+  size: [say("Largest first"), (one, other) => (other.properties.area_m2 ?? other.properties.length_m ?? 0) - (one.properties.area_m2 ?? one.properties.length_m ?? 0)],
+  time: [say("Newest first"), newestFirst],
 };
 
 /** The room's life: a strip of all, and the stage's large card. */
@@ -24,7 +25,7 @@ export class Review {
     Object.assign(this, { screen, what: "objects", order: "score", open: false, at: null });
     if (screen.data.chosen ? isChange(screen.data.chosen) : !screen.data.all.objects.length) this.what = "changes";
     this.head = el("div");
-    this.strip = el("ul.strip", { "aria-label": "To review" });
+    this.strip = el("ul.strip", { "aria-label": say("To review") });
     this.big = el("div.gallery");
     screen.stage.append(this.big);
     fill(body, this.head, this.strip);
@@ -55,22 +56,22 @@ export class Review {
     const all = this.shown();
     const done = all.filter((each) => each.properties.review).length;
     fill(this.head,
-      el("div.segments", { role: "group", "aria-label": "What to review" }, ["objects", "changes"].map((what) =>
-        button(`${what === "changes" ? "Changes" : "Objects"} (${this.shown(what).length})`, () => { this.isChosen = true; this.what = what; this.choose(null); }, { "aria-pressed": what === this.what }))),
+      el("div.segments", { role: "group", "aria-label": say("What to review") }, ["objects", "changes"].map((what) =>
+        button(`${what === "changes" ? say("Changes") : say("Objects")} (${this.shown(what).length})`, () => { this.isChosen = true; this.what = what; this.choose(null); }, { "aria-pressed": what === this.what }))),
       el("div.review-order", choice(Object.entries(ORDERS).map(([key, [words]]) => [key, words]), this.order,
-        (order) => { this.order = order; this.refresh(); }, { "aria-label": "Order" }),
-        tick("Unreviewed only", this.open, (open) => { this.open = open; this.refresh(); })),
-      all.length ? el("div.progress", el("progress", { max: all.length, value: done, "aria-label": "Reviewed" }), el("span", `${done} of ${all.length} reviewed`)) : null,
-      list.length ? null : el("p.hint", all.length ? "All reviewed. Untick “Unreviewed only” to see them again." : `No ${this.what} to review${this.screen.data.all[this.what].length ? ": the filter hides them all" : ""}.`));
+        (order) => { this.order = order; this.refresh(); }, { "aria-label": say("Order") }),
+        tick(say("Unreviewed only"), this.open, (open) => { this.open = open; this.refresh(); })),
+      all.length ? el("div.progress", el("progress", { max: all.length, value: done, "aria-label": say("Reviewed") }), el("span", say("{n} of {all} reviewed", { n: done, all: all.length }))) : null,
+      list.length ? null : el("p.hint", all.length ? say("All reviewed. Untick “Unreviewed only” to see them again.") : `${this.what === "changes" ? say("No changes to review") : say("No objects to review")}${this.screen.data.all[this.what].length ? `: ${say("the filter hides them all")}` : ""}.`));
   }
 
   item(feature) {
     const chosen = feature.id === this.at;
     const words = { confirmed: "check", rejected: "cross" }[feature.properties.review];
     return el("li", button([
-      cropsOf(feature).length ? picture(cropsOf(feature).at(-1), "") : el("div.gone", "no picture yet"),
+      cropsOf(feature).length ? picture(cropsOf(feature).at(-1), "") : el("div.gone", say("no picture yet")),
       el("span.name", badge(feature), titleOf(feature)),
-      words ? el("span.mark", icon(words), el("span.sr", feature.properties.review)) : null,
+      words ? el("span.mark", icon(words), el("span.sr", VERDICTS[feature.properties.review])) : null,
     ], () => this.choose(feature.id), { "aria-current": chosen || null, data: { id: feature.id }, class: feature.properties.review ?? "open" }));
   }
 
@@ -84,18 +85,18 @@ export class Review {
     if (state === this.told) return; // what a person is about to press stays under the finger
     Object.assign(this, { drawn: this.at, told: state });
     this.pictures = pictures(feature);
-    this.film = el("ol.film", { tabindex: 0, "aria-label": "Seen here, in order of time" });
+    this.film = el("ol.film", { tabindex: 0, "aria-label": say("Seen here, in order of time") });
     const { data } = this.screen;
     const place = middleOf(feature.geometry);
     fill(this.big,
-      el("div.gallery-head", badge(feature), el("h3", titleOf(feature)), el("span.soft", `${at + 1} of ${list.length}`),
-        isChange(feature) ? null : quiet("10 m around", (event) => this.around(feature, event.currentTarget), { "aria-pressed": false }),
-        quiet("Previous", () => this.step(-1), { "aria-keyshortcuts": "K" }), quiet("Next", () => this.step(1), { "aria-keyshortcuts": "J" })),
+      el("div.gallery-head", badge(feature), el("h3", titleOf(feature)), el("span.soft", say("{n} of {all}", { n: at + 1, all: list.length })),
+        isChange(feature) ? null : quiet(say("10 m around"), (event) => this.around(feature, event.currentTarget), { "aria-pressed": false }),
+        quiet(say("Previous"), () => this.step(-1), { "aria-keyshortcuts": "K" }), quiet(say("Next"), () => this.step(1), { "aria-keyshortcuts": "J" })),
       this.pictures, this.film,
       el("div.gallery-foot", facts(feature, data.detail.is_local),
         el("div", verdictForm(this.screen, feature, { keys: true, given: (verdict, note) => this.give(verdict, note) }),
-          el("div.row", button("Show on the map", () => this.map(), { icon: "target", "aria-keyshortcuts": "M" }),
-            isChange(feature) ? quiet("Blink", () => this.blink(), { "aria-keyshortcuts": "B" }) : null),
+          el("div.row", button(say("Show on the map"), () => this.map(), { icon: "target", "aria-keyshortcuts": "M" }),
+            isChange(feature) ? quiet(say("Blink"), () => this.blink(), { "aria-keyshortcuts": "B" }) : null),
           data.detail.is_local ? null : handover(data.id, titleOf(feature), place, feature.properties.sigma_m))));
     this.showFilm(feature, place);
     this.strip.querySelector("[aria-current]")?.scrollIntoView({ block: "nearest" });
@@ -107,7 +108,7 @@ export class Review {
     const views = await get(`${siteUrl(this.screen.data.id, "place")}?lon=${lon}&lat=${lat}`).catch(() => []);
     if (film !== this.film) return;
     this.views = views.filter((each) => each.crop_url);
-    fill(film, this.views.map((each) => el("li", button(picture(each.crop_url, ""), () => this.large(feature, each), { class: "frame", "aria-label": `Seen ${time(each.time)}` }), jump(this.screen, each))));
+    fill(film, this.views.map((each) => el("li", button(picture(each.crop_url, ""), () => this.large(feature, each), { class: "frame", "aria-label": say("Seen {time}", { time: time(each.time) }) }), jump(this.screen, each))));
   }
 
   /** The surroundings in place of the crop, or back. */
@@ -123,7 +124,7 @@ export class Review {
     const length_m = Math.max(1, Math.min(8, feature.properties.length_m || 2));
     const ring = svg("svg", { viewBox: "0 0 10 10", class: "scale", "aria-hidden": "true" }, svg("circle", { cx: 5, cy: 5, r: 0.65 * length_m }), svg("path", { d: "M.5 9.5h2M9.5 2V.6m-.3.5.3-.5.3.5" }),
       svg("text", { x: 0.5, y: 9.2 }, "2 m"), svg("text", { x: 9.35, y: 2.6 }, "N"));
-    const shown = el("div.pictures.n1", el("figure.ground", picture(view.crop_url, `10 m around, ${time(view.time)}`), ring, el("figcaption", time(view.time))));
+    const shown = el("div.pictures.n1", el("figure.ground", picture(view.crop_url, `${say("10 m around")}, ${time(view.time)}`), ring, el("figcaption", time(view.time))));
     this.pictures.replaceWith(shown);
     this.pictures = shown;
   }

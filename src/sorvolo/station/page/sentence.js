@@ -1,11 +1,12 @@
 // The line above every room: what is known, as a result. It never states that nobody is there.
 
+import { say } from "./languages.js";
 import { area_m2, polygonsOf } from "./places.js";
-import { counted, day, duration, percent } from "./words.js";
+import { day, duration, percent } from "./words.js";
 
-const ACTS = { map: "Mapping", compare: "Comparing", watch: "Looking for people and vehicles", search: "Measuring the search" };
-const BAD_ENDS = { failed: "The last mission failed", incomplete: "The last mission is incomplete", lost: "The last mission broke off", stopped: "The last mission was stopped" };
-const LINKS = { late: "The station answers late", waiting: "Connecting", lost: "No connection" };
+const ACTS = { map: say("Mapping"), compare: say("Comparing"), watch: say("Looking for people and vehicles"), search: say("Measuring the search") };
+const BAD_ENDS = { failed: say("The last mission failed"), incomplete: say("The last mission is incomplete"), lost: say("The last mission broke off"), stopped: say("The last mission was stopped") };
+const LINKS = { late: say("The station answers late"), waiting: say("Connecting"), lost: say("No connection") };
 
 /** A polygon's area without its holes, m2. */
 function polygonArea_m2([outer, ...inner]) {
@@ -37,12 +38,12 @@ export const openOf = (...lists) => lists.flat().filter(({ properties: { review,
  */
 export function sentence({ link, loaded, runs, objects, changes, pod, versions, votes = 0, isLow = false, now = Date.now() }) {
   const parts = [];
-  const say = (words, act = null, kind = "") => parts.push({ words, act, kind });
-  if (link !== "live") say(`${LINKS[link]}: this may be old`, null, "warning");
-  if (votes) say(`${counted(votes, "verdict")} ${votes === 1 ? "waits" : "wait"} to be sent`, null, "warning");
-  if (isLow) say("The disk is nearly full", null, "warning");
+  const tell = (words, act = null, kind = "") => parts.push({ words, act, kind });
+  if (link !== "live") tell(say("{link}: this may be old", { link: LINKS[link] }), null, "warning");
+  if (votes) tell(say("{n} verdict waits to be sent|{n} verdicts wait to be sent", { n: votes }), null, "warning");
+  if (isLow) tell(say("The disk is nearly full"), null, "warning");
   if (loaded !== "yes") {
-    say(loaded === "failed" ? "What is known here could not be loaded" : "Loading what is known", null, loaded === "failed" ? "warning" : "");
+    tell(loaded === "failed" ? say("What is known here could not be loaded") : say("Loading what is known"), null, loaded === "failed" ? "warning" : "");
     return parts;
   }
   const running = runs.filter(({ state }) => state === "running");
@@ -50,22 +51,22 @@ export function sentence({ link, loaded, runs, objects, changes, pod, versions, 
   for (const run of running.toReversed()) {
     const { input, mission, started_at: began } = run;
     const hasLanded = runs.some((each) => each.progress?.landed && each.input?.stream === input?.stream && each.started_at >= began);
-    const name = hasLanded ? (running.some((each) => each.mission === "watch") ? "Landed, searching the rest" : "Landed, finishing the map") : input?.stream || input?.stream_url ? "Flying" : ACTS[mission];
-    if (!told.has(name)) say(hasLanded ? name : `${name} ${duration((now - new Date(began)) / 1000)}`, "live");
+    const name = hasLanded ? (running.some((each) => each.mission === "watch") ? say("Landed, searching the rest") : say("Landed, finishing the map")) : input?.stream || input?.stream_url ? say("Flying") : ACTS[mission];
+    if (!told.has(name)) tell(hasLanded ? name : `${name} ${duration((now - new Date(began)) / 1000)}`, "live");
     told.add(name);
   }
   if (!running.length) {
     const newest = versions.at(-1);
-    say(newest ? `Map of ${day(newest.flown_at ?? newest.made_at)}` : "No map yet", "live");
+    tell(newest ? say("Map of {date}", { date: day(newest.flown_at ?? newest.made_at) }) : say("No map yet"), "live");
     const ending = BAD_ENDS[runs[0]?.state];
-    if (ending) say(ending, "live", "warning");
+    if (ending) tell(ending, "live", "warning");
   }
-  say(...found(objects, pod, running, runs));
+  tell(...found(objects, pod, running, runs));
   const looked = lookedAt(pod);
-  say(looked ? `${percent(looked.share)} of the ground looked at (a person on it: ${Math.round(looked.from * 100)}–${percent(looked.to)})` : "the chance to have seen a person is not measured", "coverage");
+  tell(looked ? say("{share} of the ground looked at (a person on it: {from}–{to})", { share: percent(looked.share), from: Math.round(looked.from * 100), to: percent(looked.to) }) : say("the chance to have seen a person is not measured"), "coverage");
   const open = openOf(objects, changes).length;
-  if (changes.length) say(counted(changes.length, "change"), "compare");
-  if (open) say(`${open} to review`, "review");
+  if (changes.length) tell(say("{n} change|{n} changes", { n: changes.length }), "compare");
+  if (open) tell(say("{n} to review", { n: open }), "review");
   return parts;
 }
 
@@ -78,13 +79,13 @@ function found(objects, pod, running, runs) {
   const number = (name) => there.filter(({ properties }) => properties.class === name).length;
   const [people, cars] = [number("person"), number("car")];
   const others = there.length - people - cars;
-  const more = [cars ? counted(cars, "car") : null, others ? `${counted(others, "other object")}` : null].filter(Boolean);
-  if (people) return [[counted(people, "person", "people"), ...more].join(", "), "review", "found"];
+  const more = [cars ? say("{n} car|{n} cars", { n: cars }) : null, others ? say("{n} other object|{n} other objects", { n: others }) : null].filter(Boolean);
+  if (people) return [[say("{n} person|{n} people", { n: people }), ...more].join(", "), "review", "found"];
   const seen = (property) => objects.filter(({ properties }) => properties.class === "person" && property(properties)).length;
   const [rejected, gone] = [seen(({ review }) => review === "rejected"), seen(({ gone: isGone, review }) => isGone && review !== "rejected")];
   const wasLooked = lookedAt(pod) || runs.some((run) => ["watch", "search"].includes(run.mission) && run.state === "finished" && looksForPeople(run));
   const why = rejected || gone
-    ? [gone ? `${counted(gone, "person", "people")} on an earlier date only` : null, rejected ? `${counted(rejected, "person", "people")} found and rejected in review` : null].filter(Boolean).join(", ")
-    : running.some(looksForPeople) ? "no person found so far" : wasLooked ? "no person found in what was looked at" : "no search for people is on record";
+    ? [gone ? say("{n} person on an earlier date only|{n} people on an earlier date only", { n: gone }) : null, rejected ? say("{n} person found and rejected in review|{n} people found and rejected in review", { n: rejected }) : null].filter(Boolean).join(", ")
+    : running.some(looksForPeople) ? say("no person found so far") : wasLooked ? say("no person found in what was looked at") : say("no search for people is on record");
   return [[...more, why].join(", "), "review"];
 }

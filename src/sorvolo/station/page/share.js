@@ -2,6 +2,7 @@
 
 import { roomUrl } from "./api.js";
 import { button, el, fill } from "./dom.js";
+import { numeral, say } from "./languages.js";
 import { placeIn } from "./words.js";
 
 /** Copy text, also where the page is not secure and the browser has no clipboard for it. */
@@ -22,7 +23,7 @@ export const placeUrl = (site, place) => `${roomUrl(site, "place")}?at=${place.m
 /** What is sent of a place: what is there, where, how surely, a link. */
 function wordsOf(name, place, sigma_m, link) {
   const lines = [name, ...["latlon", "mgrs", "utm"].map((kind) => placeIn(kind, place))];
-  if (sigma_m) lines.push(`to ${sigma_m.toFixed(1)} m (1 sigma)`);
+  if (sigma_m) lines.push(say("to {sigma} m (1 sigma)", { sigma: numeral(sigma_m, 1) }));
   return [...new Set(lines), `geo:${place[1].toFixed(6)},${place[0].toFixed(6)}`, link].join("\n");
 }
 
@@ -32,24 +33,24 @@ export function handover(site, name, place, sigma_m = null) {
   const done = el("span.soft", { role: "status" });
   const give = async (what, text) => {
     await copy(text);
-    fill(done, `${what} copied`);
+    fill(done, say("{what} copied", { what }));
   };
   const send = async () => {
     const text = wordsOf(name, place, sigma_m, link);
     if (navigator.share) {
       try {
         await navigator.share({ title: name, text });
-        return void fill(done, "Sent");
+        return void fill(done, say("Sent"));
       } catch (error) {
         if (error.name === "AbortError") return;
       }
     }
-    await give("Place", text);
+    await give(say("Place"), text);
   };
-  const systems = [["latlon", "Degrees"], ["dms", "Degrees, minutes, seconds"], ["utm", "UTM"], ["mgrs", "MGRS"]];
+  const systems = [["latlon", say("Degrees")], ["dms", say("Degrees, minutes, seconds")], ["utm", "UTM"], ["mgrs", "MGRS"]];
   return el("div.handover",
-    el("div.row", button("Send place", send, { class: "main", icon: "export" }), el("a.button", { href: `geo:${place[1].toFixed(6)},${place[0].toFixed(6)}` }, "Navigate"), done),
-    el("details", el("summary", "Coordinates and link"), el("ul.plain",
-      systems.map(([kind, words]) => [words, placeIn(kind, place)]).concat([["Link", link]]).map(([words, text]) =>
-        el("li", button(text, () => give(words, text), { class: "link", title: `${words}: a tap copies it` }))))));
+    el("div.row", button(say("Send place"), send, { class: "main", icon: "export" }), el("a.button", { href: `geo:${place[1].toFixed(6)},${place[0].toFixed(6)}` }, say("Navigate")), done),
+    el("details", el("summary", say("Coordinates and link")), el("ul.plain",
+      systems.map(([kind, words]) => [words, placeIn(kind, place)]).concat([[say("Link"), link]]).map(([words, text]) =>
+        el("li", button(text, () => give(words, text), { class: "link", title: say("{what}: a tap copies it", { what: words }) }))))));
 }

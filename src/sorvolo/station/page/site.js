@@ -9,6 +9,7 @@ import { Draw, loadDrawings } from "./draw.js";
 import { exportPanel } from "./exports.js";
 import { featureCard } from "./feature_card.js";
 import { ALL, chips } from "./filters.js";
+import { say } from "./languages.js";
 import { layersPanel } from "./layers.js";
 import { Live } from "./live.js";
 import { canDraw, MapView } from "./map_view.js";
@@ -23,8 +24,8 @@ import { VideoWall } from "./video.js";
 import { votes } from "./votes.js";
 import * as words from "./words.js";
 
-const ROOMS = { live: ["Live", Missions], findings: ["Findings", Review], compare: ["Compare", Compare] };
-const TOOLS = { layers: ["Layers", layersPanel, "layers"], measure: ["Measure and draw", Draw, "draw"], place: ["Memory of a place", placePanel, "place"], share: ["Share", exportPanel, "export"] };
+const ROOMS = { live: [say("Live"), Missions], findings: [say("Findings"), Review], compare: [say("Compare"), Compare] };
+const TOOLS = { layers: [say("Layers"), layersPanel, "layers"], measure: [say("Measure and draw"), Draw, "draw"], place: [say("Memory of a place"), placePanel, "place"], share: [say("Share"), exportPanel, "export"] };
 const ALL_PANELS = { ...ROOMS, ...TOOLS };
 const STOPS = ["half", "full", "peek"]; // of the sheet that a panel is on a phone
 const STATUS_MS = 10000;
@@ -45,13 +46,13 @@ function notMadeYet(id) {
 class SiteScreen {
   constructor({ main, title, rooms, known }, station, data, view, at) {
     Object.assign(this, { station, data, known, over: new AbortController(), lastPlace: at, room: "live", loaded: "no", runs: [] });
-    this.stage = el("section.stage", { "aria-label": "Map" });
+    this.stage = el("section.stage", { "aria-label": say("Map") });
     this.panel = el("section.panel", { id: "panel", tabindex: -1, data: { stop: "half" } });
     this.canvas = el("div.map-canvas");
-    this.readout = el("output.readout", { "aria-label": "Place under the pointer" });
+    this.readout = el("output.readout", { "aria-label": say("Place under the pointer") });
     this.chips = el("div.chips");
     this.stage.append(this.canvas, this.chips, this.readout);
-    this.wall = el("section.wall", { "aria-label": "Videos", hidden: true });
+    this.wall = el("section.wall", { "aria-label": say("Videos"), hidden: true });
     const tab = (name, props) => button(ALL_PANELS[name][0], () => this.open(name, true), { data: { panel: name }, "aria-controls": "panel", ...props });
     fill(rooms, this.tabs = [...Object.keys(ROOMS).map((name) => tab(name)), tab("share", { icon: "export", class: "share" })]);
     fill(main, el("div.site", this.panel, this.stage, this.wall));
@@ -63,8 +64,8 @@ class SiteScreen {
 
   begin(view) {
     if (!canDraw()) {
-      fill(this.canvas, el("div.starting", el("h2", "This browser cannot draw the map"),
-        el("p", "It has no WebGL 2. Use a newer Firefox, Chrome, Edge or Safari, or switch on hardware acceleration in its settings. Findings, missions and exports work without the map.")));
+      fill(this.canvas, el("div.starting", el("h2", say("This browser cannot draw the map")),
+        el("p", say("It has no WebGL 2. Use a newer Firefox, Chrome, Edge or Safari, or switch on hardware acceleration in its settings. Findings, missions and exports work without the map."))));
       this.view = null;
     } else {
       this.view = new MapView(this.canvas, this.data.detail, {
@@ -105,9 +106,9 @@ class SiteScreen {
 
   tools() {
     const tool = (title, drawn, act, props = {}) => button("", act, { icon: drawn, title, "aria-label": title, ...props });
-    this.follower = tool("Follow the drone", "video", () => this.follow(!this.live.follows), { "aria-pressed": true });
-    return el("div.map-tools", { role: "toolbar", "aria-label": "Map tools" },
-      tool("Whole site", "fit", () => { if (this.data.detail.bounds_wgs84) this.view.go(this.data.detail.bounds_wgs84); this.follow(false); }), this.follower,
+    this.follower = tool(say("Follow the drone"), "video", () => this.follow(!this.live.follows), { "aria-pressed": true });
+    return el("div.map-tools", { role: "toolbar", "aria-label": say("Map tools") },
+      tool(say("Whole site"), "fit", () => { if (this.data.detail.bounds_wgs84) this.view.go(this.data.detail.bounds_wgs84); this.follow(false); }), this.follower,
       Object.entries(TOOLS).filter(([name]) => name !== "share").map(([name, [words_, , drawn]]) => tool(words_, drawn, () => (this.shown === name ? this.open(this.room) : this.open(name, true)), { data: { panel: name } })));
   }
 
@@ -133,8 +134,8 @@ class SiteScreen {
   refused({ vote, problem }) {
     if (vote.site !== this.data.id) return;
     const found = this.data.find(vote.id);
-    message(`This verdict was not taken: ${problem.title}`, { kind: "error", todo: problem.detail,
-      act: found ? button("Show it", () => (this.opened?.see ? this.opened.see(found) : this.data.choose(found))) : null });
+    message(say("This verdict was not taken: {why}", { why: problem.title }), { kind: "error", todo: problem.detail,
+      act: found ? button(say("Show it"), () => (this.opened?.see ? this.opened.see(found) : this.data.choose(found))) : null });
     this.data.load([vote.kind === "change" ? "changes" : "objects"]).catch(() => {});
   }
 
@@ -189,7 +190,7 @@ class SiteScreen {
     try {
       this.station.status = { ...this.station.status, ...await get(`/api/status?site=${encodeURIComponent(this.data.id)}`) };
       const others = this.station.status.present.filter((name) => name !== this.station.status.name);
-      fill(this.people, others.length ? `also here: ${others.join(", ")}` : "");
+      fill(this.people, others.length ? say("also here: {names}", { names: others.map(words.nameOf).join(", ") }) : "");
       if (this.closed || this.station.events.state !== "live") return;
       if (this.station.status.name !== votes.who) location.reload(); // another tab changed it
       if (this.loaded === "failed" || this.isOld) await this.reload();
@@ -253,7 +254,7 @@ class SiteScreen {
   }
 
   gone() {
-    message("This site is gone", { kind: "error", todo: "Somebody deleted it. The list of sites shows the others." });
+    message(say("This site is gone"), { kind: "error", todo: say("Somebody deleted it. The list of sites shows the others.") });
     location.hash = "#/";
   }
 
@@ -267,8 +268,8 @@ class SiteScreen {
     this.stage.dataset.panel = document.body.dataset.panel = shown;
     const [words_, made] = ALL_PANELS[shown];
     const body = el("div", { class: `body ${shown}` });
-    fill(this.panel, el("div.panel-head", button("", () => this.resize(), { class: "quiet handle", "aria-label": "More or less of this sheet" }), el("h2", words_),
-      shown in TOOLS ? quiet("Close", () => this.open(this.room), { icon: "close" }) : null), body);
+    fill(this.panel, el("div.panel-head", button("", () => this.resize(), { class: "quiet handle", "aria-label": say("More or less of this sheet") }), el("h2", words_),
+      shown in TOOLS ? quiet(say("Close"), () => this.open(this.room), { icon: "close" }) : null), body);
     this.panel.setAttribute("aria-label", words_);
     if (byHand && this.panel.dataset.stop === "peek") this.resize("half");
     this.opened = new made(this, body);

@@ -6,17 +6,18 @@ import { isWithin, tileColumn, tileRow } from "./places.js";
 import { DroneVideo } from "./video.js";
 import * as words from "./words.js";
 import { choices } from "./choices.js";
+import { say } from "./languages.js";
 
 const PREVIEW_SHAPE = 1.6; // width over height
 const LOOK_MS = 5000;
 const HEARD = ["run.started", "run.finished", "run.failed", "site.changed", "site.gone", "stream.state"];
 
 export async function showSites({ main, title }, station) {
-  fill(title, el("h1.sr", "Sites"));
-  document.title = "Sorvolo station";
+  fill(title, el("h1.sr", say("Sites")));
+  document.title = say("Sorvolo station");
   const videos = new Map();
   let [shown, closed] = ["", false];
-  const drones = el("section.drones", { "aria-label": "Drones" });
+  const drones = el("section.drones", { "aria-label": say("Drones") });
   const below = el("div");
   const load = async () => {
     const [sites, streams] = await Promise.all([get("/api/sites"), get("/api/streams")]);
@@ -74,53 +75,53 @@ function droneCard({ stream, telemetry }, video, sites, station) {
       pressed.disabled = false;
     }
   };
-  return el("article.card.drone", video.pane, el("p", "Sends now", lat === undefined || lat === null ? "" : ` at ${words.place([lon, lat])}`, here ? `, over ${siteName(here)}` : ""),
-    station.operates ? button("Map and find people", start, { class: "main" }) : mayNot(),
-    here ? el("p", el("a", { href: roomUrl(here.id) }, `Look at ${siteName(here)}`)) : null, fault);
+  return el("article.card.drone", video.pane, el("p", [say("Sends now"), lat === undefined || lat === null ? "" : words.place([lon, lat]), here ? say("over {site}", { site: siteName(here) }) : ""].filter(Boolean).join(", ")),
+    station.operates ? button(say("Map and find people"), start, { class: "main" }) : mayNot(),
+    here ? el("p", el("a", { href: roomUrl(here.id) }, say("Look at {site}", { site: siteName(here) }))) : null, fault);
 }
 
 function list(sites, station) {
-  return [el("h2", "Sites"),
+  return [el("h2", say("Sites")),
     el("ul.cards", sites.map((site) => card(site, station.operates))),
     station.operates ? newSite() : null];
 }
 
 function card(site, may) {
-  const remove = may ? quiet("Delete", () => showDeletion(site).catch(report), { "aria-label": `Delete ${site.id}` }) : null;
+  const remove = may ? quiet(say("Delete"), () => showDeletion(site).catch(report), { "aria-label": say("Delete {name}", { name: site.id }) }) : null;
   if (site.error) {
     return el("li.card.broken", el("h3", site.name), el("p", site.error), remove);
   }
-  const where = site.is_local ? "no GPS" : site.center_wgs84 ? words.place(site.center_wgs84) : "nothing mapped yet";
+  const where = site.is_local ? say("no GPS") : site.center_wgs84 ? words.place(site.center_wgs84) : say("nothing mapped yet");
   return el("li.card",
     el("a", { href: roomUrl(site.id) },
-      site.versions && site.bounds_wgs84 ? preview(site) : el("div.preview.none", "no map yet"),
+      site.versions && site.bounds_wgs84 ? preview(site) : el("div.preview.none", say("no map yet")),
       el("h3", siteName(site))),
-    el("p", words.counted(site.flights, "flight"), " · ", words.counted(site.versions, "version")),
+    el("p", say("{n} flight|{n} flights", { n: site.flights }), " · ", say("{n} version|{n} versions", { n: site.versions })),
     el("p.soft", where, site.updated_at ? ` · ${words.time(site.updated_at)}` : ""),
-    remove ? el("details.more", el("summary", { "aria-label": `More of ${site.id}` }, "⋯"), remove) : null);
+    remove ? el("details.more", el("summary", { "aria-label": say("More of {name}", { name: site.id }) }, "⋯"), remove) : null);
 }
 
 /** State what would be lost with a site, and delete it when its id is typed (two may have one name); or why it cannot be deleted now. */
 async function showDeletion(site) {
   const loss = await get(siteUrl(site.id, "deletion"));
   const name = el("input", { autocomplete: "off", spellcheck: "false" });
-  const remove = el("button.main", { disabled: true }, "Delete");
+  const remove = el("button.main", { disabled: true }, say("Delete"));
   name.addEventListener("input", () => { remove.disabled = name.value.trim() !== site.id; });
   const form = el("form.stack", { on: { submit: async (event) => {
     event.preventDefault();
     box.close();
     try { await ask("DELETE", siteUrl(site.id), undefined, { headers: { "if-match": loss.etag } }); } catch (problem) { report(problem); }
   } } },
-  el("p", loss.versions === null ? "This site cannot be read." : `${words.counted(loss.flights, "flight")}, ${words.counted(loss.versions, "version")} of the map.`,
-    ` ${words.counted(loss.files, "file")}, ${words.bytes(loss.bytes)}.`),
-  el("p.note", `Verdicts and drawings go with it, and the records of its missions (${loss.missions}) with what watches found. Recordings and uploads stay.`),
-  field(`Type ${site.id} to confirm`, name), remove);
-  const box = dialog(`Delete the site ${site.id} for good?`, form);
+  el("p", loss.versions === null ? say("This site cannot be read.") : `${say("{n} flight|{n} flights", { n: loss.flights })}, ${say("{n} version of the map|{n} versions of the map", { n: loss.versions })}.`,
+    ` ${say("{n} file|{n} files", { n: loss.files })}, ${words.bytes(loss.bytes)}.`),
+  el("p.note", say("Verdicts and drawings go with it, and the records of its missions ({missions}) with what watches found. Recordings and uploads stay.", { missions: loss.missions })),
+  field(say("Type {name} to confirm", { name: site.id }), name), remove);
+  const box = dialog(say("Delete the site {name} for good?", { name: site.id }), form);
   name.focus();
 }
 
 /** What stands in the place of what a person may not do. */
-export const mayNot = (role = "operator") => el("p.note", `View only. Ask the team lead for ${role} access.`);
+export const mayNot = (role = "operator") => el("p.note", role === "operator" ? say("View only. Ask the team lead for operator access.") : say("View only. Ask the team lead for reviewer access."));
 
 /** A site as its list and title name it: its folder below the root. */
 export const siteName = (site) => (site.id.includes(":") ? site.id.replaceAll(":", " / ") : site.name);
@@ -149,27 +150,27 @@ function preview(site) {
 }
 
 function newSite() {
-  const name = el("input", { required: true, maxlength: 80, placeholder: "My field", "aria-label": "Name of a new site" });
+  const name = el("input", { required: true, maxlength: 80, placeholder: say("My field"), "aria-label": say("Name of a new site") });
   return el("form.row.new-site", { on: { submit: (event) => {
     event.preventDefault();
     const id = name.value.trim().replaceAll(/[/\\:]+/g, "-"); // a site is a folder
     location.hash = roomUrl(id);
-  } } }, name, el("button", "New site"));
+  } } }, name, el("button", say("New site")));
 }
 
 function firstRun(station) {
   return el("div.first-run",
-    el("h2", "No site yet"),
-    el("p", "A site is a piece of ground with its maps, flight after flight. Three ways to the first one:"),
+    el("h2", say("No site yet")),
+    el("p", say("A site is a piece of ground with its maps, flight after flight. Three ways to the first one:")),
     el("ol.ways",
-      el("li", el("h3", "See it with a demo flight"),
-        el("p", "Two simulated flights over a village, mapped and compared in about two minutes. On the station's machine, in the folder it serves:"),
+      el("li", el("h3", say("See it with a demo flight")),
+        el("p", say("Two simulated flights over a village, mapped and compared in about two minutes. On the station's machine, in the folder it serves:")),
         el("pre", { tabindex: 0 }, el("code", "sorvolo demo")),
-        el("p.soft", "The site appears here when it is done.")),
-      el("li", el("h3", "Map a flight of yours"),
-        el("p", "Name the site, then upload a video with its telemetry, or a folder of photos."),
+        el("p.soft", say("The site appears here when it is done."))),
+      el("li", el("h3", say("Map a flight of yours")),
+        el("p", say("Name the site, then upload a video with its telemetry, or a folder of photos.")),
         station.operates ? newSite() : mayNot()),
-      el("li", el("h3", "Let the drone stream"),
-        el("p", "On its companion computer, or to replay a recorded flight:"),
+      el("li", el("h3", say("Let the drone stream")),
+        el("p", say("On its companion computer, or to replay a recorded flight:")),
         el("pre", { tabindex: 0 }, el("code", `sorvolo stream FLIGHT.MP4 --to ${location.origin}`)))));
 }

@@ -3,6 +3,7 @@
 import { Problem, send } from "./api.js";
 import { stored } from "./choices.js";
 import { message } from "./dom.js";
+import { say } from "./languages.js";
 import { bytes } from "./words.js";
 
 const VERSION = { "tus-resumable": "1.0.0" };
@@ -51,9 +52,9 @@ export class Upload extends EventTarget {
   async checked(url) {
     for (;;) {
       const { id, state, why, facts } = await (await send(url, { signal: this.stopped.signal })).json();
-      if (state === "refused") throw new Problem(415, `${this.file.name} cannot be used`, why);
+      if (state === "refused") throw new Problem(415, say("{name} cannot be used", { name: this.file.name }), why);
       if (state === "ready" && facts?.missing_bytes) {
-        message(`${this.file.name} is cut: its last ${bytes(facts.missing_bytes)} are missing`, { kind: "warning", todo: "What is there is used. Copy the video from the drone again to have all of it." });
+        message(say("{name} is cut: its last {size} are missing", { name: this.file.name, size: bytes(facts.missing_bytes) }), { kind: "warning", todo: say("What is there is used. Copy the video from the drone again to have all of it.") });
       }
       if (state === "ready") return id;
       await pause(300);
@@ -74,7 +75,7 @@ export class Upload extends EventTarget {
     const metadata = `filename ${base64(this.file.name)}`;
     const answer = await send("/api/uploads", { method: "POST", headers: { ...VERSION, "upload-length": String(this.file.size), "upload-metadata": metadata }, signal: this.stopped.signal });
     const url = answer.headers.get("location");
-    if (!url) throw new Problem(500, "The upload did not begin", "The station gave it no address; look at its messages.");
+    if (!url) throw new Problem(500, say("The upload did not begin"), say("The station gave it no address; look at its messages."));
     stored.set(this.key, url);
     return url;
   }

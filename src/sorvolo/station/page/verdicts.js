@@ -2,6 +2,7 @@
 
 import { get, siteUrl } from "./api.js";
 import { button, el, fill, quiet } from "./dom.js";
+import { say } from "./languages.js";
 import { isChange } from "./site_data.js";
 import { mayNot } from "./sites.js";
 import { votes } from "./votes.js";
@@ -16,18 +17,18 @@ export function judge(screen, feature, verdict, note = null) {
 /** Who judged it how and when, in a line. */
 export function verdictLine(feature) {
   const { review, reviewer, reviewed_at: at, note, review_state: state, waiting } = feature.properties;
-  if (!waiting && !review && !note) return el("p.verdict.none", "Not reviewed yet");
-  return el("p", { class: `verdict ${review || "none"}` }, el("b", review && review !== "none" ? review : "no verdict"),
-    waiting ? " · waits to be sent" : [state === "agreed" ? ", agreed" : "", reviewer ? ` by ${reviewer}` : "", at ? `, ${words.time(at)}` : ""], note ? el("span.remark", ` “${note}”`) : "");
+  if (!waiting && !review && !note) return el("p.verdict.none", say("Not reviewed yet"));
+  return el("p", { class: `verdict ${review || "none"}` }, el("b", words.VERDICTS[review] ?? words.VERDICTS.none),
+    waiting ? ` · ${say("waits to be sent")}` : [state === "agreed" ? `, ${say("agreed")}` : "", reviewer ? ` ${say("by {name}", { name: words.nameOf(reviewer) })}` : "", at ? `, ${words.time(at)}` : ""], note ? el("span.remark", ` “${note}”`) : "");
 }
 
 /** Buttons and a note for a feature. `given(verdict, note)`: what a button does, if not only to judge. */
 export function verdictForm(screen, feature, { keys = false, given = null } = {}) {
   const line = el("div", verdictLine(feature));
-  const others = el("ul.plain.votes", { "aria-label": "Votes" });
+  const others = el("ul.plain.votes", { "aria-label": say("Votes") });
   showVotes(screen, feature, others);
   if (!screen.station.reviews) return el("div", line, others, mayNot("reviewer"));
-  const note = el("input", { type: "text", maxlength: 2000, placeholder: "Note", "aria-label": "Note", ".value": feature.properties.note ?? "" });
+  const note = el("input", { type: "text", maxlength: 2000, placeholder: say("Note"), "aria-label": say("Note"), ".value": feature.properties.note ?? "" });
   const current = feature.properties.review;
   const give = (verdict) => {
     judge(screen, feature, verdict, note.value.trim());
@@ -42,9 +43,9 @@ export function verdictForm(screen, feature, { keys = false, given = null } = {}
     () => (given ? given(verdict, note.value.trim()) : give(verdict)), { class: style, "aria-pressed": current === verdict });
   return el("div.verdict-form", line, others,
     el("div.row",
-      vote("Confirm", "confirmed", "C", "confirm"), vote("Reject", "rejected", "R", "reject"), vote("Not sure", "unsure", "", "quiet"),
-      current ? vote("Withdraw", "none", "U", "quiet") : null),
-    el("div.row", note, quiet("Save note", () => give(null))));
+      vote(say("Confirm"), "confirmed", "C", "confirm"), vote(say("Reject"), "rejected", "R", "reject"), vote(say("Not sure"), "unsure", "", "quiet"),
+      current ? vote(say("Withdraw"), "none", "U", "quiet") : null),
+    el("div.row", note, quiet(say("Save note"), () => give(null))));
 }
 
 /** Each person's last vote, where several people voted. */
@@ -53,5 +54,5 @@ async function showVotes(screen, feature, list) {
   const query = new URLSearchParams({ kind: isChange(feature) ? "change" : "object", id: feature.id });
   const given = await get(`${siteUrl(screen.data.id, "reviews")}?${query}`).catch(() => []);
   const last = [...new Map(given.reverse().map((each) => [each.who, each])).values()].filter(({ verdict }) => verdict !== "none");
-  if (last.length > 1) fill(list, last.map(({ who, verdict, at }) => el("li", el("b", who), `: ${verdict}, ${words.time(at)}`)));
+  if (last.length > 1) fill(list, last.map(({ who, verdict, at }) => el("li", el("b", words.nameOf(who)), `: ${words.VERDICTS[verdict] ?? verdict}, ${words.time(at)}`)));
 }

@@ -3,6 +3,7 @@
 import { get, socketTo } from "./api.js";
 import { choices } from "./choices.js";
 import { button, cross, el, fill, quiet, tick } from "./dom.js";
+import { say } from "./languages.js";
 import { CLASSES, OTHER_CLASS } from "./map_style.js";
 import { PictureMotion } from "./picture_motion.js";
 import { isWithin } from "./places.js";
@@ -11,6 +12,7 @@ import * as words from "./words.js";
 const { number, percent } = words;
 
 const BOXES_WITHIN_US = 250000; // boxes further from a picture than this were not seen in it
+const OFF = { ended: say("ended"), "no signal": say("no signal") };
 const KEPT_BOXES = 300;
 const CLOCKS_AGREE_S = 0.5;
 const OLD_BOXES_US = 4000000; // a slow detector's last boxes are shown for so long
@@ -27,7 +29,7 @@ const NEAR_DEG = 0.02; // of a site's ground: a drone there is shown with it
 export class VideoWall {
   constructor(screen) {
     Object.assign(this, { screen, panes: new Map(), closed: new Set() });
-    this.opener = button("Video", () => { this.closed.clear(); this.look(); }, { class: "video-open", icon: "video" });
+    this.opener = button(say("Video"), () => { this.closed.clear(); this.look(); }, { class: "video-open", icon: "video" });
     this.opener.hidden = true;
     screen.stage.append(this.opener);
     screen.hear(screen.station.events, "stream.state", ({ detail: { data: { stream, is_connected: isOn, flights } } }) => {
@@ -61,7 +63,7 @@ export class VideoWall {
 
   open(stream) {
     const pane = new DroneVideo(stream, { heard: (telemetry) => this.screen.live.heard(stream, telemetry), leave: () => this.leave(stream) });
-    pane.pane.querySelector("header").prepend(quiet("⤢", () => { this.screen.wall.classList.toggle("large"); this.fit(); }, { "aria-label": "Larger or smaller" }));
+    pane.pane.querySelector("header").prepend(quiet("⤢", () => { this.screen.wall.classList.toggle("large"); this.fit(); }, { "aria-label": say("Larger or smaller") }));
     this.add(stream, pane);
   }
 
@@ -96,8 +98,8 @@ export class VideoWall {
     this.take(name);
     const player = el("video", { src: view.video_url, controls: true, playsinline: true, ".muted": true });
     player.addEventListener("loadedmetadata", () => { player.currentTime = view.video_s; player.play().catch(() => {}); }, { once: true });
-    const pane = el("aside.video", { "aria-label": `Recording of ${name}` }, el("header", el("b", name), el("span.delay", "recorded"),
-      cross("Close the video", () => this.take(name))), el("div.picture", player));
+    const pane = el("aside.video", { "aria-label": say("Recording of {name}", { name }) }, el("header", el("b", name), el("span.delay", say("recorded")),
+      cross(say("Close the video"), () => this.take(name))), el("div.picture", player));
     this.add(name, { pane, close: () => pane.remove(), off() {} });
   }
 
@@ -114,16 +116,16 @@ export class DroneVideo {
     this.overlay = el("canvas.boxes", { width: 640, height: 360, "aria-hidden": true });
     this.player = el("video", { ".muted": true, playsinline: true, hidden: true });
     this.delay = el("span.delay");
-    this.pane = el("aside.video", { "aria-label": `Live video of ${stream}` },
-      el("header", el("b", stream), this.delay, leave ? cross("Close the video", leave) : null),
+    this.pane = el("aside.video", { "aria-label": say("Live video of {name}", { name: stream }) },
+      el("header", el("b", stream), this.delay, leave ? cross(say("Close the video"), leave) : null),
       el("div.picture", this.canvas, this.player, this.overlay),
-      el("footer", tick("Sync video to detections", choices.get("holdForBoxes"), (on) => choices.set("holdForBoxes", on), { title: "Show each picture when its boxes are known" }), this.seen = el("span.soft")));
+      el("footer", tick(say("Sync video to detections"), choices.get("holdForBoxes"), (on) => choices.set("holdForBoxes", on), { title: say("Show each picture when its boxes are known") }), this.seen = el("span.soft")));
     this.connect();
   }
 
   /** No pictures come, and why. */
   off(why) {
-    fill(this.delay, why);
+    fill(this.delay, OFF[why]);
     this.pane.dataset.off = why;
   }
 
@@ -149,7 +151,7 @@ export class DroneVideo {
   /** Where the drone is, by its own telemetry; whether its flight is over, or the connection to it dead. */
   async ask() {
     const quiet_s = (performance.now() - this.heard_at) / 1000;
-    if (quiet_s > QUIET_S && !this.pane.dataset.off) fill(this.delay, `no picture for ${number(quiet_s, 0)} s`);
+    if (quiet_s > QUIET_S && !this.pane.dataset.off) fill(this.delay, say("no picture for {seconds} s", { seconds: Math.round(quiet_s) }));
     try {
       const asked_us = Date.now() * 1000;
       const state = await get(this.url);
@@ -207,7 +209,7 @@ export class DroneVideo {
     const whole_s = this.epoch_us !== undefined && this.ahead_us !== undefined ? (Date.now() * 1000 - this.ahead_us - this.epoch_us - pts_us) / 1e6 : null;
     // a picture that left the drone after it came here: the two clocks disagree
     const behind_s = whole_s === null || whole_s < (here_s ?? 0) - CLOCKS_AGREE_S ? here_s : whole_s;
-    if (behind_s !== null) fill(this.delay, `${number(Math.max(0, behind_s), 2)} s delay`);
+    if (behind_s !== null) fill(this.delay, say("{seconds} s delay", { seconds: Math.max(0, behind_s) }));
   }
 
   drawBoxes(pts_us) {
@@ -230,7 +232,7 @@ export class DroneVideo {
       if (boxes.length && !oldest) oldest = { isOwn, carried, ago_s: (pts_us - look.pts_us) / 1e6 };
       count += boxes.length;
     }
-    fill(this.seen, count ? `${words.counted(count, "detection")}${oldest.isOwn ? "" : `, ${oldest.carried ? "dashed" : "faint"}: seen ${number(oldest.ago_s, 1)} s ago`}` : "");
+    fill(this.seen, count ? `${say("{n} detection|{n} detections", { n: count })}${oldest.isOwn ? "" : `, ${oldest.carried ? say("dashed: seen {seconds} s ago", { seconds: number(oldest.ago_s) }) : say("faint: seen {seconds} s ago", { seconds: number(oldest.ago_s) })}`}` : "");
   }
 
   /** The looks that show most of a picture, the older first: the nearest whole one, and where cars of a later one are known already, those. */
@@ -267,7 +269,7 @@ function drawBox(pen, { class: name, score, xywh_px: [x, y, w, h] }, size) {
   pen.strokeRect(x - 1, y - 1, w + 2, h + 2);
   pen.strokeStyle = colour;
   pen.strokeRect(x, y, w, h);
-  const text = `${name} ${percent(score)}`;
+  const text = `${words.className(name)} ${percent(score)}`;
   const top = Math.max(0, y - size * 1.25); // at the picture's upper edge in the box
   pen.fillStyle = colour;
   pen.fillRect(x, top, pen.measureText(text).width + size * 0.6, size * 1.25);

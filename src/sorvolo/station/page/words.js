@@ -1,6 +1,7 @@
 // Numbers, times and places in words, in the units that this browser's user chose.
 
 import { choices } from "./choices.js";
+import { locale, numeral, say } from "./languages.js";
 import { mgrs, utm } from "./places.js";
 
 const FOOT_M = 0.3048;
@@ -10,7 +11,7 @@ const ACRE_M2 = 4046.8564224;
 const isNumber = (value) => typeof value === "number" && Number.isFinite(value);
 
 function rounded(value, digits) {
-  return value.toLocaleString("en", { maximumFractionDigits: digits, minimumFractionDigits: 0, useGrouping: value >= 10000 });
+  return numeral(value, digits);
 }
 
 export function length(m) {
@@ -58,12 +59,12 @@ function said(iso, how, zone = " UTC", unknown = "–") {
   const at = new Date(iso);
   const isUtc = choices.get("clock") === "utc";
   if (!iso || Number.isNaN(at.getTime())) return unknown;
-  return at.toLocaleString("en-GB", { ...how, timeZone: isUtc ? "UTC" : undefined }) + (isUtc ? zone : "");
+  return at.toLocaleString(locale, { ...how, timeZone: isUtc ? "UTC" : undefined }) + (isUtc ? zone : "");
 }
 
 export const time = (iso) => said(iso, { dateStyle: "medium", timeStyle: "short" });
 export const clock = (iso) => said(iso, { timeStyle: "medium" });
-export const day = (iso) => said(iso, { dateStyle: "medium" }, "", "undated");
+export const day = (iso) => said(iso, { dateStyle: "medium" }, "", say("undated"));
 
 const metres = (value, digits) => String(Math.round(value)).padStart(digits, "0");
 
@@ -87,17 +88,30 @@ export function placeIn(kind, [lon, lat]) {
 }
 
 /** A place as the user wants it. */
-export const place = (at, { local = false } = {}) => (local ? "no place on Earth (a site without GPS)" : placeIn(choices.get("coordinates"), at));
+export const place = (at, { local = false } = {}) => (local ? say("no place on Earth (a site without GPS)") : placeIn(choices.get("coordinates"), at));
 
-/** "1 person", "4 people". */
-export function counted(count, one, many = `${one}s`) {
-  return `${number(count, 0)} ${count === 1 ? one : many}`;
-}
+/** The station's own words in the reader's language: verdicts, classes, why ground was seen badly. What it does not know stays. */
+export const VERDICTS = { confirmed: say("confirmed"), rejected: say("rejected"), disputed: say("disputed"), unsure: say("not sure"), none: say("no verdict") };
+const CLASS_NAMES = { person: say("person"), car: say("car"), "small object": say("small object") };
+const REASONS = {
+  "not seen": say("not seen"), "under trees": say("under trees"), "too coarse": say("too coarse"), "motion blur": say("motion blur"), dark: say("dark"), "rough ground": say("rough ground"),
+  "too few views": say("too few views"), "seen aslant": say("seen aslant"), "rarely found anywhere": say("rarely found anywhere"), "under a roof": say("under a roof"), "not measured": say("not measured"),
+};
+export const className = (name) => CLASS_NAMES[name] ?? name;
+export const reason = (name) => REASONS[name] ?? name;
 
-export function changeWords(properties) {
-  const { kind, class_before: before, class_after: after } = properties;
-  if (kind === "replaced" && before && after) return `${before} replaced by ${after}`;
-  const what = (kind === "disappeared" ? before : after) || "unknown object";
-  return { appeared: `${what} appeared`, disappeared: `${what} disappeared`, moving: `${what} moving`,
-    area: "ground changed", replaced: `${what} replaced` }[kind] || kind;
+/** Who did something; the station calls who needs no token "this machine". */
+export const nameOf = (who) => (who === "this machine" ? say("this machine") : who);
+
+export function changeWords({ kind, class_before: was, class_after: is }) {
+  const [before, after] = [was, is].map((each) => (each ? className(each) : ""));
+  if (kind === "replaced" && before && after) return say("{before} replaced by {after}", { before, after });
+  const what = (kind === "disappeared" ? before : after) || say("unknown object");
+  switch (kind) {
+    case "appeared": return say("{what} appeared", { what });
+    case "disappeared": return say("{what} disappeared", { what });
+    case "moving": return say("{what} moving", { what });
+    case "replaced": return say("{what} replaced", { what });
+    default: return kind === "area" ? say("ground changed") : kind;
+  }
 }
