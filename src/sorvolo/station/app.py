@@ -344,7 +344,7 @@ def _serve_page(app: FastAPI) -> None:
     def page() -> Response:
         return FileResponse(PAGE_FOLDER / "index.html", headers={"cache-control": "no-cache"})
 
-    files = GZipMiddleware(_PageFiles(directory=PAGE_FOLDER), compresslevel=5)
+    files = GZipMiddleware(_PageFiles(directory=PAGE_FOLDER), compresslevel=6)
     app.mount("/page", files, name="page")
 
 

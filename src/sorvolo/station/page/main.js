@@ -32,10 +32,14 @@ const siteScreen = () => import("./site.js");
 
 /** What index.html says before there is a script. */
 function speak() {
-  const texts = { ".skip": say("To the content"), "#settings-button .sr": say("Settings"), ".starting": say("Connecting to the station…") };
-  const labels = { ".brand": say("Sorvolo: all sites"), "#rooms": say("Rooms"), "#sentence": say("What is known"), "#messages": say("Messages") };
-  for (const [each, words] of Object.entries(texts)) document.querySelector(each).textContent = words;
-  for (const [each, words] of Object.entries(labels)) document.querySelector(each).setAttribute("aria-label", words);
+  const found = (name) => document.querySelector(name);
+  found(".skip").textContent = say("To the content");
+  found("#settings-button .sr").textContent = say("Settings");
+  found(".starting").textContent = say("Connecting to the station…");
+  found(".brand").ariaLabel = say("Sorvolo: all sites");
+  rooms.ariaLabel = say("Rooms");
+  known.ariaLabel = say("What is known");
+  found("#messages").ariaLabel = say("Messages");
 }
 
 async function begin() {
