@@ -11,19 +11,21 @@ videos or flights. Written to results/detector_accuracy.json, with a page for ea
 import argparse
 import json
 import tempfile
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 import detection_data
 from provenance import commit, machine, note_scoring
+from sorvolo.detection.detector import Detector
+from sorvolo.geometry.box_overlap import iou_matrix
 from sorvolo.lab.datasets import read_dataset
-from sorvolo.lab.evaluation.detection_scores import score_set
 from sorvolo.lab.evaluation.detector import (
     EvaluationSettings,
-    FoundSet,
     evaluate_detector,
     write_evaluation,
 )
@@ -37,9 +39,10 @@ from sorvolo.lab.simulation.pictures import (
 from sorvolo.lab.simulation.presets import preset
 from sorvolo.lab.simulation.truth import coco_boxes
 from sorvolo.store.exports.plain import plain_json
-from sorvolo.store.images import jpeg_from_image
+from sorvolo.store.images import image_from_jpeg, jpeg_from_image
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES
+from sorvolo.tracking.sizes import TOO_SHORT_CUT_PX, cut_edges, impossible_size
 
 RESULTS = Path(__file__).parent / "results" / "detector_accuracy.json"
 REAL = ("hituav", "tinyperson", "aerial_cars", "cats", "sdd", "semantic_drone")
@@ -49,6 +52,11 @@ FLIGHTS, FRAMES_OF_ONE, PICTURES = (
     8,
     120,
 )
+FLIGHTS_SEEN = {
+    "brighton_beach": ("", 0.034),
+    "caliterra": ("IMG_9400.jpg", 0.07),
+}  # first photo, half size
+SAME_IOU = 0.3
 TARGETS = {"people": 16, "cars": 8, "small_objects": 16}
 
 
@@ -59,6 +67,7 @@ def main() -> None:
     )
     parser.add_argument("model", help="a model's name or file")
     parser.add_argument("--data", type=Path, help="folder of the data sets")
+    parser.add_argument("--flights", type=Path, help="folder of the flights for false alarms")
     parser.add_argument(
         "--sets", nargs="+", default=[*REAL, "simulated", "pictures", "pictures_thermal"]
     )
@@ -80,6 +89,7 @@ def main() -> None:
     settings = EvaluationSettings(tiles, from_above=options.from_above)
     scoring = note_scoring(
         f"detector_accuracy, {' '.join(options.sets)}{' from above' * options.from_above}"
+        f"{' false alarms' * bool(options.flights)}"
     )
     runs = {}
     for name in options.sets:
@@ -91,12 +101,6 @@ def main() -> None:
             measured = evaluate_detector([[options.model]], [labelled], settings)
         runs[name] = figures(measured.sets[0]) | {
             "seconds_per_picture": measured.found.seconds_per_picture,
-            "people_by_centre": people_by_centre(
-                labelled, measured.found.sets[labelled.name], measured.found.classes
-            ),
-            "people_from_8_px": people_from(
-                8.0, labelled, measured.found.sets[labelled.name], measured.found.classes
-            ),
         }
         print(name, json.dumps(plain_json(runs[name]["classes"])), flush=True)
         if options.out is not None:
@@ -118,6 +122,9 @@ def main() -> None:
                     "seed": settings.seed,
                     "first_simulated_seed": FIRST_SEED,
                     "sets": runs,
+                    "flights": flight_alarms(options.model, options.flights)
+                    if options.flights
+                    else None,
                 }
             ),
             indent=1,
@@ -224,71 +231,55 @@ def figures(scores) -> dict[str, object]:
     }
 
 
-def people_by_centre(
-    labelled: LabelledSet, found: FoundSet, classes: tuple[str, ...]
-) -> dict[str, float | int] | None:
-    """How many people are found if a reported box's centre within the label is enough, for sets with loose boxes.
+def flight_alarms(model: str, flights: Path) -> dict[str, object]:
+    """What a model reports of photos of real flights that hardly show anyone, a photo, and how much of it is wrong.
 
-    At the model's own threshold; None where no person is labelled. `found` and `right` are shares of the labels and of
-    the reported boxes; boxes whose centre lies in a region to ignore are left out.
+    Photos are shown at half size and at the scale of their ground (FLIGHTS_SEEN, roughly known), as in a map, and boxes of
+    a size on the ground that their class cannot have do not count. The truth is what a person drew on crops.
     """
-    own, person = labelled.classes.index("person"), classes.index("person")
-    labels = hits = boxes = right = 0
-    for picture, seen in zip(labelled.pictures, found.detections):
-        people = picture.boxes_px[picture.labels == own]
-        is_reported = (seen.labels == person) & (seen.scores >= found.thresholds["person"])
-        centres = (seen.boxes_px[is_reported][:, :2] + seen.boxes_px[is_reported][:, 2:]) / 2
-        inside, ignored = _holds(people, centres), _holds(picture.ignored_px, centres)
-        labels, hits = labels + len(people), hits + int(inside.any(axis=1).sum())
-        counts = inside.any(axis=0) | ~ignored.any(axis=0)
-        boxes, right = boxes + int(counts.sum()), right + int(inside.any(axis=0).sum())
-    if not labels:
-        return None
-    return {
-        "labels": labels,
-        "reported": boxes,
-        "found": hits / labels,
-        "right": right / max(boxes, 1),
-    }
-
-
-def people_from(
-    least_px: float, labelled: LabelledSet, found: FoundSet, classes: tuple[str, ...]
-) -> dict[str, object] | None:
-    """AP50 and what is reported of people whose longer side has `least_px` or more, smaller ones being ignored.
-
-    None where no person is that large.
-    """
-    own = labelled.classes.index("person")
-    pictures = []
-    for each in labelled.pictures:
-        sides = np.max(each.boxes_px[:, 2:] - each.boxes_px[:, :2], axis=1, initial=0)
-        small = (each.labels == own) & (sides < least_px)
-        pictures.append(
-            replace(
-                each,
-                boxes_px=each.boxes_px[~small],
-                labels=each.labels[~small],
-                ignored_px=np.vstack([each.ignored_px, each.boxes_px[small]]),
-            )
-        )
-    scores = score_set(labelled.only(pictures), found.detections, classes, found.thresholds)
-    rows = [row for row in scores.classes if row.label == "person" and row.labels]
-    return (
-        {
-            "labels": rows[0].labels,
-            "AP50": asdict(scores.intervals["AP50 person"]),
-            "reported": asdict(rows[0].reported),
-        }
-        if rows
-        else None
+    detector = Detector.load(model, provider="cpu", threads=1)
+    here = Path(__file__).parent
+    people, cars = (
+        json.loads((here / name).read_text())
+        for name in ("brighton_people.json", "flight_cars.json")
     )
-
-
-def _holds(boxes_px: np.ndarray, points_px: np.ndarray) -> np.ndarray:
-    """(boxes, points) whether each box, left, top, right, bottom, holds each point."""
-    low, high = boxes_px[:, None, :2], boxes_px[:, None, 2:]
-    return ((points_px >= low) & (points_px <= high)).all(axis=2)
+    rows = {}
+    for flight, (first, m_per_px) in FLIGHTS_SEEN.items():
+        counts: Counter[str] = Counter()
+        paths = [path for path in sorted((flights / flight).iterdir()) if path.name >= first]
+        paths = [path for path in paths if path.suffix.lower() == ".jpg"]
+        for path in paths:
+            whole = image_from_jpeg(path.read_bytes(), path.name)
+            size_px = whole.shape[1] // 2, whole.shape[0] // 2
+            shown = np.asarray(cv2.resize(whole, size_px, interpolation=cv2.INTER_AREA), np.uint8)
+            seen = detector.detect(
+                shown, tiles="auto", m_per_px=m_per_px, classes=("person", "car"), from_above=True
+            )
+            sides_m = (seen.boxes_px[:, 2:] - seen.boxes_px[:, :2]).astype(float) * m_per_px
+            cut = cut_edges(seen.boxes_px, *size_px, TOO_SHORT_CUT_PX)
+            seen = seen.only(~impossible_size(seen.names, sides_m, cut))
+            drawn = (
+                people["people"].get(path.stem, []),
+                cars["cars"].get(f"{flight}/{path.stem}", []),
+            )
+            true = dict(zip(("person", "car"), drawn))
+            crowd = np.array(people["around"].get(path.stem, []), float).reshape(-1, 4)
+            for name, box in zip(seen.names, 2.0 * seen.boxes_px):
+                known = np.array(true[name], float).reshape(-1, 4)
+                is_right = (iou_matrix(box[None], known) >= SAME_IOU).any()
+                middle = np.tile((box[:2] + box[2:]) / 2, 2)
+                inside = ((crowd - middle) * [1, 1, -1, -1] <= 0).all(axis=1).any()
+                if is_right or name != "person" or not inside:
+                    counts[f"{name} {'right' if is_right else 'false'}"] += 1
+        rows[flight] = {"photos": len(paths)} | {
+            name: {
+                "right": counts[f"{name} right"],
+                "false": counts[f"{name} false"],
+                "false_a_photo": counts[f"{name} false"] / len(paths),
+            }
+            for name in ("person", "car")
+        }
+    return rows
 
 
 if __name__ == "__main__":
