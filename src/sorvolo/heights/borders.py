@@ -176,7 +176,7 @@ class _Ties:
 
     def kept(self) -> Rows:
         """The nodes that stay with `keep` when the ties between it and `give` are cut as cheaply as can be."""
-        begin, end, price = (np.concatenate(each) for each in zip(*self._parts))
+        begin, end, price = (np.concatenate(each) for each in zip(*self._parts, strict=True))
         capacity = np.rint(_CAPACITY * price).astype(np.int32)
         ties = csr_matrix(
             coo_matrix((capacity, (begin, end)), shape=(self.give + 1, self.give + 1))

@@ -65,7 +65,7 @@ def pieces(up_m: Floats32, step_m: float) -> Rows:
         with np.errstate(invalid="ignore"):
             close = np.abs(up_m[here] - up_m[there]) < step_m
         joined.append((number[here][close], number[there][close]))
-    rows, columns = (np.concatenate(each) for each in zip(*joined))
+    rows, columns = (np.concatenate(each) for each in zip(*joined, strict=True))
     ties = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), shape=(up_m.size, up_m.size))
     _, piece = connected_components(ties, directed=False)
     return np.asarray(piece.reshape(up_m.shape), np.int64)

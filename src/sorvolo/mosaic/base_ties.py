@@ -96,7 +96,7 @@ def tie_to_base(
         good = misfit <= max(_WILD * float(np.median(misfit)), 3 * m_per_px)
         if good.all():
             break
-        kept = [each for each, is_good in zip(kept, good) if is_good]
+        kept = [each for each, is_good in zip(kept, good, strict=True) if is_good]
     return len(frames) - len(kept), float(np.median(misfit))
 
 
@@ -109,7 +109,7 @@ def _ties(
     camera = frame.camera
     x, y = (
         np.linspace(0.12, 0.88, count) * size
-        for count, size in zip(_POINTS, (camera.width_px, camera.height_px))
+        for count, size in zip(_POINTS, (camera.width_px, camera.height_px), strict=True)
     )
     pixels = np.column_stack([each.ravel() for each in np.meshgrid(x, y)])
     ground_m = apply_homography(frame.site_from_image, pixels)

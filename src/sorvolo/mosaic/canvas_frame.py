@@ -138,7 +138,7 @@ def _part_shown(
     margin = 4 * step + 2  # of interpolation, and of the filter that halves
     deep = reach + margin  # what is reflected beyond a border lies so deep within it
     sides = []
-    for first, last, side in zip(low, high, (width, height)):
+    for first, last, side in zip(low, high, (width, height), strict=True):
         begin, end = int(np.floor(first)) - margin, int(np.ceil(last)) + margin + 1
         begin = begin if end < side else min(begin, side - deep)
         end = end if begin > 0 else max(end, deep)

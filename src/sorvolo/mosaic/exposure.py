@@ -127,7 +127,7 @@ def solve_exposure(pairs: Mapping[tuple[int, int], ColourPairs]) -> Exposure:
     exists = np.arange(counts.max()) < counts[:, None]
     radius2_a, radius2_b = np.zeros((2, *exists.shape), np.float32)
     difference = np.zeros((*exists.shape, 3), np.float32)
-    for row, (link, count) in enumerate(zip(links, counts.tolist())):
+    for row, (link, count) in enumerate(zip(links, counts.tolist(), strict=True)):
         chosen = pairs[link].thinned(POINTS_PER_LINK)
         radius2_a[row, :count], radius2_b[row, :count] = chosen.radius2_a, chosen.radius2_b
         colours_a, colours_b = (

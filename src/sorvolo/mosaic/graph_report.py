@@ -58,7 +58,10 @@ def ground_sigmas_m(
     found: list[float] = []
     for first in range(0, len(starts), _AT_ONCE):
         some = slice(first, first + _AT_ONCE)
-        blocks = [_ground_centre_jacobian(*each) for each in zip(rotations[some], heights_m[some])]
+        blocks = [
+            _ground_centre_jacobian(*each)
+            for each in zip(rotations[some], heights_m[some], strict=True)
+        ]
         unknowns = starts[some, None] + np.arange(6)
         right = np.zeros((factors.size, len(blocks), 2))
         for k, block in enumerate(blocks):

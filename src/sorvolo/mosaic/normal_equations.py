@@ -90,7 +90,7 @@ class BlockFactors:
     def solve(self, right: Floats) -> Floats:
         """(6 n,) or (6 n, k) right-hand sides to as many solutions."""
         found = right.reshape(len(right), -1).copy()
-        for front, (corner, below) in zip(self._fronts, self._pieces):
+        for front, (corner, below) in zip(self._fronts, self._pieces, strict=True):
             out = _unknowns(front.out)
             found[out] = dtrsm(1.0, corner.T, found[out], trans_a=1)
             if len(front.rest):

@@ -40,7 +40,7 @@ def lay_out(frames: Sequence[tuple[ImageRGB, Matrix3]], side_px: int) -> Overvie
     width, height = (max(16, int(np.ceil(each / unit))) for each in high - low)
     site_from_image = np.array([[unit, 0.0, low[0]], [0.0, -unit, high[1]], [0.0, 0.0, 1.0]])
     gray, known = np.zeros((height, width), np.uint8), np.zeros((height, width), bool)
-    for (image, site_from_frame), outline in zip(frames, outlines):
+    for (image, site_from_frame), outline in zip(frames, outlines, strict=True):
         if not np.isfinite(outline).all():
             continue
         matrix = np.linalg.inv(site_from_image) @ site_from_frame

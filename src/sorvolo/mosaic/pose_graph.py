@@ -348,14 +348,14 @@ class PoseGraph:
             leans = leans_m(rows.rotations[own], rows.prior_rotations[own], rows.centres_m[own, 2])
             is_stated = np.isfinite(rows.stated_sigma_rad[own]).all(axis=1)
             leans[~is_stated | np.isin(own, self._trust.contradicted)] = 0.0
-        return {self._names[at]: float(lean) for at, lean in zip(own, leans)}
+        return {self._names[at]: float(lean) for at, lean in zip(own, leans, strict=True)}
 
     def residuals_px(self) -> dict[int, float]:
         """Each keyframe's median transfer residual over its links, px at registration size; NaN without links."""
         result = dict.fromkeys(self._ids, float("nan"))
         gathered: dict[int, list[Floats]] = {}
         for old, new, miss in miss_px(self._state(), self._links, self._shared):
-            for row, ends in enumerate(zip(old.tolist(), new.tolist())):
+            for row, ends in enumerate(zip(old.tolist(), new.tolist(), strict=True)):
                 for at in ends:
                     gathered.setdefault(at, []).append(miss[row])
         for at, rows in gathered.items():
@@ -381,7 +381,9 @@ class PoseGraph:
             solution.equations.factorised(),
         )
         every = np.interp(index, sample, found) if len(sample) else np.zeros(0)
-        return sigmas | {self._names[at]: float(value) for at, value in zip(index, every)}
+        return sigmas | {
+            self._names[at]: float(value) for at, value in zip(index, every, strict=True)
+        }
 
     def common_sigma_m(self) -> float:
         """What all fixes of the flight err in common, per axis, m; 0 without fixes.

@@ -180,7 +180,7 @@ def _runs(cells: Mask) -> Iterator[tuple[int, int, int]]:
     edges = np.diff(np.pad(cells.astype(np.int8), ((0, 0), (1, 1))), axis=1)
     rows, starts = np.nonzero(edges == 1)
     ends = np.nonzero(edges == -1)[1]
-    yield from zip(rows.tolist(), starts.tolist(), ends.tolist())
+    yield from zip(rows.tolist(), starts.tolist(), ends.tolist(), strict=True)
 
 
 def _regions(cells: Mask, least: float) -> Iterator[Mask]:

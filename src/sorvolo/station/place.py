@@ -156,7 +156,7 @@ def place_routes(
             found = _near(site, Point(lon, lat), collections, reviews)
         else:
             seeing = [each.flight for each in known if each.frames]
-            those = dict(zip(seeing, collections.frames_of(site, seeing)))
+            those = dict(zip(seeing, collections.frames_of(site, seeing), strict=True))
             views = [view for each in those.values() for view in _views(each.frames, lon, lat)]
             kept = {(flight, number) for flight, each in those.items() for number in each.kept}
             found = {each.flight: _things(site, each, reviews) for each in known}

@@ -252,7 +252,7 @@ def mux_klv(
             pictures = source.streams.video[0]
             size_px = pictures.codec_context.width, pictures.codec_context.height
             packets = []
-            for sample, heading_deg in zip(samples, headings_deg):
+            for sample, heading_deg in zip(samples, headings_deg, strict=True):
                 seen = detections.get(sample.video_s, ())
                 packet = packet_of(sample, heading_deg, height_reference, seen, size_px)
                 packets.append((sample.video_s, packet))

@@ -277,7 +277,7 @@ def match_events(
 
 
 def _chosen(events: Sequence[_Event], which: Mask) -> tuple[_Event, ...]:
-    return tuple(each for each, is_chosen in zip(events, which) if is_chosen)
+    return tuple(each for each, is_chosen in zip(events, which, strict=True) if is_chosen)
 
 
 def _paired(wishes: Iterable[tuple[bool, float, int, int]]) -> dict[int, int]:

@@ -256,7 +256,7 @@ def solve_gains(
             right[i] += size * _GAIN_SIGMA**-2
     for lonely in np.flatnonzero(right == 0):
         normal[lonely, lonely] = right[lonely] = 1.0
-    return dict(zip(frames, np.atleast_1d(spsolve(normal.tocsc(), right)).tolist()))
+    return dict(zip(frames, np.atleast_1d(spsolve(normal.tocsc(), right)).tolist(), strict=True))
 
 
 def georeference(barycentres_mosaic_px: PointsPx, fixes_site_m: PointsM) -> Matrix3:
