@@ -1346,7 +1346,7 @@ def test_what_is_shown_can_be_taken_away(opened: Watched, served: Served, tmp_pa
     revision = served.ask(url, "PUT", wish)["revision"]
     page.reload()
     page.locator("[data-panel=share]").click()
-    page.locator(".files a", has_text="GeoPackage").wait_for()
+    page.locator(".files a[href$=gpkg]").wait_for()
     taken = {}
     for name in ("GeoJSON", "CSV", "KMZ", "CalTopo", "TAK package"):
         with page.expect_download() as download:
