@@ -26,28 +26,21 @@ _LEVEL = small_flight(
 )
 
 
+def _mapped(folder: Path, site: str, *asked: str) -> int:
+    """Map what was simulated into `made` of a folder, into a site beside it; the exit code."""
+    made = folder / "made"
+    command = ["map", str(made / "flight1" / "photos"), "--site", str(folder / site)]
+    return main([*command, "--model", "none", "--camera", str(made / "camera.xml"), *asked])
+
+
 @pytest.mark.parametrize("relief_m, asked", [(0.0, []), (12.0, ["--flat"]), (12.0, [])])
 def test_the_report_names_ground_that_is_not_level(
-    relief_m: float, asked: list[str], tmp_path: Path
+    relief_m: float, asked: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     simulate_into(
         tmp_path / "made", replace(_LEVEL, scene=replace(_LEVEL.scene, relief_m=relief_m))
     )
-    photos = tmp_path / "made" / "flight1" / "photos"
-    camera = str(tmp_path / "made" / "camera.xml")
-    exit_code = main(
-        [
-            "map",
-            str(photos),
-            "--site",
-            str(tmp_path / "site"),
-            "--model",
-            "none",
-            "--camera",
-            camera,
-            *asked,
-        ]
-    )
+    exit_code = _mapped(tmp_path, "site", *asked)
     report = json.loads(next((tmp_path / "site").glob("flights/*/report.json")).read_text())
     is_doubted = bool(asked)
     assert any("the ground is not level" in each for each in report["warnings"]) == is_doubted
@@ -58,6 +51,27 @@ def test_the_report_names_ground_that_is_not_level(
     assert any((tmp_path / "site").glob("flights/*/heights.tif")) == stands
     off_m = _off_m(tmp_path)
     assert (off_m < 2 * report["sigma_m"] * np.sqrt(2)).mean() > 0.9, (off_m, report["sigma_m"])
+    if stands:
+        _goes_on_after_a_full_disk(tmp_path, monkeypatch)
+
+
+def _goes_on_after_a_full_disk(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Heights of a large flight are minutes of work: what a run that was stopped found out is not sought again."""
+
+    def full(*_: object) -> None:
+        raise DiskFullError("disk full")
+
+    for modules, exit_code in (
+        ({planar_run: ["ground_tiles"]}, 1),
+        ({heights_run: ["find_tracks", "sweep_surface"]}, 0),
+    ):
+        with monkeypatch.context() as patch:
+            for module, names in modules.items():
+                for name in names:
+                    patch.setattr(module, name, full)
+            assert _mapped(folder, "stopped") == exit_code
+    for name in ("mosaic.tif", "flights/photos/heights.tif", "flights/photos/terrain.tif"):
+        assert (folder / "stopped" / name).read_bytes() == (folder / "site" / name).read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -105,37 +119,3 @@ def _off_m(folder: Path) -> np.ndarray:
 
 def _corners_m(feature: dict[str, Any], frame: LocalFrame) -> np.ndarray:
     return frame.ground_from_lonlat(np.array(feature["geometry"]["coordinates"][0])[:4])
-
-
-def test_a_map_that_a_full_disk_stopped_keeps_what_its_heights_took(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    simulate_into(tmp_path / "made", replace(_LEVEL, scene=replace(_LEVEL.scene, relief_m=12.0)))
-    folder = tmp_path / "made"
-
-    def mapped(site: Path) -> int:
-        command = [
-            "map",
-            str(folder / "flight1" / "photos"),
-            "--site",
-            str(site),
-            "--model",
-            "none",
-        ]
-        return main([*command, "--camera", str(folder / "camera.xml")])
-
-    def full(*_: object) -> None:
-        raise DiskFullError("disk full")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(planar_run, "ground_tiles", full)
-        assert mapped(tmp_path / "stopped") == 1
-    with monkeypatch.context() as patch:
-        for each in ("find_tracks", "sweep_surface"):  # minutes of work of a large flight
-            patch.setattr(heights_run, each, full)
-        assert mapped(tmp_path / "stopped") == 0
-    assert mapped(tmp_path / "whole") == 0
-    for name in ("mosaic.tif", "flights/photos/heights.tif", "flights/photos/terrain.tif"):
-        assert (tmp_path / "stopped" / name).read_bytes() == (
-            tmp_path / "whole" / name
-        ).read_bytes()
