@@ -2141,7 +2141,7 @@ UNSAID = """() => {
 }"""
 SAME_EVERYWHERE = re.compile(  # names, formats, keys, what the station calls a flight; addresses
     r"Sorvolo|GeoJSON|CSV|KMZ|CalTopo|UTM|UTC|MGRS|OpenAPI|API|Esc|field|http.*|Español|Français|Deutsch|Italiano"
-    r"|\d: .* \([ab]\)|run-\d+|[( ]*v\d\)|[\d., :]+, ada"
+    r"|\d: .* \([ab]\)|run-\d+|[( ]*v\d\)|[\d., :]+, ada|sorvolo review"
 )
 
 
