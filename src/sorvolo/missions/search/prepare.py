@@ -141,7 +141,10 @@ class PreparedSearch:
     @property
     def cut_outs_sha256(self) -> str:
         """A hash of the people to be planted; "" without any."""
-        kept = [(each.m_per_px, each.texture.tolist()) for each in self.cut_outs]
+        kept = [
+            (each.m_per_px, each.texture.shape, each.texture.tobytes().hex())
+            for each in self.cut_outs
+        ]
         return content_sha256(kept) if kept else ""
 
 
@@ -176,7 +179,8 @@ def prepare_search(
     """Read and check all that a search needs beside a site, before it takes any time.
 
     Beside an `is_live` flight's map the detector runs at low priority.
-    Raises InputError for a broken area or file of segments, for pictures out of which nobody can be cut, and for a model that is not there, SettingsError for classes
+    Raises InputError for a broken area or file of segments, for pictures out of which nobody can be cut, and for a model
+    that is not there, SettingsError for classes
     that cannot be measured, for a folder that is a file, and for a file of waypoints that cannot be one, StoreError for
     a folder that cannot be written.
     """
