@@ -28,7 +28,7 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.lab.evaluation.changes import evaluate_changes
 from sorvolo.lab.simulation.settings import OutputSettings
 from sorvolo.missions import worker
-from sorvolo.missions.compare.classes import ChangeClasses, object_at, seen_at
+from sorvolo.missions.compare.classes import ChangeClasses, class_at
 from sorvolo.missions.compare.flights import compare_flights
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.map_objects import ObjectFinder, open_detector
@@ -38,7 +38,7 @@ from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.mission import flight_outcome
 from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
 from sorvolo.store.site.archive import Archive
-from sorvolo.survey.findings import Change, ChangeKind, Patch
+from sorvolo.survey.findings import Change, ChangeKind, Patch, Verdict
 from sorvolo.survey.flight import CameraPrior, Frame, PosedFrame
 from sorvolo.survey.map_objects import MapObject
 from sorvolo.survey.objects import Detections, Sighting, no_detections
@@ -292,24 +292,24 @@ def test_the_object_in_a_change() -> None:
     """The nearest in place and size, not what passes by, and nothing from afar."""
     change = change_at(ChangeKind.APPEARED)
     person, car = standing("person", 10.1, 20.0, 0.6), standing("car", 10.3, 21.4, 4.4)
-    assert object_at(change, [car, person]) == "person"
-    assert object_at(change, [car]) == "car"
-    assert object_at(change, [standing("person", 10.0, 22.0, 0.6)]) == ""
-    assert object_at(change, [standing("person", 10.0, 20.0, 0.6, moving=True)]) == ""
+    assert class_at(change, [car, person]) == "person"
+    assert class_at(change, [car]) == "car"
+    assert class_at(change, [standing("person", 10.0, 22.0, 0.6)]) == ""
+    assert class_at(change, [standing("person", 10.0, 20.0, 0.6, moving=True)]) == ""
 
 
 def test_sightings_on_the_way_of_what_moves() -> None:
     """At 2 m/s east it was 6 m further west three seconds before; what stands there at other times is not it."""
     change = change_at(ChangeKind.MOVING, (2.0, 0.0))
-    assert seen_at(change, [sighting("person", 4.0, 20.0, 7.0)]) == "person"
-    assert seen_at(change, [sighting("person", 4.0, 26.0, 7.0)]) == ""
-    assert seen_at(change, [sighting("car", 10.0, 20.0, 3.0)]) == ""
+    assert class_at(change, [sighting("person", 4.0, 20.0, 7.0)]) == "person"
+    assert class_at(change, [sighting("person", 4.0, 26.0, 7.0)]) == ""
+    assert class_at(change, [sighting("car", 10.0, 20.0, 3.0)]) == ""
     still = change_at(ChangeKind.APPEARED)
     reported = [
         sighting("car", 10.0, 20.0, 3.0, 0.9),
         *(sighting("person", 10.2, 20.0, s, 0.5) for s in (4.0, 5.0)),
     ]
-    assert seen_at(still, reported) == "person"
+    assert class_at(still, reported) == "person"
 
 
 class Sees(Knowing):
@@ -335,6 +335,44 @@ class Sees(Knowing):
         x, y = image.shape[1] / 2, image.shape[0] / 2
         box_px = np.array([[x - 5, y - 5, x + 5, y + 5]])
         return Detections(box_px, np.array([self._score]), np.array([1]), self.classes)
+
+
+def test_whom_a_comparison_alone_saw_is_in_every_list(
+    simulated: Path, mapped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Seen in no frame by the detector, recognised in the changes' own pictures: headline, files, page and alarm."""
+
+    class NamesChanges(Sees):
+        def detect(self, image: ImageRGB, *, is_part: bool = False, **_: object) -> Detections:
+            found = super().detect(image)
+            person = replace(found, labels=np.array([0]))
+            return person if is_part else no_detections(self.classes)
+
+    site = shutil.copytree(mapped, tmp_path / "site")
+    flight, detector = simulated / "flight2/flight2.mp4", NamesChanges(simulated, 0.9)
+    for _ in compare_flights([flight], site, detector=detector, again=True):
+        pass
+    report = report_of(site, "flight2")
+    came = [
+        each["properties"]
+        for each in json.loads((site / "flights/flight2/changes.geojson").read_text())["features"]
+        if each["properties"]["class_after"] == "person"
+    ]
+    assert f"; {counted(len(came), 'person')}" in report["comparison"]["headline"]["text"]
+    assert {each["id"] for each in report["objects"]["list"]} == {each["id"] for each in came}
+    for folder in (site, site / "flights/flight2"):
+        features = json.loads((folder / "objects.geojson").read_text())["features"]
+        shown = [
+            each["properties"] for each in features if "flight2" in each["properties"]["flights"]
+        ]
+        assert {each["object"] for each in shown} == {each["id"] for each in came}
+        assert all((folder / each["crop"]).is_file() for each in shown)
+    announce_people(report, site, Console(force_terminal=True, width=200))
+    assert capsys.readouterr().out.count("PERSON FOUND") == len(came) > 0
+    with Archive.open(site, write=True) as archive:
+        archive.review(came[0]["id"], Verdict.REJECTED)
+    for folder in (site, site / "flights/flight2"):
+        assert came[0]["id"] not in (folder / "objects.geojson").read_text()
 
 
 def test_what_left_or_came_where_another_thing_stands_was_replaced(simulated: Path) -> None:

@@ -161,7 +161,7 @@ def test_a_working_copy_replaces_only_what_it_was_made_of(memory: Objects, site:
     second = BucketEnd(memory, base=first.written.id)
     copied(FolderEnd(site), second)
     with Archive.open(site, write=True) as archive:
-        archive.withdraw_review([change])
+        archive.review([change], None)
     with pytest.raises(StoreError, match="another writer"):
         copied(FolderEnd(site), BucketEnd(memory, base=first.written.id))
     with pytest.raises(StoreError, match="lacks: the review of change"):

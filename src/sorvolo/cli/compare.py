@@ -274,7 +274,7 @@ def show_results(
         for reason, count in list(comparison["reasons"].items())[:_MAX_REASONS]:
             console.print(f"  {counted(count, 'view')}: {escape(reason)}")
         show_notices_and_warnings(result, console)
-        announce_people(result, site, console)
+        announce_people(result, site, console, form)
         folder = site / "flights" / result["flight"]
         show_path("page", folder / "changes.html", console)
         show_path("list", features_path(folder, "changes"), console)

@@ -77,21 +77,24 @@ def announce_person(words: str, console: Console) -> None:
     console.print(f"[bold red]PERSON FOUND[/bold red]  {escape(words)}", soft_wrap=True)
 
 
-def announce_people(report: JsonView, folder: Path, console: Console) -> None:
-    """Print each person that a map or a comparison found, by its report; `folder` has the site."""
+def announce_people(
+    report: JsonView, folder: Path, console: Console, form: PlaceFormat = "latlon"
+) -> None:
+    """Print each person whom a map or a comparison was first to find, by its report; `folder` has the site."""
     from sorvolo.geometry.coordinates import Coordinates, place_text
     from sorvolo.store.site.archive import Archive
-    from sorvolo.survey.objects import PERSON
 
     if not report["objects"].get("model"):
         return
     with Archive.open(folder, write=False) as archive:
-        people, is_local = archive.findings(report["flight"], PERSON), archive.site().is_local
+        people, is_local = archive.new_people(report["flight"]), archive.site().is_local
     for each in people:
         x, y = each["geometry"]["coordinates"]
-        place = f"{x:+.1f}, {y:+.1f}" if is_local else place_text(y, x, Coordinates("latlon"))
-        score = each["properties"]["score"]
-        announce_person(f"{each['id']} at {place}, score {score:.2f}", console)
+        known, place = each["properties"], f"at {x:+.1f}, {y:+.1f}"
+        if not is_local:
+            accuracy = f" (accuracy {known['sigma_m']:.1f} m)" if known["sigma_m"] else ""
+            place = f"at {place_text(y, x, Coordinates(form))}{accuracy}"
+        announce_person(f"person {each['id']}  {place}, score {known['score']:.2f}", console)
 
 
 def show_path(name: str, path: Path, console: Console) -> None:

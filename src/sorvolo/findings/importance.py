@@ -37,8 +37,8 @@ def ordered(findings: Sequence[GroundFinding]) -> list[GroundFinding]:
 
 
 def between(register: Register, before: str, after: str) -> str:
-    """What came and left between two dates, by class: "1 person came, 1 left; 12 cars left". Counts only what one date
-    saw and the other looked for without finding it; what moves is another's on each date."""
+    """What came and left between two dates that were not compared, by class: "1 person came, 1 left; 12 cars left".
+    Counts only what one date saw and the other looked for without finding it."""
     known = {each.date for each in register.looks if len(each.frames.outlines_m)}
     changed = begun_and_ended(register, {before}, after)
     counts = Counter((found.label, kind) for kind, found in changed)

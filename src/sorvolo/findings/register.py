@@ -192,19 +192,17 @@ def reach_m(places_m: PointsM) -> tuple[Floats, Floats]:
 def begun_and_ended(
     register: Register, before: Collection[str], after: str
 ) -> Iterator[tuple[ChangeKind, GroundFinding]]:
-    """What came to be there, or left, between dates that both looked for it: appeared or disappeared."""
+    """What came to be there, or left, between dates that both looked for it: appeared or disappeared. What moves is
+    another's on each date."""
     searches = [each.frames for each in register.looks if each.date in before]
-    new = [each for each in register.findings if each.dates[0] == after]
+    standing = [each for each in register.findings if not each.newest.moving]
+    new = [each for each in standing if each.dates[0] == after]
     places_m = np.array([each.position_m for each in new]).reshape(-1, 2)
     was_looked_for = looked_at(places_m, [each.label for each in new], searches)
     for found, is_known in zip(new, was_looked_for):
-        # or its own comparison saw it come
-        if (is_known and _can_be_missed(found.sightings)) or any(
-            each.origin is KnownBy.CHANGED and not (each.gone or each.moving)
-            for each in found.sightings
-        ):
+        if is_known and _can_be_missed(found.sightings):
             yield ChangeKind.APPEARED, found
-    for found in register.findings:
+    for found in standing:
         if found.gone == after and any(each in found.dates for each in before):
             yield ChangeKind.DISAPPEARED, found
 

@@ -407,14 +407,13 @@ def _mapped(journal: Journal, site: Path, outcomes: "Sequence[FlightOutcome]") -
 def _add_people(
     journal: Journal, site: Path, flights: Sequence[str], *, below_crowns: bool = False
 ) -> None:
-    """Write each person that flights of the site found, in single pictures or by a look below crowns."""
+    """Write each person that flights of the site found first, in single pictures or by a look below crowns."""
     from sorvolo.findings.register import KnownBy
     from sorvolo.store.site.archive import Archive
-    from sorvolo.survey.objects import PERSON
 
     with Archive.open(site, write=False) as archive:
         is_local = archive.site().is_local
-        for feature in (each for flight in flights for each in archive.findings(flight, PERSON)):
+        for feature in (each for flight in flights for each in archive.new_people(flight)):
             if (KnownBy.UNDER_TREES in feature["properties"]["origins"]) == below_crowns:
                 journal.add(PERSON_FOUND, {"feature": feature, "is_local": is_local})
 

@@ -8,7 +8,6 @@ import numpy as np
 
 from sorvolo.findings.importance import ordered
 from sorvolo.findings.register import (
-    UNNAMED,
     GroundFinding,
     KnownBy,
     MissionSighting,
@@ -17,9 +16,8 @@ from sorvolo.findings.register import (
 )
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.paths import Json
-from sorvolo.store.exports.change_files import objects_geojson
-from sorvolo.store.exports.places import place_deg
-from sorvolo.store.exports.plain import feature, rounded, utc_text
+from sorvolo.store.exports.change_files import finding_feature, objects_geojson
+from sorvolo.store.exports.plain import rounded
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.change_records import StoredObject
 from sorvolo.survey.flight import Site
@@ -146,43 +144,38 @@ def _feature(
     ids = [each.id for each in reversed(found.sightings)]
     of_map = next((objects[each] for each in ids if each in objects), None)
     of_watch = next((watched[each] for each in ids if each in watched), None)
-    newest = found.newest
-    values: Json = {"score": newest.score, "length_m": rounded(newest.length_m, 2)}
+    shown = finding_feature(found, site)
     changed = [each.id for each in found.sightings if each.origin is KnownBy.CHANGED]
     crop = ("change", changed[-1]) if changed else None
+    own: Json = {}
     if of_map is not None:
-        (shown,) = objects_geojson([of_map], site, crops_from_site=True)["features"]
-        values, crop = shown["properties"], ("object", of_map.thing.id)
+        (object_,) = objects_geojson([of_map], site, crops_from_site=True)["features"]
+        own = object_["properties"]
+        if of_map.thing.id not in changed:
+            crop = ("object", of_map.thing.id)
     elif of_watch is not None:
-        values = {name: each for name, each in of_watch.items() if name != "lonlat"}
+        own = {name: each for name, each in of_watch.items() if name != "lonlat"}
         crop = ("finding", of_watch["id"]) if of_watch.get("crop") else None
-    longitude_deg, latitude_deg = place_deg(found.position_m, site)
-    first, last = utc_text(found.first_ns), utc_text(found.last_ns)
-    begun = found.sightings[0].id
-    values = values | {
-        "id": found.id,
-        "class": found.label or UNNAMED,
+    known, begun = shown["properties"], found.sightings[0].id
+    longitude_deg, latitude_deg = shown["geometry"]["coordinates"]
+    shown["properties"] = {
+        **own,
+        **known,
+        **{name: own.get(name, known[name]) for name in ("score", "length_m")},
         "class_scores": {name: rounded(share, 4) for name, share in found.class_scores.items()},
-        "latitude": rounded(latitude_deg, 8),
-        "longitude": rounded(longitude_deg, 8),
-        "sigma_m": rounded(found.sigma_m, 3),
-        "flight": newest.date,
-        "flights": list(found.dates),
-        "gone": found.gone or None,
+        "latitude": latitude_deg,
+        "longitude": longitude_deg,
+        "flight": found.newest.date,
         "missions": sorted({each.mission for each in found.sightings}),
-        "origins": sorted({each.origin.value for each in found.sightings}),
         "sightings": list(dict.fromkeys(ids)),
         "voted_as": begun if begun in watched else found.id,
         "known_as": [id_by(each) for each in found.sightings],
-        "first_seen": first,
-        "last_seen": last,
-        "datetime": first,
-        "end_datetime": last,
+        "datetime": known["first_seen"],
+        "end_datetime": known["last_seen"],
         "review_kind": "object",
         "crop_of": crop,
     }
-    geometry = {"type": "Point", "coordinates": [values["longitude"], values["latitude"]]}
-    return feature(geometry, values, id=found.id)
+    return shown
 
 
 def _ns(time: str) -> int:

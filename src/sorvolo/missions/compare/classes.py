@@ -2,7 +2,7 @@
 
 import math
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import cv2
@@ -10,6 +10,7 @@ import numpy as np
 
 from sorvolo.geometry.arrays import Floats, ImageRGB, ImageRGBA, PointsM
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
+from sorvolo.store.images import jpeg_from_image
 from sorvolo.survey.findings import Change, ChangeKind, Patch
 from sorvolo.survey.map_objects import MapObject
 from sorvolo.survey.objects import TYPICAL_SIZE_M, Detections, Sighting
@@ -23,6 +24,7 @@ _LEAST_SIDE_PX = 160  # of a picture that a detector is shown
 _LEAST_SHARE = 0.5  # of the box or of the change, whichever is smaller, that both have in common
 # of a class's usual longest side, upright too, and what edges add, m: a change that is longer is more than it
 _MOST_LENGTHS, _EDGES_M = 2.5, 1.0
+_LEAST_SIDES = 0.5  # times its shortest usual side: a change that is shorter is a part of it
 _LIKE_LENGTHS = 1.6  # times the other's, at most
 LENIENT = 0.4  # times each class's score: that something is there is known already
 
@@ -34,49 +36,51 @@ def stands_in(change: Change, thing: MapObject) -> bool:
     return change.length_m / _LIKE_LENGTHS <= thing.length_m <= change.length_m * _LIKE_LENGTHS
 
 
-def object_at(change: Change, objects: Sequence[MapObject]) -> str:
-    """The class of the object that stands in a change's outline, or nearly, and is nearest to it in place and size.
+def class_at(change: Change, things: Iterable[MapObject | Sighting]) -> str:
+    """The class of the objects or sightings in a change's outline, or nearly, by their summed scores: the nearer in
+    place and size, the more they count. "" where there is none.
 
-    "" where there is none; what moves is left out.
+    Objects that move are left out. A change that moves is looked for where it was at each sighting's time.
     """
-    best, best_cost = "", np.inf
-    centre_m = np.asarray(
-        (change.outline_m.min(axis=0) + change.outline_m.max(axis=0)) / 2, np.float64
-    )
-    for each in objects:
-        if each.moving:
-            continue
-        length_m = each.length_m if np.isfinite(each.length_m) else change.length_m
-        reach_m = _BESIDE_M + length_m / 4
-        outside_m = _outside_m(change.outline_m, each.position_m)
-        if outside_m > reach_m:
-            continue
-        ratio = float(np.log(max(length_m, 0.1) / max(change.length_m, 0.1)))
-        cost = float(np.hypot(*(each.position_m - centre_m))) / max(change.length_m, 0.5) + abs(
-            ratio
-        )
-        if cost < best_cost:
-            best, best_cost = each.label, cost
-    return best
-
-
-def seen_at(change: Change, sightings: Sequence[Sighting]) -> str:
-    """The class of a flight's sightings in a change's outline, by their summed scores; "" where there is none.
-
-    What moves is looked for where it was at each sighting's time.
-    """
-    sums: dict[str, float] = defaultdict(float)
-    speed_m_s = float(np.hypot(*change.velocity_m_s))
-    for each in sightings:
-        after_s = (each.time_ns - change.last_seen_ns) / 1e9
-        if change.kind is ChangeKind.MOVING and abs(after_s) > _LONGEST_S:
-            continue
-        meanwhile_m: Floats = change.velocity_m_s * after_s if speed_m_s else np.zeros(2)
-        reach_m = _BESIDE_M + each.size_m[0] / 4 + _TURN * float(np.hypot(*meanwhile_m))
-        outside_m = _outside_m(change.outline_m, each.position_m - meanwhile_m)
-        if outside_m <= reach_m:
-            sums[each.label] += each.score / (1.0 + max(outside_m, 0.0))
+    sums, moves = defaultdict[str, float](float), change.kind is ChangeKind.MOVING
+    for each in things:
+        meanwhile_m = np.zeros(2)
+        if isinstance(each, MapObject):
+            length_m = each.length_m if math.isfinite(each.length_m) else change.length_m
+            is_then = not each.moving and not moves
+        else:
+            length_m, after_s = float(each.size_m[0]), (each.time_ns - change.last_seen_ns) / 1e9
+            meanwhile_m = change.velocity_m_s * after_s
+            is_then = not moves or abs(after_s) <= _LONGEST_S
+        reach_m = _BESIDE_M + length_m / 4 + _TURN * math.hypot(*meanwhile_m)
+        outside_m = max(_outside_m(change.outline_m, each.position_m - meanwhile_m), 0.0)
+        if is_then and outside_m <= reach_m:
+            ratio = abs(math.log(max(length_m, 0.1) / max(change.length_m, 0.1)))
+            sums[each.label] += each.score / (1.0 + outside_m + ratio)
     return max(sums, key=sums.__getitem__, default="")
+
+
+def object_of(change: Change) -> MapObject:
+    """What came, or moves, as an object: its picture is the change's own."""
+    rgba = change.patch.after
+    return MapObject(
+        change.id,
+        change.class_after,
+        change.score,
+        (change.outline_m.min(axis=0) + change.outline_m.max(axis=0)) / 2,
+        change.sigma_m,
+        change.length_m,
+        math.nan,
+        change.views,
+        change.views,
+        change.first_seen_ns,
+        change.last_seen_ns,
+        change.kind is ChangeKind.MOVING,
+        change.velocity_m_s,
+        {change.class_after: 1.0},
+        "",
+        jpeg_from_image(np.where(rgba[..., 3:] > 0, rgba[..., :3], np.uint8(127))),
+    )
 
 
 def can_show(patch: Patch, rgba: ImageRGBA) -> bool:
@@ -129,9 +133,13 @@ def _outside_m(outline_m: PointsM, place_m: Floats) -> float:
 
 
 def _can_be(change: Change, name: str) -> bool:
-    """Whether a thing of a class may be all of a change: a person in front of a heap is not what the heap is."""
-    usual_m = TYPICAL_SIZE_M.get(name, (math.inf,))
-    return not change.length_m > _MOST_LENGTHS * max(usual_m) + _EDGES_M
+    """Whether a thing of a class may be all of a change, and the change all of it: a person in front of a heap is not
+    what the heap is, and a mirror's glint no car."""
+    usual_m = TYPICAL_SIZE_M.get(name)
+    if usual_m is None:
+        return True
+    least_m, most_m = _LEAST_SIDES * min(usual_m), _MOST_LENGTHS * max(usual_m) + _EDGES_M
+    return least_m <= change.length_m <= most_m
 
 
 _HAS_BEFORE = (ChangeKind.DISAPPEARED, ChangeKind.REPLACED)
@@ -157,8 +165,8 @@ class ChangeClasses:
     def final(
         self, change: Change, found: Sequence[MapObject], sightings: Sequence[Sighting]
     ) -> Change:
-        """The change with its classes, "" where nothing is recognised: of the objects that were there before or after;
-        else of the flight's sightings there; else of what the detector finds in the change's own pictures.
+        """The change with its classes, "" where nothing is recognised: of the objects and sightings that were there before
+        or after; else of what the detector finds in the change's own pictures.
 
         `found` and `sightings` are those of the flight, by its frames' final places. Where something left and a found
         object of about its size stands in its outline, or something came where a known one stood, it was replaced.
@@ -170,11 +178,10 @@ class ChangeClasses:
             change = replace(change, kind=ChangeKind.REPLACED)
         before = after = ""
         if change.kind in _HAS_BEFORE:
-            before = object_at(change, self._known) or self._in_picture(change, change.patch.before)
+            before = class_at(change, self._known) or self._in_picture(change, change.patch.before)
         if change.kind in _HAS_AFTER:
-            after = "" if change.kind is ChangeKind.MOVING else object_at(change, found)
-            after = (
-                after or seen_at(change, sightings) or self._in_picture(change, change.patch.after)
+            after = class_at(change, [*found, *sightings]) or self._in_picture(
+                change, change.patch.after
             )
         before, after = (name if _can_be(change, name) else "" for name in (before, after))
         return replace(change, class_before=before, class_after=after)

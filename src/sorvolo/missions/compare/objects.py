@@ -2,12 +2,19 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from sorvolo.capture.source import LiveSource
 from sorvolo.change.views import ViewMaker, ViewOutcome
-from sorvolo.findings.register import GroundFinding, SearchedDate, begun_and_ended
-from sorvolo.missions.compare.classes import ChangeClasses
+from sorvolo.findings.register import (
+    GroundFinding,
+    MissionSighting,
+    SearchedDate,
+    associate,
+    begun_and_ended,
+)
+from sorvolo.missions.compare.classes import ChangeClasses, class_at, object_of
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.looked_at import searched_document
 from sorvolo.missions.flight.map_objects import ObjectFinder, search_summary, why_not_searched
@@ -16,7 +23,8 @@ from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.mosaic.selection import StretchSelection
 from sorvolo.store.site.archive import Archive
-from sorvolo.store.site.register import sighting_of
+from sorvolo.store.site.change_records import stored_changes
+from sorvolo.store.site.register import sighting_of, sightings_of_change
 from sorvolo.survey.findings import Change, ChangeKind
 from sorvolo.survey.flight import Notice, PosedFrame, Site
 from sorvolo.survey.map_objects import ObjectSearch
@@ -88,26 +96,46 @@ class ComparisonObjects:
         return self._finder.conclude(placed, self._name, has_metres=True)
 
     def on_one_date(self, search: ObjectSearch | None) -> list[tuple[ChangeKind, GroundFinding]]:
-        """The objects that this flight or those before it found on ground where the other found none; what moves, or
-        has no known size, is left out."""
+        """The objects that this flight or those before it found on ground where the other found none; what has no
+        known size is left out."""
         if search is None:
             return []
-        seen = [sighting_of(each, self._name, math.inf) for each in search.objects]
         look = SearchedDate(self._name, math.inf, search.frames)
-        register = self._archive.register(seen, [look], self._before)
+        register = self._archive.register(self._sightings(search), [look], self._before)
         return [
             (kind, each)
             for kind, each in begun_and_ended(register, self._before, self._name)
-            if not each.newest.moving and math.isfinite(each.newest.length_m)
+            if math.isfinite(each.newest.length_m)
         ]
 
-    def classified(self, changes: Sequence[Change], search: ObjectSearch | None) -> list[Change]:
-        """The changes with their classes, after `conclude`."""
+    def classified(
+        self, changes: Sequence[Change], search: ObjectSearch | None
+    ) -> tuple[list[Change], ObjectSearch | None]:
+        """The changes with their classes, after `conclude`; the search with what they alone saw of its classes."""
         if self._finder is None or self._classes is None or search is None:
-            return list(changes)
-        return [
+            return list(changes), search
+        named = [
             self._classes.final(each, search.objects, self._finder.sightings) for each in changes
         ]
+        seen, detected = self._sightings(search), {each.id for each in search.objects}
+        for change in stored_changes(self._name, named):
+            seen += sightings_of_change(change, {self._name: math.inf}, {})
+        alone = {
+            each.id
+            for found in associate(seen).findings
+            for each in found.sightings
+            if each.label in search.classes
+            and detected.isdisjoint(one.id for one in found.sightings)
+        }
+        others = (
+            object_of(each)
+            for each in named
+            if each.id in alone and not class_at(each, search.objects)
+        )
+        return named, replace(search, objects=(*search.objects, *others))
+
+    def _sightings(self, search: ObjectSearch) -> list[MissionSighting]:
+        return [sighting_of(each, self._name, math.inf) for each in search.objects]
 
     def summary(
         self, search: ObjectSearch | None, placed: Sequence[PlacedFrame], site: Site

@@ -150,14 +150,12 @@ def comparison_summary(
 
 def flight_summary(counts: ViewCounts, fit: FlightFit | None) -> dict[str, Any]:
     """The report's part on photos that were placed with all others of their flight; `fit` is where that lies on the
-    map, None where it was not looked for, or not found."""
-    if fit is None:
-        return {"views": 0, "left_out": 0, "ratio": None, "residual_m": None}
+    map, None where it was not looked for, or not found: then none was."""
     return {
         "views": counts.with_flight,
         "left_out": counts.left_out,
-        "ratio": fit.ratio,
-        "residual_m": fit.residual_m,
+        "ratio": None if fit is None else fit.ratio,
+        "residual_m": None if fit is None else fit.residual_m,
     }
 
 

@@ -44,13 +44,12 @@ from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.heights.measure import flight_with_heights, read_field
 from sorvolo.store.exports.change_files import write_pictures
 from sorvolo.store.exports.ground_files import COVERAGE, coverage_geojson
-from sorvolo.store.exports.map_pictures import Picture, picture
+from sorvolo.store.exports.map_pictures import picture
 from sorvolo.store.exports.plain import features_name, geojson_bytes
 from sorvolo.store.images import ImageCache
 from sorvolo.store.pages.flight import report_page
 from sorvolo.store.site.archive import Archive, FlightWriter
 from sorvolo.store.site.files import HeightFile
-from sorvolo.survey.coverage import CoveredGround
 from sorvolo.survey.findings import Change, ComparedView, Verdict, ViewStatus
 from sorvolo.survey.flight import LostFrame, Notice, PosedFrame
 from sorvolo.survey.mosaic import FrameView, PlacedFrame, Status
@@ -258,6 +257,7 @@ class CompareRun:
                 f"no frame of {self._setup.source.name} could be compared: {self._counts.commonest_reason}; is it "
                 "another place, another season, or night? `sorvolo inspect` shows what the flight holds"
             )
+        site, name = self._archive.site(), self._setup.source.name
         concluding = self._comparing.submit(
             self._changes.conclude
         )  # which takes about as long as the map's extension
@@ -275,27 +275,58 @@ class CompareRun:
             if self._settings.updates_map:
                 paint_changes(changes, self._writer.tiles, self._archive.site_grid())
         with self._log.stage(Stage.DETECT):
-            changes = self._objects.classified(changes, search)
-            changes, of_heights = with_height_changes(
-                self._archive, self._setup.source.name, changes
-            )
+            changes, search = self._objects.classified(changes, search)
+            changes, of_heights = with_height_changes(self._archive, name, changes)
         with self._log.stage(Stage.REPORT):
             shown = picture(self._writer.tiles, 800)  # a day without change should cost little
         ground = self._counts.ground.parts([each.outline_m for each in changes])
-        report = self._report(
+        report = build_report(
+            self._setup,
+            self._settings.mapping,
+            self._log,
+            FlightResult(placed, self._setup.source.camera.camera, makes_map=False),
+            site,
+            shown,
+            [
+                *notices,
+                *of_heights,
+                *self._archive.notices,
+                *self._objects.notices,
+                *flight_notices(self._counts, self._flight_fit),
+                *views_notices(placed, self._settings.votes),
+            ],
+            time.monotonic() - started_s,
+        )
+        report["objects"], searched = self._objects.summary(search, placed, site)
+        comparison = comparison_summary(
             changes,
             suppressed,
-            shown_as_well,
-            placed,
-            shown,
-            [*notices, *of_heights],
-            started_s,
+            self._counts,
+            self._views,
+            self._settings,
+            self._base_version,
             ground,
+            is_local=site.is_local,
         )
-        site = self._archive.site()
-        report["objects"], searched = self._objects.summary(search, placed, site)
-        comparison = report["comparison"]
-        comparison["headline"] = with_objects(report, comparison["headline"])
+        comparison |= {
+            "headline": with_objects(report, comparison["headline"]),
+            "with_flight": flight_summary(self._counts, self._flight_fit),
+            "candidates": self._changes.candidates(),
+            "heights_of": flight_with_heights(self._archive, but=name),
+            "extension": {
+                "frames": len(self._extension.frames),
+                "shown_as_well": shown_as_well,
+                "area_m2": self._extension.grown_m2(self._base_version),
+            },
+        }
+        report |= {
+            "method": f"compare-{self._settings.method_name}",
+            "settings": asdict(self._settings),
+            "comparison": comparison,
+        }
+        report["warnings"] += comparison_warnings(
+            self._counts, self._views.brightness, self._views.times_coarser
+        )
         page = report_page(report, shown.rgba, crops_of(search), site)
         documents = searched | {
             features_name(COVERAGE, is_local=site.is_local): geojson_bytes(
@@ -350,63 +381,6 @@ class CompareRun:
         if self._steps is not None and method is not None:
             steps = method.steps(view.reference, view.image, view.valid)
             write_pictures(self._steps / view.name, steps)
-
-    def _report(
-        self,
-        changes: Sequence[Change],
-        suppressed: int,
-        shown_as_well: int,
-        placed: Sequence[PlacedFrame],
-        shown: Picture,
-        notices: Sequence[Notice],
-        started_s: float,
-        ground: Sequence[CoveredGround],
-    ) -> dict[str, Any]:
-        result = FlightResult(placed, self._setup.source.camera.camera, makes_map=False)
-        notices = [
-            *notices,
-            *self._archive.notices,
-            *self._objects.notices,
-            *flight_notices(self._counts, self._flight_fit),
-            *views_notices(placed, self._settings.votes),
-        ]
-        report = build_report(
-            self._setup,
-            self._settings.mapping,
-            self._log,
-            result,
-            self._archive.site(),
-            shown,
-            notices,
-            time.monotonic() - started_s,
-        )
-        warnings = comparison_warnings(
-            self._counts, self._views.brightness, self._views.times_coarser
-        )
-        comparison = comparison_summary(
-            changes,
-            suppressed,
-            self._counts,
-            self._views,
-            self._settings,
-            self._base_version,
-            ground,
-            is_local=self._archive.site().is_local,
-        )
-        comparison["with_flight"] = flight_summary(self._counts, self._flight_fit)
-        comparison["candidates"] = self._changes.candidates()
-        comparison["heights_of"] = flight_with_heights(self._archive, but=self._setup.source.name)
-        comparison["extension"] = {
-            "frames": len(self._extension.frames),
-            "shown_as_well": shown_as_well,
-            "area_m2": self._extension.grown_m2(self._base_version),
-        }
-        return report | {
-            "method": f"compare-{self._settings.method_name}",
-            "settings": asdict(self._settings),
-            "comparison": comparison,
-            "warnings": [*report["warnings"], *warnings],
-        }
 
 
 def view_maker(

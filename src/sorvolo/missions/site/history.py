@@ -7,7 +7,7 @@ from datetime import datetime, time, timedelta
 from pathlib import Path
 
 from sorvolo.errors import InputError, SettingsError, StoreError
-from sorvolo.findings.importance import between
+from sorvolo.findings.importance import between, in_short
 from sorvolo.missions.heights.measure import coloured_heights
 from sorvolo.store.exports.map_pictures import write_kmz, write_preview
 from sorvolo.store.exports.plain import moment_of
@@ -73,12 +73,21 @@ def site_history(site: Path) -> list[HistoryEntry]:
 
 
 def came_and_left(site: Path) -> str:
-    """What came and left between the newest two flights of the site, in a sentence; "" for one flight."""
+    """What came and left between the newest two flights of the site, in a sentence: the comparison's, where the later
+    one was compared. "" for one flight."""
     with Archive.open(site, write=False) as archive:
-        flights = list(dict.fromkeys(each.flight_id for each in archive.versions()))[-2:]
+        versions = archive.versions()
+        flights = list(dict.fromkeys(each.flight_id for each in versions))[-2:]
         if len(flights) < 2:
             return ""
-        return f"from {flights[0]} to {flights[1]}: {between(archive.register(), *flights)}"
+        made = next(each.id for each in reversed(versions) if each.flight_id == flights[1])
+        if made in archive.comparisons():
+            changes = archive.changes(flights[1])
+            kept = [each for each in changes if each.verdict is not Verdict.REJECTED]
+            words = in_short(kept, is_local=archive.site().is_local)
+        else:
+            words = between(archive.register(), *flights)
+        return f"from {flights[0]} to {flights[1]}: {words}"
 
 
 def _entry(

@@ -49,7 +49,7 @@ def withdraw_reviews(site: Path, ids: Sequence[str]) -> None:
     Raises InputError for an unknown id, StoreError when the folder is no site or another process is writing.
     """
     with Archive.open(site, write=True, makes=False) as archive:
-        archive.withdraw_review(ids)
+        archive.review(ids, None)
 
 
 def _require_flight(archive: Archive, flight: str | None) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from sorvolo.findings.register import UNNAMED, GroundFinding
 from sorvolo.geometry.arrays import Boxes, Floats, ImageGray, ImageRGB, Mask
 from sorvolo.geometry.polygons import signed_area
 from sorvolo.store.atomic import atomic_write_bytes, make_folder
@@ -212,6 +213,25 @@ def crop_name(object_id: str) -> str:
 def object_crops(objects: Iterable[MapObject]) -> dict[str, bytes]:
     """The crops, JPEG, by file name."""
     return {crop_name(each.id): each.crop_jpeg for each in objects if each.crop_jpeg}
+
+
+def finding_feature(found: GroundFinding, site: Site) -> dict[str, Any]:
+    """A finding as a point of GeoJSON; of a local site in its own pixels."""
+    place = found.position_m.tolist() if site.is_local else place_deg(found.position_m, site)
+    properties = {
+        "id": found.id,
+        "class": found.label or UNNAMED,
+        "score": rounded(found.newest.score, 4),
+        "sigma_m": rounded(found.sigma_m, 3),
+        "length_m": rounded(found.newest.length_m, 2),
+        "origins": sorted({each.origin.value for each in found.sightings}),
+        "flights": list(found.dates),
+        "gone": found.gone or None,
+        "first_seen": utc_text(found.first_ns),
+        "last_seen": utc_text(found.last_ns),
+    }
+    geometry = {"type": "Point", "coordinates": [round(each, 8) for each in place]}
+    return feature(geometry, properties, id=found.id)
 
 
 def _identity(stored: StoredObject) -> str:

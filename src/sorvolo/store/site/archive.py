@@ -12,23 +12,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
-from sqlalchemy import Connection
-
 from sorvolo.errors import InputError, NotFoundError, SettingsError, SorvoloWarning, StoreError
 from sorvolo.findings.importance import ordered
-from sorvolo.findings.register import UNNAMED, MissionSighting, Register, SearchedDate
+from sorvolo.findings.register import MissionSighting, Register, SearchedDate
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.paths import AnyPath
-from sorvolo.store.exports.change_files import object_crops
-from sorvolo.store.exports.places import place_deg
+from sorvolo.store.atomic import atomic_write_bytes, make_folder
+from sorvolo.store.exports.change_files import CROPS, finding_feature, object_crops
 from sorvolo.store.exports.plain import (
     FeatureList,
-    feature,
     features_name,
     plain_json,
-    rounded,
-    utc_text,
 )
 from sorvolo.store.images import image_from_jpeg
 from sorvolo.store.nofollow import MOST_BYTES, open_below, read_below, sha256_of
@@ -51,7 +46,6 @@ from sorvolo.store.site.files import (
     DamagedError,
     HeightFile,
     begin_writing,
-    checked_document,
     checked_image_path,
     checked_name,
     find_origin,
@@ -73,11 +67,11 @@ from sorvolo.store.site.upkeep import (
     remove_unused,
     repair,
     stopped_flights,
-    write_object_files,
 )
 from sorvolo.survey.findings import Verdict
 from sorvolo.survey.flight import Notice, Site
 from sorvolo.survey.map_objects import MapObject
+from sorvolo.survey.objects import PERSON
 
 __all__ = ["Archive", "FlightWriter"]
 
@@ -237,8 +231,11 @@ class Archive:
         return self.catalogue_rows(change_records.load_reviews)
 
     def objects(self, flight_id: str | None = None) -> list[StoredObject]:
-        """The objects that complete runs found, by flight rank and number; of one flight."""
-        return self.catalogue_rows(change_records.load_objects, self._known(flight_id))
+        """The objects that complete runs found, by flight rank and number; of one flight. What a comparison alone saw
+        is none once a person rejected that change."""
+        rejected = {each.id for each in self.changes(flight_id) if each.verdict is Verdict.REJECTED}
+        found = self.catalogue_rows(change_records.load_objects, flight_id)
+        return [each for each in found if each.thing.id not in rejected]
 
     def keep_under_trees(self, flight_id: str, found: Sequence[MapObject]) -> None:
         """Keep what a look below the crowns of a mapped flight found, in place of an earlier look's; the lists follow."""
@@ -246,7 +243,13 @@ class Archive:
         with self.catalogue.changing() as connection:
             change_records.put_under_trees(connection, flight_id, found)
             register_anew(connection)
-        write_object_files(self, flight_id, object_crops(found))
+            records.owe_documents(connection, {flight_id})
+        crops = f"flights/{flight_id}/{CROPS}"
+        make_folder(self.folder / crops)
+        with self.replacing(crops):
+            for name, data in object_crops(found).items():
+                atomic_write_bytes(self.folder / crops / name, data)
+        repair(self)
 
     def searches(self) -> list[SearchedDate]:
         """Which ground each complete run searched for objects, by flight rank."""
@@ -277,28 +280,12 @@ class Archive:
                 for seen in each.sightings
             )
         ]
-        features = []
-        for each in found:
-            place = each.position_m.tolist() if site.is_local else place_deg(each.position_m, site)
-            features.append(
-                feature(
-                    {"type": "Point", "coordinates": [round(x, 8) for x in place]},
-                    {
-                        "id": each.id,
-                        "class": each.label or UNNAMED,
-                        "score": rounded(each.newest.score, 4),
-                        "sigma_m": rounded(each.sigma_m, 3),
-                        "length_m": rounded(each.newest.length_m, 2),
-                        "origins": sorted({seen.origin.value for seen in each.sightings}),
-                        "flights": list(each.dates),
-                        "gone": each.gone or None,
-                        "first_seen": utc_text(each.first_ns),
-                        "last_seen": utc_text(each.last_ns),
-                    },
-                    id=each.id,
-                )
-            )
-        return FeatureList(features, is_local=site.is_local)
+        return FeatureList((finding_feature(each, site) for each in found), is_local=site.is_local)
+
+    def new_people(self, flight_id: str) -> list[Any]:
+        """The findings that are people whom no flight before this one had found."""
+        people = self.findings(flight_id, PERSON)
+        return [each for each in people if each["properties"]["flights"][0] == flight_id]
 
     def _known(self, flight_id: str | None) -> str | None:
         """The flight, None for all. Raises NotFoundError for one that the site has not."""
@@ -317,34 +304,26 @@ class Archive:
         """What stands on the site by the newest look at each piece of ground; as far as these flights know."""
         return present_objects(self.register(flights=flights), self.objects())
 
-    def review(self, change_ids: str | Iterable[str], verdict: Verdict, note: str = "") -> None:
-        """Record a person's verdict on one change, or on several; the flights' change files follow.
+    def review(
+        self, change_ids: str | Iterable[str], verdict: Verdict | None, note: str = ""
+    ) -> None:
+        """Record a person's verdict on one change, or on several; None withdraws it. The flights' files follow.
 
         A later review replaces an earlier one. Raises InputError, and stores nothing, when an id is unknown.
         """
         wanted = {change_ids} if isinstance(change_ids, str) else set(change_ids)
-        self._change_reviews(
-            wanted,
-            lambda connection, found: change_records.put_reviews(connection, found, verdict, note),
-        )
-
-    def withdraw_review(self, change_ids: Iterable[str]) -> None:
-        """Withdraw the reviews of changes. Raises InputError, and changes nothing, when an id is unknown."""
-        self._change_reviews(set(change_ids), change_records.drop_reviews)
-
-    def _change_reviews(
-        self, wanted: Collection[str], change: Callable[[Connection, Sequence[StoredChange]], None]
-    ) -> None:
         self._require_writable()
         with self.catalogue.changing() as connection:
             found = [each for each in change_records.load_changes(connection) if each.id in wanted]
-            unknown = sorted(set(wanted) - {each.id for each in found})
+            unknown = sorted(wanted - {each.id for each in found})
             if unknown:
                 raise InputError(
                     f"{self.folder} has no change {', '.join(unknown)}; `sorvolo review {self.folder}` lists them"
                 )
-            change(connection, found)
-            register_anew(connection)
+            change_records.put_reviews(connection, found, verdict, note)
+            rejected = Verdict.REJECTED
+            if any((each.verdict is rejected) != (verdict is rejected) for each in found):
+                register_anew(connection)
             records.owe_documents(connection, {each.flight_id for each in found})
         repair(self)
 
@@ -517,10 +496,6 @@ class Archive:
             if path.is_dir() and not path.is_symlink()
         ]
 
-    def document_path(self, flight_id: str, name: str) -> Path:
-        """A text file of a flight; raises StoreError for a name that could lie elsewhere."""
-        return self.flight_folder(flight_id) / checked_document(name)
-
     def height_path(self, flight_id: str, file: HeightFile) -> Path:
         """Where a file of a flight's heights lies, whether it is there or not."""
         return self.flight_folder(flight_id) / file
@@ -532,12 +507,6 @@ class Archive:
     def staged_folder(self, flight_id: str, run_id: int) -> Path:
         """Where a run collects pictures until it is committed."""
         return self.flight_folder(flight_id) / STAGED / str(int(run_id))
-
-    def image_name(self, flight_id: str, run_id: int, index: int) -> str:
-        """The path of a keyframe's image in the site folder, as the catalogue holds it."""
-        return (
-            f"flights/{checked_name(flight_id, 'flight')}/keyframes/{int(run_id)}/{index:06d}.jpg"
-        )
 
     def stored_image(self, flight_id: str, image_path: str, sha256: str, step: int = 1) -> ImageRGB:
         """A stored keyframe, at a `step`-th (1, 2, 4, 8) of its size.

@@ -157,13 +157,15 @@ def load_reviews(connection: Connection) -> list[StoredReview]:
 
 
 def put_reviews(
-    connection: Connection, changes: Sequence[StoredChange], verdict: Verdict, note: str
+    connection: Connection, changes: Sequence[StoredChange], verdict: Verdict | None, note: str
 ) -> None:
-    """Give each of these changes the same verdict; an earlier one is replaced."""
+    """Give each of these changes the same verdict, None for none; an earlier one is replaced."""
     now = utc_now()
-    drop_reviews(connection, changes)
-    rows = [
-        {
+    for each in changes:
+        connection.execute(delete(schema.reviews).where(schema.reviews.c.change_id == each.id))
+        if verdict is None:
+            continue
+        row = {
             "change_id": each.id,
             "flight_id": each.flight_id,
             "verdict": verdict.value,
@@ -172,15 +174,7 @@ def put_reviews(
             "kind": each.kind.value,
             "outline_m": each.outline_m.tolist(),
         }
-        for each in changes
-    ]
-    schema.add_rows(connection, schema.reviews, rows)
-
-
-def drop_reviews(connection: Connection, changes: Sequence[StoredChange]) -> None:
-    """Forget the verdicts on these changes."""
-    for each in changes:
-        connection.execute(delete(schema.reviews).where(schema.reviews.c.change_id == each.id))
+        schema.add_rows(connection, schema.reviews, [row])
 
 
 def compared_versions(connection: Connection) -> dict[int, Mapping[str, int]]:

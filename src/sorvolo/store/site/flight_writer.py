@@ -352,7 +352,7 @@ class FlightWriter:
         sync_file(self._files.folder)
 
     def _image_path(self, index: int) -> str:
-        return self._files.image_name(self._flight_id, self._run_id, index)
+        return f"flights/{self._flight_id}/keyframes/{self._run_id}/{index:06d}.jpg"
 
     def _keyframes(
         self, placed: Sequence[PlacedFrame], image_paths: Mapping[int, str]

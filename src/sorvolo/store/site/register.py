@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -109,22 +109,17 @@ def flown_flights(connection: Connection) -> list[tuple[str, int, int, int]]:
 
 def present_objects(register: Register, objects: Sequence[StoredObject]) -> list[StoredObject]:
     """What stands on the site by the newest look at each place, as the newest flight that detected it found it."""
-    of_finding = {each.id: found for found in register.present for each in found.sightings}
-    newest = {
-        of_finding[each.thing.id].id: each.thing.id
-        for each in objects
-        if each.thing.id in of_finding
-    }
-    shown = set(newest.values())
-    return [
-        StoredObject(each.flight_id, each.rank, each.thing, of_finding[each.thing.id])
-        for each in objects
-        if each.thing.id in shown
-    ]
+    of_finding = {seen.id: each for each in register.present for seen in each.sightings}
+    newest: dict[str, StoredObject] = {}
+    for each in objects:
+        if (found := of_finding.get(each.thing.id)) is not None:
+            newest.pop(found.id, None)  # in the order of the objects
+            newest[found.id] = replace(each, finding=found)
+    return list(newest.values())
 
 
 def sighting_of(thing: MapObject, flight_id: str, rank: float) -> MissionSighting:
-    """An object that a flight's map or comparison found."""
+    """An object that a detector found in a flight's frames."""
     origin = KnownBy.UNDER_TREES if is_under_trees(thing.id) else KnownBy.DETECTED
     return MissionSighting(
         flight_id,
@@ -145,7 +140,7 @@ def sighting_of(thing: MapObject, flight_id: str, rank: float) -> MissionSightin
     )
 
 
-def _of_change(
+def sightings_of_change(
     change: StoredChange, ranks: Mapping[str, float], spans: Mapping[str, list[int]]
 ) -> Iterator[MissionSighting]:
     """What a change shows: what stands after it, or moves, and what left with it; its class where it has one.
@@ -183,19 +178,21 @@ def _seen(
     connection: Connection, flights: Collection[str] | None = None
 ) -> tuple[list[MissionSighting], list[SearchedDate]]:
     """What the runs of these flights saw, and where they looked; of all."""
+    changes = load_changes(connection, _only(flights))
+    in_changes = {each.id for each in changes}
     sightings = [
         sighting_of(each.thing, each.flight_id, float(each.rank))
         for each in load_objects(connection, _only(flights))
-        if flights is None or each.flight_id in flights
+        if (flights is None or each.flight_id in flights) and each.thing.id not in in_changes
     ]
     complete = select(schema.runs.c.flight_id).where(schema.runs.c.status == "complete")
     whole = select(schema.flights).where(schema.flights.c.id.in_(complete))
     ranks = {row.id: float(row.rank) for row in connection.execute(whole)}
     spans = {name: span for name, _, *span in flown_flights(connection)}
-    for change in load_changes(connection, _only(flights)):
+    for change in changes:
         is_known = flights is None or change.flight_id in flights
         if is_known and change.verdict is not Verdict.REJECTED:
-            sightings += _of_change(change, ranks, spans)
+            sightings += sightings_of_change(change, ranks, spans)
     looks = load_searches(connection, _only(flights))
     return sightings, [each for each in looks if flights is None or each.date in flights]
 

@@ -40,7 +40,7 @@ from sorvolo.store.site import catalogue as records
 from sorvolo.store.site import change_records
 from sorvolo.store.site.catalogue import OwedFiles, VersionEntry
 from sorvolo.store.site.change_records import StoredObject
-from sorvolo.store.site.files import JOURNAL, STAGED, DamagedError, HeightFile
+from sorvolo.store.site.files import JOURNAL, STAGED, DamagedError, HeightFile, checked_document
 from sorvolo.store.site.journal import is_journal_after
 
 if TYPE_CHECKING:
@@ -159,7 +159,7 @@ def _write_flight_files(files: "Archive", owed: OwedFiles) -> None:
     make_folder(folder)
     contents = {name: content for name, content in owed.documents.items() if content}
     for name in (*contents, *owed.leftovers):
-        files.document_path(owed.flight_id, name)  # refuses one that could lie elsewhere
+        checked_document(name)  # refuses one that could lie elsewhere
     compared = files.comparisons()
     searches = files.catalogue_rows(change_records.load_searches, owed.flight_id)
     staged = folder / STAGED / str(owed.run_id)
@@ -278,20 +278,6 @@ def write_change_files(files: "Archive", flight_id: str, version: VersionEntry |
         after_words=_words_of(version),
     )
     write_page(folder / "changes.html", page)
-
-
-def write_object_files(files: "Archive", flight_id: str, crops: Mapping[str, bytes]) -> None:
-    """Write a flight's and the site's lists of objects again, and these crops of the flight's by name."""
-    folder = files.flight_folder(flight_id)
-    make_folder(folder / CROPS)
-    paths = [
-        f"{place}{OBJECTS}{end}" for place in ("", f"flights/{flight_id}/") for end in LIST_ENDINGS
-    ]
-    with files.replacing(f"flights/{flight_id}/{CROPS}", *paths):
-        for name, data in crops.items():
-            atomic_write_bytes(folder / CROPS / name, data)
-        _write_objects(files, folder, files.objects(flight_id))
-        _write_objects(files, files.folder, files.newest_objects())
 
 
 def _write_objects(files: "Archive", folder: Path, found: Sequence[StoredObject] | None) -> None:
