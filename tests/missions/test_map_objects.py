@@ -417,6 +417,10 @@ def test_what_is_longer_than_its_class_has_none(simulated: Path) -> None:
     for label, named in (("person", ""), ("car", "car")):
         found = [standing(label, 10.0, 20.0, 4.0)]
         assert ChangeClasses(Sees(simulated, 0.1), []).final(heap, found, []).class_after == named
+    glint = replace(heap, length_m=0.45)  # a part of the car beside it
+    for label, named in (("person", "person"), ("car", "")):
+        found = [standing(label, 10.0, 20.0, 4.0)]
+        assert ChangeClasses(Sees(simulated, 0.9), []).final(glint, found, []).class_after == named
 
 
 def test_a_changes_own_pictures_are_searched_for_the_classes_asked_for(simulated: Path) -> None:

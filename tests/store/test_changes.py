@@ -21,8 +21,9 @@ from rich.console import Console
 from sealing import seal_again
 from sorvolo.cli.printing import announce_people
 from sorvolo.errors import InputError, StoreError
-from sorvolo.findings.importance import between
+from sorvolo.findings.importance import between, in_short
 from sorvolo.geometry.polygons import signed_area
+from sorvolo.missions.site.history import came_and_left
 from sorvolo.missions.worker import PERSON_FOUND, Journal, _add_people
 from sorvolo.store.exports.change_files import changes_geojson, mask_name, write_view_masks
 from sorvolo.store.exports.places import Placemark, gpx_bytes, kml_bytes, longitude_latitude
@@ -274,6 +275,20 @@ def test_changes_enter_the_register_by_the_order_of_flights(folder: Path) -> Non
             ("c", "", False),
         }
         assert between(archive.register(), "a", "b").endswith("1 thing left")
+
+
+def test_history_states_what_the_comparison_states(folder: Path) -> None:
+    """In its own sentence, less what a person rejected; and by both searches where a flight was mapped."""
+    changes = [fake_change(1), replace(fake_change(2, east_m=30.0), class_after="person")]
+    with Archive.open(folder, write=True) as archive:
+        compare(archive, "b", changes)
+    assert came_and_left(folder) == f"from a to b: {in_short(changes)}"
+    with Archive.open(folder, write=True) as archive:
+        archive.review(changes[1].id, Verdict.REJECTED)
+    assert came_and_left(folder) == f"from a to b: {in_short(changes[:1])}"
+    with Archive.open(folder, write=True) as archive, archive.begin_flight("c", "", {}) as writer:
+        writer.commit([frame(0)], {}, {"flight": "c"}, "<html></html>")
+    assert "no objects were searched for on b and c" in came_and_left(folder)
 
 
 def test_a_person_whom_a_comparison_alone_found_is_announced(folder: Path) -> None:

@@ -1,6 +1,7 @@
 """Objects on disk: the files of a flight and of the site, what a later flight replaces, catalogues of older formats."""
 
 import json
+import math
 import sqlite3
 from dataclasses import replace
 from pathlib import Path
@@ -10,10 +11,12 @@ import pytest
 from fake_flights import SITE, frame, image
 
 from sorvolo.errors import StoreError
+from sorvolo.findings.register import SearchedDate
 from sorvolo.store.images import image_from_jpeg, jpeg_from_image
 from sorvolo.store.pages.flight import objects_section
 from sorvolo.store.site import schema
 from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.register import sighting_of
 from sorvolo.survey.map_objects import MapObject, ObjectSearch, SearchedFrames
 
 CROP = jpeg_from_image(image(3))
@@ -116,7 +119,19 @@ def test_the_register_that_is_kept_is_what_all_flights_state_at_once(tmp_path: P
             for k in near
             if (k + number) % 4
         ]
-        commit(tmp_path, name, search(tuple(own), west_m, west_m + 120))
+        found = search(tuple(own), west_m, west_m + 120)
+        registers = []
+        if name in "bcde":  # as it will be with this flight
+            new = (
+                [sighting_of(each, name, math.inf) for each in own],
+                [SearchedDate(name, math.inf, found.frames)],
+            )
+            with Archive.open(tmp_path, write=False) as archive:
+                registers = [archive.register(*new), archive.register(*new, set("abcdef"))]
+        for register in registers:
+            shown.append([(each.id, each.gone, len(each.sightings)) for each in register.findings])
+        assert not registers or shown[-1] == shown[-2]
+        commit(tmp_path, name, found)
         with Archive.open(tmp_path, write=False) as archive:
             kept, whole = archive.register(), archive.register(flights=set("abcdef"))
         for register in (kept, whole):
@@ -129,6 +144,22 @@ def test_the_register_that_is_kept_is_what_all_flights_state_at_once(tmp_path: P
             )
         assert shown[-1] == shown[-2]
     assert {each[1] for each in shown[-1]} > {"", "f"}
+
+
+def test_a_person_is_new_to_the_first_flight_alone(tmp_path: Path) -> None:
+    """Who stands there still is no news; who came, or has another place, is."""
+    here, there = thing("a-o1", 3.0, 4.0, "person"), thing("a-o2", 9.0, -2.0, "person")
+    commit(tmp_path, "a", search((here, there)))
+    stays = replace(here, id="b-o1", position_m=np.array([3.1, 4.2]))
+    came = replace(here, id="b-o2", position_m=np.array([-20.0, 4.0]))
+    commit(tmp_path, "b", search((stays, came)))
+    with Archive.open(tmp_path, write=False) as archive:
+        people = {name: archive.new_people(name) for name in "ab"}
+        known = {
+            seen.id: each.id for each in archive.register().findings for seen in each.sightings
+        }
+    assert [len(each) for each in people.values()] == [2, 1]
+    assert people["b"][0]["id"] == known["b-o2"] != known["b-o1"] == known["a-o1"]
 
 
 @pytest.mark.usefixtures("kind")

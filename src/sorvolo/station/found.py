@@ -157,14 +157,12 @@ def _feature(
         own = {name: each for name, each in of_watch.items() if name != "lonlat"}
         crop = ("finding", of_watch["id"]) if of_watch.get("crop") else None
     known, begun = shown["properties"], found.sightings[0].id
-    longitude_deg, latitude_deg = shown["geometry"]["coordinates"]
     shown["properties"] = {
         **own,
         **known,
         **{name: own.get(name, known[name]) for name in ("score", "length_m")},
         "class_scores": {name: rounded(share, 4) for name, share in found.class_scores.items()},
-        "latitude": latitude_deg,
-        "longitude": longitude_deg,
+        **dict(zip(("longitude", "latitude"), shown["geometry"]["coordinates"], strict=True)),
         "flight": found.newest.date,
         "missions": sorted({each.mission for each in found.sightings}),
         "sightings": list(dict.fromkeys(ids)),

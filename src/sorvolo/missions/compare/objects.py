@@ -51,10 +51,12 @@ class ComparisonObjects:
         self._finder: ObjectFinder | None = None
         self._classes: ChangeClasses | None = None
         self._archive = archive
-        self._before = {each.flight_id for each in archive.versions() if each.id <= base_version}
-        self._before.discard(self._name)
+        made = archive.versions()
+        self._before = {each.flight_id for each in made if each.id <= base_version} - {self._name}
+        is_new = self._before == {each.flight_id for each in made}
+        self._known_by = None if is_new else self._before
         if detector is not None:
-            known = [each.thing for each in archive.newest_objects(self._before)]
+            known = [each.thing for each in archive.newest_objects(self._known_by)]
             self._classes = ChangeClasses(detector, known, settings.classes)
             live_folder = archive.folder if isinstance(setup.source, LiveSource) else None
             self._finder = ObjectFinder(
@@ -101,7 +103,7 @@ class ComparisonObjects:
         if search is None:
             return []
         look = SearchedDate(self._name, math.inf, search.frames)
-        register = self._archive.register(self._sightings(search), [look], self._before)
+        register = self._archive.register(self._sightings(search), [look], self._known_by)
         return [
             (kind, each)
             for kind, each in begun_and_ended(register, self._before, self._name)
@@ -109,11 +111,11 @@ class ComparisonObjects:
         ]
 
     def classified(
-        self, changes: Sequence[Change], search: ObjectSearch | None
+        self, changes: list[Change], search: ObjectSearch | None
     ) -> tuple[list[Change], ObjectSearch | None]:
         """The changes with their classes, after `conclude`; the search with what they alone saw of its classes."""
         if self._finder is None or self._classes is None or search is None:
-            return list(changes), search
+            return changes, search
         named = [
             self._classes.final(each, search.objects, self._finder.sightings) for each in changes
         ]

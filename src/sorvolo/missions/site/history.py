@@ -76,12 +76,11 @@ def came_and_left(site: Path) -> str:
     """What came and left between the newest two flights of the site, in a sentence: the comparison's, where the later
     one was compared. "" for one flight."""
     with Archive.open(site, write=False) as archive:
-        versions = archive.versions()
-        flights = list(dict.fromkeys(each.flight_id for each in versions))[-2:]
+        made = {each.flight_id: each.id for each in archive.versions()}
+        flights = list(made)[-2:]
         if len(flights) < 2:
             return ""
-        made = next(each.id for each in reversed(versions) if each.flight_id == flights[1])
-        if made in archive.comparisons():
+        if made[flights[1]] in archive.comparisons():
             changes = archive.changes(flights[1])
             kept = [each for each in changes if each.verdict is not Verdict.REJECTED]
             words = in_short(kept, is_local=archive.site().is_local)

@@ -21,6 +21,7 @@ from sorvolo.findings.register import (
 from sorvolo.geometry.arrays import Floats, frozen
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.site import schema
+from sorvolo.store.site.catalogue import list_flights
 from sorvolo.store.site.change_records import (
     StoredChange,
     StoredObject,
@@ -42,11 +43,14 @@ def site_register(
     others: Sequence[MissionSighting] = (),
     their_looks: Sequence[SearchedDate] = (),
 ) -> Register:
-    """What all complete runs found, each thing once; as far as these flights know. `others` are of no run of the site."""
-    if flights is None and not others and not their_looks:  # as commits put it together
-        return Register(
-            tuple(in_order(load_findings(connection))), tuple(load_searches(connection))
-        )
+    """What all complete runs found, each thing once; as far as these flights know. `others` are of no run of the site,
+    later than all where their order is infinite."""
+    orders = {each.order for each in others} | {each.order for each in their_looks}
+    if flights is None and orders <= {math.inf}:
+        kept = load_findings(connection)  # as commits put it together
+        found = associate(others, their_looks, [each for each in kept if not each.gone]).findings
+        whole = in_order([each for each in kept if each.gone] + list(found))
+        return Register(tuple(whole), (*load_searches(connection), *their_looks))
     sightings, looks = _seen(connection, flights)
     return associate([*sightings, *others], [*looks, *their_looks])
 
@@ -185,9 +189,8 @@ def _seen(
         for each in load_objects(connection, _only(flights))
         if (flights is None or each.flight_id in flights) and each.thing.id not in in_changes
     ]
-    complete = select(schema.runs.c.flight_id).where(schema.runs.c.status == "complete")
-    whole = select(schema.flights).where(schema.flights.c.id.in_(complete))
-    ranks = {row.id: float(row.rank) for row in connection.execute(whole)}
+    whole = (each for each in list_flights(connection) if each.status == "complete")
+    ranks = {each.id: float(each.rank) for each in whole}
     spans = {name: span for name, _, *span in flown_flights(connection)}
     for change in changes:
         is_known = flights is None or change.flight_id in flights

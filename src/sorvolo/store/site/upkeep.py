@@ -255,9 +255,12 @@ def write_change_files(files: "Archive", flight_id: str, version: VersionEntry |
         return
     changes = files.catalogue_rows(change_records.load_changes, flight_id)
     site = files.site()
-    placemarks = [] if site.is_local else change_placemarks(changes, site)
     _write_list(
-        folder, "changes", changes_geojson(changes, site), placemarks, is_local=site.is_local
+        folder,
+        "changes",
+        changes_geojson(changes, site),
+        change_placemarks(changes, site),
+        is_local=site.is_local,
     )
     crops = {}
     for change in changes:
@@ -286,8 +289,8 @@ def _write_objects(files: "Archive", folder: Path, found: Sequence[StoredObject]
         _remove_list(folder, OBJECTS)
         return
     site = files.site()
-    placemarks = [] if site.is_local else object_placemarks(found, site)
     collection = objects_geojson(found, site, crops_from_site=folder == files.folder)
+    placemarks = object_placemarks(found, site)
     _write_list(folder, OBJECTS, collection, placemarks, is_local=site.is_local)
 
 
