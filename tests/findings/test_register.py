@@ -324,7 +324,10 @@ def test_changes_are_groups_what_matters_first_and_none_is_lost() -> None:
     shuffled = [[int(each.id[2:]) for each in group] for group in grouped(changes[::-1])]
     assert shuffled == groups
     assert in_short(changes) == (
-        "1 person came; 1 truck came; 4 cars left; changed ground in 1 place, 40 m long; 3 large things that changed; 9 small things that changed"
+        "1 person came; 1 truck came; 4 cars left; changed ground in 1 place, 40 m long; 3 large things changed; 9 small things changed"
     )
+    walks = replace(changes[4], kind=ChangeKind.MOVING)
+    assert in_short([*changes[4:6], walks, walks]).startswith("1 person came, 2 move; 1 truck came")
+
     assert "long" not in in_short(changes, is_local=True)
     assert grouped([]) == [] and in_short([]) == "nothing changed"

@@ -40,12 +40,13 @@ def between(register: Register, before: str, after: str) -> str:
     """What came and left between two dates that were not compared, by class: "1 person came, 1 left; 12 cars left".
     Counts only what one date saw and the other looked for without finding it."""
     known = {each.date for each in register.looks if len(each.frames.outlines_m)}
-    changed = begun_and_ended(register, {before}, after)
-    counts = Counter((found.label, kind) for kind, found in changed)
-    parts = []
-    for label in dict.fromkeys(each.label for each in ordered(register.findings)):
-        came, left = (counts[label, kind] for kind in (ChangeKind.APPEARED, ChangeKind.DISAPPEARED))
-        parts += [_came_and_left(label or UNNAMED, came, left)] if came or left else []
+    kinds = {found: kind for kind, found in begun_and_ended(register, {before}, after)}
+    parts = _in_parts(
+        Counter(
+            (each.label or UNNAMED, "came" if kinds[each] is ChangeKind.APPEARED else "left")
+            for each in ordered(list(kinds))
+        )
+    )
     unsearched = [date for date in (before, after) if date not in known]
     if not parts and unsearched:
         return f"no telling what came or left: no objects were searched for on {' and '.join(unsearched)}"
@@ -101,41 +102,37 @@ def grouped(changes: Sequence[Seen]) -> list[list[Seen]]:
 
 
 def in_short(changes: Sequence[ChangeFacts], *, is_local: bool = False) -> str:
-    """Changes in a sentence: "12 cars left, 9 came; changed ground in 3 places, up to 210 m long; 14 small things".
-    Lengths are left out of a map without metres."""
-    came: Counter[str] = Counter()
-    left: Counter[str] = Counter()
-    others: Counter[tuple[str, bool]] = Counter()
-    labels: dict[str, None] = {}  # in order of importance
+    """Changes in a sentence: "9 cars came, 12 left, 1 moves; changed ground in 3 places, up to 210 m long; 14 small
+    things changed". Lengths are left out of a map without metres."""
+    named: Counter[tuple[str, str]] = Counter()
+    others: Counter[tuple[str, str]] = Counter()
     areas = [each.length_m for each in changes if each.kind is ChangeKind.AREA]
     for each in sorted(changes, key=_importance):
         if each.kind is ChangeKind.AREA:
             continue
-        before = each.class_before if each.kind in _HAS_BEFORE else ""
-        after = each.class_after if each.kind is not ChangeKind.DISAPPEARED else ""
-        for label, counts in ((before, left), (after, came)):
-            if label:
-                counts[label] += 1
-                labels[label] = None
+        moves = each.kind is ChangeKind.MOVING
+        if before := each.class_before if each.kind in _HAS_BEFORE else "":
+            named[before, "left"] += 1
+        if after := each.class_after if each.kind is not ChangeKind.DISAPPEARED else "":
+            named[after, "moves" if moves else "came"] += 1
         if not before and not after:
             size = "" if is_local else "large " if each.length_m >= _LARGE_M else "small "
-            others[f"{size}thing", each.kind is ChangeKind.MOVING] += 1
-    parts = [_came_and_left(label, came[label], left[label]) for label in labels]
+            others[f"{size}thing", "moves" if moves else "changed"] += 1
+    parts = _in_parts(named)
     if areas:
         size = "" if is_local else f", {'up to ' if len(areas) > 1 else ''}{max(areas):.0f} m long"
         parts.append(f"changed ground in {counted(len(areas), 'place')}{size}")
-    for (what, moves), count in others.items():
-        parts.append(
-            f"{counted(count, what)} that {plural('moves', count) if moves else 'changed'}"
-        )
-    return "; ".join(parts) or "nothing changed"
+    return "; ".join([*parts, *_in_parts(others)]) or "nothing changed"
 
 
-def _came_and_left(label: str, came: int, left: int) -> str:
-    """ "12 cars came, 9 left"; not both zero."""
-    if not came:
-        return f"{counted(left, label)} left"
-    return f"{counted(came, label)} came" + (f", {left} left" if left else "")
+def _in_parts(counts: Counter[tuple[str, str]]) -> list[str]:
+    """How many of each class did what: "12 cars came, 9 left"."""
+    parts = dict.fromkeys((label for label, _ in counts), "")
+    for (label, verb), count in sorted(counts.items(), key=lambda each: each[0][1]):
+        does = plural(verb, count) if verb == "moves" else verb
+        first = f"{counted(count, label)} {does}"
+        parts[label] += f", {count:,} {does}" if parts[label] else first
+    return list(parts.values())
 
 
 def _name(change: ChangeFacts) -> str:
