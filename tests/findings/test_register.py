@@ -209,6 +209,14 @@ def test_moving_things_are_one_within_a_date_and_never_between_dates() -> None:
     assert len(associate([*seen, sighting(1, "map", 10.0, **walks)]).findings) == 2
 
 
+def test_a_detectors_class_outweighs_that_of_a_change() -> None:
+    """A change's score is how sure it is that something changed there, not what it is."""
+    change = sighting(0, "changes", 0.0, label="small object", origin=KnownBy.CHANGED, score=0.9)
+    seen = sighting(0, "map", 0.1, label="person", score=0.5)
+    assert [each.label for each in associate([change]).findings] == ["small object"]
+    assert [each.label for each in associate([change, seen]).findings] == ["person"]
+
+
 def test_a_renamed_class_is_one_thing_on_one_date() -> None:
     """Two models' names for what both see; on another date another class is another thing."""
     seen = [sighting(0, "map", 0.0), sighting(0, "watch", 0.2, label="van", length_m=5.0)]

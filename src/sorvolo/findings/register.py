@@ -2,6 +2,7 @@
 
 import hashlib
 import math
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -28,6 +29,7 @@ _AGREE_M = 1.0  # so far apart at most, they show the same
 _SIGMA_OF_MEDIAN = 0.85  # per axis, by the median distance of a normal scatter in the plane
 _LIKE_SIZE = 2.5  # lengths further apart than this ratio are two things, where their classes differ
 _LIKE_CLASS = 0.1  # classes' shares that agree less are two classes
+_NAMED = 0.1  # beside a detector's own class counts that of a change: by the same frames, or one small picture
 _LEFT = 4.0  # as unlike is what the date's comparison saw leave: what came in its place is nearer
 _FAR = 1e3  # the cost of a pair that cannot be one thing: more than all that can
 
@@ -90,7 +92,8 @@ class GroundFinding:
 
     `id` follows from the first sighting's content. `gone` is the first date that looked there and did not find it, ""
     where none did. `position_m` (2,) and `sigma_m` are those of the newest date that saw it; `known_m` (2,) is that
-    place with its missions' common errors taken off. `class_sums` are the scores by class, summed over all sightings.
+    place with its missions' common errors taken off. `class_sums` are the scores by class, summed over all sightings,
+    those of changes as a tenth.
     """
 
     id: str
@@ -236,14 +239,15 @@ class _Thing:
         self.left: MissionSighting | None = None
         self.sightings: list[MissionSighting] = []
         self.of_date: list[MissionSighting] = []
-        self.sums: dict[str, float] = {}
+        self.sums = defaultdict[str, float](float)
         self._off_m: list[Floats] = []
 
     @classmethod
     def of(cls, found: GroundFinding) -> "_Thing":
         """One that an earlier date left standing."""
         thing = cls(found.id)
-        thing.sightings, thing.sums = list(found.sightings), dict(found.class_sums)
+        thing.sightings = list(found.sightings)
+        thing.sums.update(found.class_sums)
         thing.of_date = [each for each in found.sightings if each.date == found.dates[-1]]
         thing.place_m, thing.known_m, thing.sigma_m = found.position_m, found.known_m, found.sigma_m
         return thing
@@ -251,8 +255,9 @@ class _Thing:
     def add(self, sighting: MissionSighting, off_m: Floats) -> None:
         """Take a sighting of a mission that is off by (2,) as a whole; of a date's places, the mean by their errors
         counts."""
+        weight = sighting.score * (_NAMED if sighting.origin is KnownBy.CHANGED else 1.0)
         for name, share in _odds(sighting).items():
-            self.sums[name] = self.sums.get(name, 0.0) + share * sighting.score
+            self.sums[name] += share * weight
         self.left = sighting if sighting.gone else None
         if sighting.gone and self.of_date:  # it left from where it was seen last
             last = self.of_date[-1]
