@@ -12,10 +12,12 @@ from sorvolo.heights.views import View, inside
 
 def test_a_gimbals_one_tilt_is_found_from_fixes_and_crowns() -> None:
     draw = np.random.default_rng(20261130)
-    east_m, north_m = (each.ravel() for each in np.meshgrid(np.arange(-12, 13, 4.0), np.arange(-12, 13, 2.0)))  # fmt: skip
+    east_m, north_m = (each.ravel() for each in np.meshgrid(np.arange(-12, 13, 4.0), np.arange(-12, 13, 2.0), indexing="ij"))  # fmt: skip
     eyes_m = np.column_stack([east_m, north_m, np.full(len(east_m), 45.0)])
     tilt = NADIR_CAMERA_NORTH_UP @ rotation_from_vector(np.radians([12.0, 5.0, 0.0]))
-    turns = rotation_from_vector(np.radians(draw.normal(0, 1, (len(eyes_m), 3)) * [0, 0, 3])) @ tilt
+    back = 180.0 * (np.arange(len(eyes_m)) // 13 % 2)  # every other strip is flown the other way
+    yaws = back + draw.normal(0, 2, len(eyes_m))
+    turns = rotation_from_vector(np.radians(yaws)[:, None] * [0, 0, 1.0]) @ tilt
     true = [View(f"{k}", CAMERA, Pose(r, t), np.full(3, np.nan)) for k, (r, t) in enumerate(zip(turns, eyes_m))]  # fmt: skip
     crowns_m = draw.uniform([-30, -30, 18], [30, 30, 27], (2500, 3))
     view, point, seen = [], [], []
@@ -32,7 +34,7 @@ def test_a_gimbals_one_tilt_is_found_from_fixes_and_crowns() -> None:
     mapped = []
     for each in true:
         fix_m = each.site_from_camera.translation_m + draw.normal(0, 0.5, 3)
-        lean = rotation_from_vector(np.radians(draw.normal(0, 3, 3)))
+        lean = rotation_from_vector(np.radians(draw.normal(0, [3, 3, 6])))
         pose = Pose(each.site_from_camera.rotation @ off.T @ lean, fix_m + draw.normal(0, 0.5, 3))
         mapped.append(replace(each, site_from_camera=pose, fix_m=fix_m))
     solved = solve_steady(mapped, tracks).views

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
-from scipy.sparse import csr_matrix
+from scipy.sparse import block_array, csr_matrix, eye_array, kron
 
 from sorvolo.geometry.arrays import Floats, Mask, PointsM, Rows
 from sorvolo.geometry.pose import rotation_from_vector
@@ -34,6 +34,7 @@ class AdjustmentSettings:
     # of all the map's attitudes in common: they lean where the ground is not level
     attitude_sigma_deg: float = 3.0
     lens_freedom: float = 1.0  # times the usual sigmas of the lens
+    is_steady: bool = False  # cameras have one tilt in common: each turns about the vertical alone
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,10 +141,12 @@ def adjust(scene: Scene, priors: Priors, settings: AdjustmentSettings) -> Scene:
         system = normal.cameras - reduced.toarray()
         system[np.diag_indices_from(system)] += damping * np.diag(normal.cameras) + 1e-9
         gradient = normal.gradient - through @ normal.point_gradient.ravel()
+        free = _steady(scene) if settings.is_steady else eye_array(len(gradient), format="csr")
+        system, gradient = free.T @ (free.T @ system).T, free.T @ gradient
         try:
-            cameras = cho_solve(cho_factor(system), gradient)
+            cameras = free @ cho_solve(cho_factor(system), gradient)
         except LinAlgError:
-            cameras = np.linalg.lstsq(system, gradient, rcond=None)[0]
+            cameras = free @ np.linalg.lstsq(system, gradient, rcond=None)[0]
         points = np.einsum(
             "pij,pj->pi",
             inverse,
@@ -161,6 +164,17 @@ def adjust(scene: Scene, priors: Priors, settings: AdjustmentSettings) -> Scene:
         if gain < 1e-5 * normal.cost:
             break
     return scene
+
+
+def _steady(scene: Scene) -> csr_matrix:
+    """(6 N + 5, 4 N + 7) the steps of cameras with one tilt from its own two, each camera's turn and place, the lens."""
+    across = np.linalg.svd(scene.rotations[:1, 2])[2][
+        1:
+    ]  # (2, 3) about what is level in all of them
+    tilts = np.einsum("nij,kj->nik", scene.rotations, across)
+    tilts = np.concatenate([tilts, np.zeros_like(tilts)], axis=1).reshape(-1, 2)
+    own = kron(eye_array(len(scene.rotations)), np.eye(6)[:, 2:])
+    return block_array([[tilts, own, None], [None, None, eye_array(_SHARED)]]).tocsr()
 
 
 def height_deviations(scene: Scene, priors: Priors, settings: AdjustmentSettings) -> Floats:
@@ -219,7 +233,9 @@ def _linearise(scene: Scene, priors: Priors, settings: AdjustmentSettings) -> _N
     gradient[:-_SHARED] = -_summed(_pulls(by_camera, residual), scene.view, views).ravel()
     gradient[-_SHARED:] = -_pulls(by_shared, residual).sum(axis=0)
     cost += _add_priors(scene, priors, settings, system, gradient)
-    usual = np.array([_FOCAL_SIGMA, *_RADIAL_SIGMA, *2 * (_CENTRE_SIGMA,)])
+    # a tilt that all cameras share is what their optical centre would be
+    centre_sigma = _CENTRE_SIGMA * (0.1 if settings.is_steady else 1.0)
+    usual = np.array([_FOCAL_SIGMA, *_RADIAL_SIGMA, *2 * (centre_sigma,)])
     lens_sigma = settings.lens_freedom * usual
     system[-_SHARED:, -_SHARED:] += np.diag(1 / lens_sigma**2)
     gradient[-_SHARED:] -= scene.shared / lens_sigma**2

@@ -42,8 +42,17 @@ _MARGIN = 0.2  # of a picture: features so far beside what two views share on le
 _NEARLY_ALL = 0.9  # of two views' features: what these do not share, all of them do not
 _REJECTED_PX = (8.0, 3.0)  # observations farther off are dropped, round by round
 _LEAST_SIGMA_M = 0.02  # of a fix
-# sigma of a gimbal's tilt about the one found before, round by round
-_STEADY_DEG = (10.0, 10.0, 3.0, 1.0, 0.3)
+# of cameras with one tilt, round by round: sigma of observations and how far off they are dropped, px, and what the
+# lens is free by, times its usual sigmas: before the tilt is found it would take that on itself
+_STEADY = (
+    (4.0, 40.0, 0.1),
+    (2.0, 15.0, 0.1),
+    (1.0, 6.0, 0.1),
+    (0.5, 3.0, 1.5),
+    (0.5, 2.5, 1.5),
+)
+_HEADING_DEG = 3.0  # sigma of a heading that is held
+_BESIDE = 7  # views before and after one that have its heading
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,34 +260,56 @@ def solve_tracks(views: Sequence[View], tracks: Tracks) -> Cameras3D:
 
 
 def solve_steady(views: Sequence[View], tracks: Tracks) -> Cameras3D:
-    """The cameras of a flight whose gimbal holds one tilt, unknown, through the flight, and whose lens is the map's.
+    """The cameras of a flight whose gimbal holds one tilt, unknown, and whose aircraft holds its heading along strips.
 
     For crowns, which hold no free cameras: few pictures share a point, and none shows points far below. Heights have no
     sigma. Raises InputError where photos share too little for it.
     """
     held, priors = _held(views, tracks), _priors(views)
-    priors = replace(
-        priors,
-        fixes_m=np.where(
-            np.isfinite(priors.fixes_m),
-            priors.fixes_m,
-            [each.site_from_camera.translation_m for each in views],
-        ),
-        rotations=_one_tilt(priors.rotations),
-    )
+    centres_m = np.array([each.site_from_camera.translation_m for each in views])
+    fixes_m = np.where(np.isfinite(priors.fixes_m), priors.fixes_m, centres_m)
+    rotations = _one_tilt(priors.rotations)
+    headings = _headings(rotations)
+    rotations = _along(rotations, headings)
     began = [
         replace(view, site_from_camera=Pose(*place))
-        for view, *place in zip(views, priors.rotations, priors.fixes_m)
+        for view, *place in zip(views, rotations, fixes_m)
     ]
     scene = _first(began, tracks)
-    for sigma_deg in _STEADY_DEG:
+    for sigma_px, limit_px, freedom in _STEADY:
+        priors = replace(priors, fixes_m=fixes_m, rotations=_along(rotations, headings))
         scene = adjust(
-            scene, priors, AdjustmentSettings(attitude_sigma_deg=sigma_deg, lens_freedom=0.1)
+            scene, priors, AdjustmentSettings(sigma_px, _HEADING_DEG, freedom, is_steady=True)
         )
-        scene = _laid(scene, priors, held)
-        scene = scene.keeping(_fitting(scene, _REJECTED_PX[sigma_deg < _STEADY_DEG[0]]))
-        priors = replace(priors, rotations=_one_tilt(scene.rotations))
+        rotations = _one_tilt(scene.rotations)
+        scene = replace(scene, rotations=rotations)
+        scene = scene.keeping(_fitting(scene, limit_px))
+        priors = _reweighed(scene, priors)
     return _solved(views, scene, priors, held)
+
+
+def _headings(rotations: Floats) -> Rows:
+    """(N,) which of four headings, a quarter turn apart, the pictures about each view have: along, back and across."""
+    turns = np.exp(1j * _yaws(rotations))
+    turns = np.convolve(np.pad(turns, _BESIDE, mode="edge"), np.ones(2 * _BESIDE + 1), "valid")
+    quarters = 2 / np.pi * np.angle(turns)
+    return np.round(quarters - np.angle(np.exp(2j * np.pi * quarters).sum()) / (2 * np.pi)) % 4
+
+
+def _along(rotations: Floats, headings: Rows) -> Floats:
+    """(N, 3, 3) the rotations turned about the vertical to what is usual among those of their heading."""
+    yaws = _yaws(rotations)
+    turns = np.zeros_like(yaws)
+    for heading in np.unique(headings):
+        at = headings == heading
+        middle = np.angle(np.exp(1j * yaws[at]).sum())
+        off = np.angle(np.exp(1j * (yaws[at] - middle)))
+        turns[at] = np.median(off) - off
+    return rotation_from_vector(turns[:, None] * [0.0, 0.0, 1.0]) @ rotations
+
+
+def _yaws(rotations: Floats) -> Floats:
+    return np.asarray(np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0]))
 
 
 def _held(views: Sequence[View], tracks: Tracks) -> Mask:
@@ -297,26 +328,6 @@ def _one_tilt(rotations: Floats) -> Floats:
     usual = np.median(rotations[:, 2], axis=0)
     turn = np.cross(usual / np.linalg.norm(usual), rotations[:, 2])
     return rotations @ rotation_from_vector(turn)
-
-
-def _laid(scene: Scene, priors: Priors, held: Mask) -> Scene:
-    """The scene turned, scaled and shifted as one to fixes and attitudes: an adjustment's steps, which each point
-    resists, end before it is there."""
-    centres, fixes = scene.centres_m[held], priors.fixes_m[held]
-    middle, there = centres.mean(axis=0), fixes.mean(axis=0)
-    sigma_m = float(priors.sigmas_m.mean())
-    turns = priors.rotations[held] @ scene.rotations[held].transpose(0, 2, 1)
-    across = (fixes - there).T @ (centres - middle) / sigma_m**2
-    # all have one tilt: N attitudes know no more of it than one
-    lean = turns.mean(axis=0) / np.radians(_STEADY_DEG[0]) ** 2
-    u, _, vt = np.linalg.svd(across + lean)
-    turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
-    turned = (centres - middle) @ turn.T
-    scale = float(((fixes - there) * turned).sum() / (turned**2).sum())
-    centres_m, points_m = (
-        scale * (each - middle) @ turn.T + there for each in (scene.centres_m, scene.points_m)
-    )
-    return replace(scene, centres_m=centres_m, points_m=points_m, rotations=turn @ scene.rotations)
 
 
 def _first(views: Sequence[View], tracks: Tracks) -> Scene:

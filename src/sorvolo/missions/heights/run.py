@@ -413,10 +413,13 @@ def write_heights(
 
 
 def solved_before(
-    archive: Archive, keyframes: Sequence[StoredKeyframe], views: Sequence[View]
+    archive: Archive,
+    keyframes: Sequence[StoredKeyframe],
+    views: Sequence[View],
+    file: str = HeightFile.REPORT,
 ) -> Cameras3D | None:
-    """The cameras in space that this mapping run's heights were made with; None without heights."""
-    path = archive.height_path(keyframes[0].flight_id, HeightFile.REPORT)
+    """The cameras in space that this mapping run's heights, or another `file`, were made with; None without them."""
+    path = archive.flight_folder(keyframes[0].flight_id) / file
     by_name = {view.name: view for view in views}
     try:
         report = json.loads(path.read_text())

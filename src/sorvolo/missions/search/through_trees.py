@@ -16,6 +16,7 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats32, ImageRGBA, Numbers
 from sorvolo.heights.cameras import Cameras3D, find_tracks, solve_steady, solve_tracks
 from sorvolo.heights.field import HeightField
+from sorvolo.heights.figures import camera_figures
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.views import View, ground_outlines_m
 from sorvolo.missions.heights.run import (
@@ -36,6 +37,7 @@ from sorvolo.store.pages.search import under_trees_page
 from sorvolo.store.rasters.height_model import read_height_cog, write_height_cog
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import StoredKeyframe
+from sorvolo.store.site.files import UNDER_TREES
 from sorvolo.survey.flight import Site
 from sorvolo.survey.map_objects import MapObject
 from sorvolo.survey.objects import PERSON
@@ -50,6 +52,8 @@ _FLOOR_M = (
 )  # where the floor is looked for, above the map's level ground: that may be crowns
 _TILT = float(np.tan(np.radians(10)))  # as far as fixes alone hold the tilt that cameras share
 _MOST_STRETCH = 0.06  # of the focal length, three sigmas of what it may be off
+_MOST_SWING_DEG = 3.0  # median, of cameras that a gimbal holds
+_LEAST_STEADY = 0.7  # of the observations, that fit cameras of one tilt
 _POD = "pod", "pod_low", "pod_high"
 _RING_M = 2.0  # around a find
 _CROP_M, _CROP_CELL_M = 8.0, 0.04
@@ -94,6 +98,8 @@ def search_under_trees(
             views, radial = solved.views, solved.radial
             by_name = {each.name: each for each in keyframes}
             keyframes = [by_name[view.name] for view in views]
+        unknown = np.zeros((0, 3)), np.nan, 1.0, radial, np.full(3, np.nan), 0
+        cameras = camera_figures(solved or Cameras3D(tuple(views), (), *unknown))
         yield UnderTreesUpdate(name, "floor", 1)
         pictures = FlightPictures(archive, keyframes, radial)
         views, cell_m = _at_body_size(views)
@@ -129,6 +135,16 @@ def search_under_trees(
             name, finds, sigma_m, keyframes, [_crop(each, views, picture) for each in finds.people]
         )
         archive.keep_under_trees(name, found)
+        low, high = np.nanpercentile(under.mean, [1, 99.5])
+        kept_floor = {
+            "run": run_of(keyframes),
+            "floor_m": float(np.median(floor.up_m)),
+            "levels": [float(low), float(high)],
+            "cameras": cameras,
+        }
+        file = f"flights/{name}/{UNDER_TREES}"
+        with archive.replacing(file):
+            atomic_write_bytes(archive.folder / file, json_bytes(kept_floor))
         report = _report(name, site, under, floor, finds, planted, sigma_m)
         report |= {"pictures": len(views), "warnings": [warning] if warning else []}
         report |= {"run": run_of(keyframes), "cell_m": cell_m}
@@ -186,30 +202,40 @@ def _solved(
     Where crowns share few points, cameras that are free end anywhere; then a gimbal's one tilt and the fixes hold them.
     """
     try:
-        tracks = None
-        for is_free, most_lost in ((True, 0.1), (False, 0.3)):
-            if is_free and before is not None:
-                solved = before
-            else:
-                if before is not None:
-                    views = _by_given_lens(views, before)
-                tracks = tracks or find_tracks(views, pictures.gray)
-                solved = (solve_tracks if is_free else solve_steady)(views, tracks)
-            why = (
-                f"points hold {len(solved.views)} of {len(views)} pictures, and a focal length "
-                f"{solved.focal_scale:.2f} times the map's"
+        if before is None:
+            tracks = find_tracks(views, pictures.gray)
+        free = before or solve_tracks(views, tracks)
+        swing_deg, stretch = _swing_deg(free), abs(np.log(free.focal_scale))
+        is_held = len(free.lost) <= 0.1 * len(views) and stretch < _MOST_STRETCH
+        if is_held and swing_deg < _MOST_SWING_DEG:
+            return free, ""
+        if before is not None:
+            views = _by_given_lens(views, before)
+            tracks = find_tracks(views, pictures.gray)
+        steady = solve_steady(views, tracks)
+        share = steady.observations / len(tracks.view)
+        why = (
+            f"points hold {len(steady.views)} of {len(views)} pictures, and {share:.0%} of them fit"
+        )
+        if len(steady.lost) <= 0.3 * len(views) and share > _LEAST_STEADY:
+            held = f"{why}: the camera's tilt was taken as steady, and people may be missed if it was not"
+            return steady, held
+        if is_held:
+            return (
+                free,
+                f"cameras tilt by {swing_deg:.0f} degrees to and fro: crowns may have held them badly",
             )
-            if (
-                len(solved.lost) <= most_lost * len(views)
-                and abs(np.log(solved.focal_scale)) < _MOST_STRETCH
-            ):
-                held = f"{why}: the camera's tilt was taken as steady, and people may be missed if it was not"
-                return solved, "" if is_free else held
     except InputError as error:
         why = f"{error}"
     return None, (
         f"cameras are as mapped, not solved in space ({why}): 0.5 m or 1 degree of error hides people"
     )
+
+
+def _swing_deg(solved: Cameras3D) -> float:
+    """How far cameras tilt from their usual tilt, median: a gimbal's hardly do, those that crowns leave free do."""
+    ups = np.array([view.site_from_camera.rotation[2] for view in solved.views])
+    return float(np.degrees(np.median(np.linalg.norm(ups - np.median(ups, axis=0), axis=1))))
 
 
 def _by_given_lens(views: Sequence[View], before: Cameras3D) -> Sequence[View]:

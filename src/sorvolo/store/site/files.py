@@ -154,6 +154,10 @@ class DamagedError(StoreError):
     """A file's bytes are not those that were written."""
 
 
+UNDER_TREES = "under_trees.json"
+"""In a flight's folder: the cameras of a look below its crowns, and the floor that they show."""
+
+
 class HeightFile(StrEnum):
     """The files of a flight's folder that hold its heights."""
 
