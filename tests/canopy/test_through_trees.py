@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import rasterio
 from forest_site import forest_site
+from PIL import Image
 from thermal_forest import fly, make_forest, photograph
 
 from sorvolo.cli.main import main
@@ -22,6 +23,9 @@ from sorvolo.search.cells import Cells
 from sorvolo.search.conditions import Conditions
 from sorvolo.search.outcomes import Outcomes
 from sorvolo.search.recall import Chances
+from sorvolo.station.problems import Problem
+from sorvolo.station.sites import SiteShelf
+from sorvolo.station.tiles import FloorTiles
 from sorvolo.store.site.archive import Archive
 
 _PEOPLE_M = np.array([[-4.0, -3.0], [4.0, 5.0]])
@@ -65,6 +69,34 @@ def test_the_people_are_named_with_the_chance_that_one_is_found(
     with rasterio.open(out / "under_trees.tif") as opened:
         assert opened.descriptions[:3] == ("mean", "anomaly, sigmas", "views")
         assert opened.read(3).max() > 24
+
+
+def test_a_station_shows_the_floor_at_each_height(
+    searched: tuple[Path, int, str], site: Path
+) -> None:
+    """A person is a brighter spot at the floor's height than far above it."""
+    tiles = FloorTiles(SiteShelf(site.parent))
+    about = tiles.about("site")
+    assert about is not None and abs(about["floor_m"] + 18) < 2
+    first, *_ = json.loads((searched[0] / "under_trees.json").read_text())["people"]
+    longitude, latitude = first["longitude_deg"], np.radians(first["latitude_deg"])
+    column = (longitude / 360 + 0.5) * 2**20
+    row = (0.5 - np.arcsinh(np.tan(latitude)) / (2 * np.pi)) * 2**20
+    x, y = int(column), int(row)
+    at = round((column - x) * 256), round((row - y) * 256)
+
+    def contrast(up_m: float) -> float:
+        data = tiles.tile("site", about["run"], up_m, 20, x, y)
+        shown = np.asarray(Image.open(BytesIO(data)).convert("RGBA"))
+        grey = shown[..., 0].astype(float)
+        near = grey[max(at[1] - 1, 0) : at[1] + 2, max(at[0] - 1, 0) : at[0] + 2]
+        return float(near.mean() - np.median(grey[shown[..., 3] > 0]))
+
+    assert contrast(-18.0) > 2 * contrast(-6.0) > 0, (contrast(-18.0), contrast(-6.0))
+    with pytest.raises(Problem):
+        tiles.tile("site", about["run"], 99.0, 20, x, y)
+    with pytest.raises(Problem):
+        tiles.tile("site", "an earlier look's", -18.0, 20, x, y)
 
 
 def test_a_station_is_told_of_each_person(searched: tuple[Path, int, str], site: Path) -> None:

@@ -1906,6 +1906,39 @@ def test_a_base_map_comes_from_a_file(opened: Watched, tmp_path: Path) -> None:
     page.locator(".message.error", has_text="cannot be read").wait_for()
 
 
+def test_the_height_below_crowns_is_chosen_with_a_slider(
+    browser: Any, made_site: Path, tmp_path: Path
+) -> None:
+    """A site that nobody looked at below its crowns has no such layer."""
+    shutil.copytree(made_site, tmp_path / "looked")
+    looked = {"floor_m": -19.8, "levels": [-3.0, 9.0]}
+    (tmp_path / "looked" / "flights" / "b" / "under_trees.json").write_text(json.dumps(looked))
+    shutil.copytree(made_site, tmp_path / "field")
+    with Served(tmp_path) as station:
+        context = context_of(browser)
+        page = context.new_page()
+        asked: list[str] = []
+
+        def give(route: Any) -> None:
+            asked.append(route.request.url.split("/under-trees/")[1])
+            route.fulfill(status=204)
+
+        page.route("**/under-trees/**", give)
+        page.goto(f"{station.url}/#/site/field/layers")
+        page.get_by_label("Track").wait_for()
+        assert page.get_by_label("Under the trees").count() == 0
+        page.goto(f"{station.url}/#/site/looked/layers")
+        page.get_by_label("Under the trees", exact=True).check()
+        run = station.ask("/api/sites/looked")["under_trees"]["run"]
+        wait_for(lambda: any(each.startswith(f"{run}/-20/") for each in asked))
+        slider = page.get_by_label("Height under the trees")
+        slider.focus()
+        slider.press("ArrowRight")
+        page.get_by_text("1 m above the floor").wait_for()
+        wait_for(lambda: any(each.startswith(f"{run}/-19/") for each in asked))
+        context.close()
+
+
 def test_the_station_s_own_base_map_is_shown_at_once(
     browser: Any, made_site: Path, tmp_path: Path
 ) -> None:

@@ -54,7 +54,7 @@ from sorvolo.station.site_deletion import SiteDeletion, site_deletion_routes
 from sorvolo.station.sites import SiteShelf, readable, site_detail
 from sorvolo.station.state import RootLock, StationState
 from sorvolo.station.stream_routes import CameraDoor, announcing, stream_routes
-from sorvolo.station.tiles import WebTiles, wmts_routes
+from sorvolo.station.tiles import FloorTiles, WebTiles, wmts_routes
 from sorvolo.station.tokens import has_tokens
 from sorvolo.station.uploads import Uploads, upload_routes
 
@@ -73,6 +73,7 @@ class Station:
     state: StationState
     shelf: SiteShelf
     tiles: WebTiles
+    floor_tiles: FloorTiles
     events: EventLog
     collections: SiteCollections
     reviews: Reviews
@@ -116,6 +117,7 @@ class Station:
             state,
             shelf,
             tiles,
+            FloorTiles(shelf),
             events,
             collections,
             reviews,
@@ -223,6 +225,10 @@ _TILES: dict[int | str, Json] = {
     200: {"description": "The tile", "content": {"image/webp": {}, "image/png": {}}},
     204: {"description": "Nothing of the map"},
 }
+_FLOOR_TILES: dict[int | str, Json] = {
+    200: {"description": "The tile", "content": {"image/webp": {}}},
+    204: {"description": "Too few pictures show it"},
+}
 
 
 def _about_routes(station: Station) -> APIRouter:
@@ -316,7 +322,12 @@ def _site_routes(station: Station) -> APIRouter:
             if detail["versions"] or detail["bounds_wgs84"]
             else None
         )
-        return {**detail, "live_revision": revision, "links": landing_links(request, site)}
+        return {
+            **detail,
+            "live_revision": revision,
+            "under_trees": station.floor_tiles.about(site),
+            "links": landing_links(request, site),
+        }
 
     @router.get(
         "/{site}/tiles/{version}/{z}/{x}/{y}.{kind}", response_class=Response, responses=_TILES
@@ -333,6 +344,18 @@ def _site_routes(station: Station) -> APIRouter:
             {"cache-control": kept},
             f"image/{kind}" if answer.data else None,
         )
+
+    @router.get(
+        "/{site}/under-trees/{run}/{up_m}/{z}/{x}/{y}.webp",
+        response_class=Response,
+        responses=_FLOOR_TILES,
+    )
+    def floor_tile(site: str, run: str, up_m: float, z: int, x: int, y: int) -> Response:
+        """A tile of a look below crowns, its pictures put together `up_m` metres above the site's level. 204: too few."""
+        data = station.floor_tiles.tile(site, run, up_m, z, x, y)
+        kept = _FOR_EVER.replace("public", "private")
+        status, kind = (200, "image/webp") if data else (204, None)
+        return Response(data, status, {"cache-control": kept}, kind)
 
     return router
 

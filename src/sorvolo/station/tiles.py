@@ -1,34 +1,44 @@
-"""Tiles of a site's map for web maps: any version, and the growing one, warped from the site's grid to Web Mercator."""
+"""Tiles of a site for web maps: any version of its map, the growing one, and the floor below crowns at any height."""
 
 import hashlib
+import json
 import os
 import re
 import threading
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 from xml.sax.saxutils import escape, quoteattr
 
 import cv2
 import numpy as np
 from fastapi import APIRouter, Request, Response
+from numpy.typing import NDArray
 from PIL import Image
 from rasterio import DatasetReader
 from rasterio.enums import Resampling
 from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
+from sorvolo.canopy.integral import lay, levelled, seeing
 from sorvolo.errors import SorvoloError
 from sorvolo.geometry.arrays import Floats, Floats32, ImageRGBA
+from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import Grid, SiteGrid, TileIndex
+from sorvolo.heights.lattice import Lattice
+from sorvolo.heights.views import View
+from sorvolo.missions.heights.run import FlightPictures, flight_views, solved_before
+from sorvolo.paths import Json
 from sorvolo.station.problems import Problem
 from sorvolo.station.security import FOR_VIEWERS, address
 from sorvolo.station.sites import SiteShelf, bounds_lonlat
 from sorvolo.store.images import BytesCache
 from sorvolo.store.rasters.geotiff import crs_of_epsg, open_raster, quiet_gdal
 from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.files import UNDER_TREES
 from sorvolo.store.site.tiles import TileView
 
 _MOST_LEVELS = 24  # halvings; a map of a million tiles a side needs 20
@@ -370,6 +380,127 @@ def _resampled(source: ImageRGBA, places_px: Floats32) -> ImageRGBA:
     mixed = cv2.remap(weighted, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
     colours = mixed[..., :3] / np.maximum(mixed[..., 3:], 1e-3)
     return np.clip(np.round(np.dstack([colours, 255 * mixed[..., 3]])), 0, 255).astype(np.uint8)
+
+
+_FLOOR_ZOOM = 17  # and deeper: the ground of a tile is small enough to be level
+_FLOOR_REACH_M = (-15.0, 30.0)  # of heights about the floor's: below it, and up to crowns
+_FLOOR_VIEWS = 64  # of a tile at most: what one costs is bound
+_FLOOR_PX = 640  # the longest side of their pictures
+_FLOOR_BYTES = 96 << 20
+_LEAST_SHOWN = 8  # views of a pixel
+
+
+class FloorTiles:
+    """The pictures of a flight laid on a height below its crowns, put together while somebody looks.
+
+    One tile is made at a time. What was made last is kept within bounds of memory.
+    """
+
+    def __init__(self, shelf: SiteShelf) -> None:
+        self._shelf, self._lock = shelf, threading.Lock()
+        self._kept = BytesCache[tuple[str, ...], Any](_FLOOR_BYTES, lambda each: int(each.nbytes))
+        self._views: tuple[tuple[str, ...], Sequence[View], FlightPictures] | None = None
+
+    def about(self, site_id: str) -> Json | None:
+        """The newest flight that was looked at below its crowns, its run, its floor's height and the heights there are,
+        site metres up; None without one."""
+        archive = self._shelf.open(site_id)
+        for flight in reversed(archive.complete_flights):
+            try:
+                text = (archive.flight_folder(flight.id) / UNDER_TREES).read_text()
+                found = json.loads(text)
+                floor_m, (dark, bright) = (
+                    round(float(found["floor_m"])),
+                    map(float, found["levels"]),
+                )
+                low_m, high_m = (floor_m + each for each in _FLOOR_REACH_M)
+                return {
+                    "flight": flight.id,
+                    "run": hashlib.sha256(text.encode()).hexdigest()[:12],
+                    "floor_m": floor_m,
+                    "low_m": low_m,
+                    "high_m": high_m,
+                    "levels": [dark, bright],
+                }
+            except (OSError, ValueError, KeyError, TypeError):  # none, or damaged
+                continue
+        return None
+
+    def tile(self, site_id: str, run: str, up_m: float, z: int, x: int, y: int) -> bytes:
+        """An XYZ tile as WebP, b"" where too few pictures show it. Raises Problem (404), StoreError."""
+        about = self.about(site_id)
+        if about is None or run != about["run"]:
+            raise Problem(404, "nobody looked below the crowns of this site, or did so again since")
+        if not (about["low_m"] <= up_m <= about["high_m"] and _FLOOR_ZOOM <= z <= _DEEPEST_ZOOM):
+            raise Problem(
+                404,
+                f"no such height or zoom: heights from {about['low_m']} to {about['high_m']} m, zooms from {_FLOOR_ZOOM}",
+            )
+        with self._lock:
+            return self._tile(site_id, about, up_m, z, x, y)
+
+    def _tile(self, site_id: str, about: Json, up_m: float, z: int, x: int, y: int) -> bytes:
+        archive = self._shelf.open(site_id)
+        corners = np.array([[x, y], [x + 1, y], [x, y + 1]]) / 2**z
+        latitude = np.degrees(np.arctan(np.sinh(np.pi * (1 - 2 * corners[:, 1]))))
+        lonlat = np.column_stack([corners[:, 0] * 360.0 - 180.0, latitude])
+        first, right, below = archive.site_grid().frame.ground_from_lonlat(lonlat)
+        across, down = (right - first) / TILE_PX, (below - first) / TILE_PX
+        middle = first + (across + down) / 2
+        affine = np.vstack([np.column_stack([across, down, middle]), [0.0, 0.0, 1.0]])
+        lattice = Lattice(affine, TILE_PX, TILE_PX, float(np.linalg.norm(across)))
+        views, pictures = self._opened(archive, site_id, about)
+        numbers = seeing(views, lattice, up_m)
+        numbers = numbers[:: -(-len(numbers) // _FLOOR_VIEWS) or 1]
+        total, count = np.zeros(lattice.shape, np.float32), np.zeros(lattice.shape, np.float32)
+        for number in numbers:
+            key, size = (site_id, about["run"], str(number)), views[number].camera
+            small = self._kept.get(key, partial(_levels, pictures, number, size))
+            laid = lay(views[number], small.astype(np.float32), lattice, float(up_m))[..., 0]
+            count += np.isfinite(laid)
+            total += np.nan_to_num(laid)
+        dark, bright = about["levels"]
+        grey = (total / np.maximum(count, 1) - dark) / max(bright - dark, 1e-6) * 255
+        shown = 255 * (count >= _LEAST_SHOWN)
+        rgba = np.clip(np.dstack([grey, grey, grey, shown]), 0, 255).astype(np.uint8)
+        return encoded(rgba, ".webp") if shown.any() else b""
+
+    def _opened(
+        self, archive: Archive, site_id: str, about: Json
+    ) -> tuple[Sequence[View], FlightPictures]:
+        """The views of a look, their pixels those of pictures of `_FLOOR_PX`, and what loads these."""
+        key = (site_id, about["run"])
+        if self._views is None or self._views[0] != key:
+            keyframes = [
+                each for each in archive.sound_keyframes(about["flight"]) if each.site_from_camera
+            ]
+            mapped = flight_views(archive, about["flight"], keyframes)
+            solved = solved_before(archive, keyframes, mapped, UNDER_TREES)
+            if solved is None:
+                raise Problem(
+                    404, f"flight {about['flight']} was mapped again; look through its trees again"
+                )
+            by_name = {each.name: each for each in keyframes}
+            keyframes = [by_name[view.name] for view in solved.views]
+            first = solved.views[0].camera
+            share = min(1.0, _FLOOR_PX / max(first.width_px, first.height_px))
+            views = [_smaller(view, share) for view in solved.views]
+            self._views = key, views, FlightPictures(archive, keyframes, solved.radial)
+        return self._views[1:]
+
+
+def _smaller(view: View, share: float) -> View:
+    width_px, height_px = (
+        round(each * share) for each in (view.camera.width_px, view.camera.height_px)
+    )
+    return replace(view, camera=view.camera.resized(width_px, height_px))
+
+
+def _levels(pictures: FlightPictures, number: int, camera: Camera) -> NDArray[np.int16]:
+    """(H, W) a picture in gray without its usual level, of a camera's size."""
+    size = camera.width_px, camera.height_px
+    gray = cv2.resize(pictures.gray(number), size, interpolation=cv2.INTER_AREA)
+    return levelled(np.asarray(gray, np.uint8)).astype(np.int16)
 
 
 _DEEPEST = 9  # beyond it a tile is wider than the file's blocks are aligned

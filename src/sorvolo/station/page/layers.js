@@ -15,9 +15,11 @@ import { day, percent, VERDICTS } from "./words.js";
 export function layersPanel(screen, body) {
   const { data, view } = screen;
   const legend = el("div");
+  const { under_trees: under } = data.detail;
   const layers = el("fieldset.ticks", el("legend", say("Layers")),
-    Object.entries(GROUPS).map(([group, [words]]) => [tick(words, choices.get("layers")[group] ?? GROUPS[group][1],
+    Object.entries(GROUPS).filter(([group]) => group !== "trees" || under).map(([group, [words]]) => [tick(words, choices.get("layers")[group] ?? GROUPS[group][1],
       (shown) => { view?.show(group, shown); refresh(); }),
+    group === "trees" && heightSlider(under, view),
     FADED[group] && el("input", { type: "range", min: 0.1, max: 1, step: 0.05, "aria-label": say("Opacity: {layer}", { layer: words }), ".value": String(view?.opacity(group) ?? 1), on: { input: (event) => view?.fade(group, Number(event.target.value)) } })]));
   const found = el("div");
   const coverage = el("div");
@@ -33,6 +35,13 @@ export function layersPanel(screen, body) {
   }
   refresh();
   return { refresh };
+}
+
+/** The height at which pictures are put together: the floor is sharp at its own. */
+function heightSlider({ floor_m: floor, low_m: min, high_m: max, ...under }, view) {
+  const above = el("output", say("{n} m above the floor", { n: 0 }));
+  return el("div.row", el("input", { type: "range", min, max, step: 1, "aria-label": say("Height under the trees"), ".value": String(floor),
+    on: { input: (event) => fill(above, say("{n} m above the floor", { n: Number(event.target.value) - floor })), change: (event) => view?.showUnderTrees(under, Number(event.target.value)) } }), above);
 }
 
 function whyEmpty(data) {

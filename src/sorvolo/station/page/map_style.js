@@ -25,7 +25,7 @@ const matched = (property, table, other) => ["match", ["get", property], ...Obje
 export const GROUPS = {
   mosaic: [say("Map"), true], frames: [say("Footprints of the frames"), false], track: [say("Track"), true],
   objects: [say("Objects"), true], changes: [say("Changes"), true], coverage: [say("Coverage gaps"), false],
-  pod: [say("Chance to have seen a person"), false], drone: [say("Drone and field of view"), true], drawings: [say("Drawings and zones"), true],
+  trees: [say("Under the trees"), false], pod: [say("Chance to have seen a person"), false], drone: [say("Drone and field of view"), true], drawings: [say("Drawings and zones"), true],
 };
 
 /** What is laid over ground and can be made fainter: its property of opacity, and that at first. */

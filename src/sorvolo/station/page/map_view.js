@@ -108,6 +108,19 @@ export class MapView {
       layout: { visibility: this.isShown("mosaic") ? "visible" : "none" } }, "coverage");
   }
 
+  /** Show the pictures put together at a height below the crowns, m; `under` is the site's look through them. */
+  showUnderTrees(under, up_m = under?.floor_m) {
+    this.groups.trees = ["trees"];
+    if (this.map.getLayer("trees")) this.map.removeLayer("trees");
+    if (this.map.getSource("trees")) this.map.removeSource("trees");
+    if (!under) return;
+    this.map.addSource("trees", {
+      type: "raster", tileSize: 256, minzoom: 17, maxzoom: 21, ...(this.site.bounds_wgs84 ? { bounds: this.site.bounds_wgs84 } : {}),
+      tiles: [location.origin + siteUrl(this.site.id, "under-trees", under.run, up_m, "{z}/{x}/{y}.webp")],
+    });
+    this.map.addLayer({ id: "trees", type: "raster", source: "trees", paint: { "raster-fade-duration": 0 }, layout: { visibility: this.isShown("trees") ? "visible" : "none" } }, "coverage");
+  }
+
   /** The growing map changed within bounds: only its tiles there are asked for again. */
   refresh(revision, bounds) {
     this.changes.push({ revision, bounds });

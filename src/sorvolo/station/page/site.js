@@ -144,6 +144,7 @@ class SiteScreen {
     const drawn = this.view?.ready.then(() => {
       if (this.closed) return;
       this.view.showVersion(live ? `live-${live}` : versions.at(-1)?.n);
+      this.view.showUnderTrees(this.data.detail.under_trees);
       showStationMap(this);
       if (!this.lastPlace) {
         if (this.data.detail.bounds_wgs84 && this.view.covered().low) this.view.go(this.data.detail.bounds_wgs84, 0, true); // what a sheet lies over
