@@ -297,11 +297,10 @@ def _show_progress(
                 site = site or site_of(folder)
                 unit, colour = "units" if site.is_local else "m", _COLOURS[change.kind]
                 what = _class_words(change.kind, change.class_before, change.class_after)
-                middle_m = (change.outline_m.min(axis=0) + change.outline_m.max(axis=0)) / 2
                 console.print(
                     f"[{colour}]{change.kind.value:>11}[/{colour}]  {escape(change.id)}: "
                     f"{what + ', ' if what else ''}{change.length_m:.1f} {unit} long, "
-                    f"at {place_words(site, form)(middle_m)} (accuracy {change.sigma_m:.2f} {unit})",
+                    f"at {place_words(site, form)(change.centre_m)} (accuracy {change.sigma_m:.2f} {unit})",
                     soft_wrap=True,
                 )
             compared = f"{update.compared:,} of {counted(update.views, 'view')} compared"

@@ -197,6 +197,11 @@ class ChangeFacts:
     class_after: str = field(default="", kw_only=True)
 
     @property
+    def centre_m(self) -> Floats:
+        """(2,) the middle of the outline's box, site metres."""
+        return (self.outline_m.min(axis=0) + self.outline_m.max(axis=0)) / 2
+
+    @property
     def is_single_view(self) -> bool:
         """Whether one view alone shows it: no other confirmed it."""
         return self.views == 1

@@ -67,7 +67,7 @@ def object_of(change: Change) -> MapObject:
         change.id,
         change.class_after,
         change.score,
-        (change.outline_m.min(axis=0) + change.outline_m.max(axis=0)) / 2,
+        change.centre_m,
         change.sigma_m,
         change.length_m,
         math.nan,

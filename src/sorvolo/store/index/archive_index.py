@@ -194,7 +194,9 @@ def _shown(keyframe: StoredKeyframe, site: Site) -> _Row | None:
 
 
 def _objects(archive: Archive, flight: str, site: Site) -> PlacedRows:
-    things = [each.thing for each in archive.objects(flight)]
+    changed = {each.id for each in archive.changes(flight)}  # rows of their own
+    found = [each.thing for each in archive.objects(flight)]
+    things = [each for each in found if each.id not in changed]
     if not things:
         return PlacedRows()
     longitudes, latitudes = longitude_latitude(np.array([each.position_m for each in things]), site)

@@ -49,11 +49,6 @@ class StoredChange(ChangeFacts):
     sigma_in_map_m: float = float("nan")
     height_change: HeightChange | None = None
 
-    @property
-    def centre_m(self) -> PointsM:
-        """(2,) the middle of the outline's box, site metres."""
-        return _centre(self.outline_m)
-
 
 @dataclass(frozen=True, eq=False)
 class StoredReview:
@@ -70,7 +65,7 @@ class StoredReview:
     @property
     def centre_m(self) -> PointsM:
         """(2,) the middle of the outline's box, site metres."""
-        return _centre(self.outline_m)
+        return (self.outline_m.min(axis=0) + self.outline_m.max(axis=0)) / 2
 
 
 def stored_changes(flight_id: str, changes: Sequence[Change]) -> list[StoredChange]:
@@ -183,10 +178,6 @@ def compared_versions(connection: Connection) -> dict[int, Mapping[str, int]]:
     return {
         row.version_id: row.kinds for row in schema.checked_rows(connection, table, select(table))
     }
-
-
-def _centre(outline_m: PointsM) -> PointsM:
-    return (outline_m.min(axis=0) + outline_m.max(axis=0)) / 2
 
 
 _STORED = (
