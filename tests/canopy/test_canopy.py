@@ -17,6 +17,7 @@ from sorvolo.canopy.integral import (
     levelled,
 )
 from sorvolo.errors import InputError
+from sorvolo.geometry.camera import Camera
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.views import View
 
@@ -70,6 +71,17 @@ def test_focus_states_the_floors_height(looked: tuple[UnderTrees, Floor, Finds])
     off_m = looked[1].on(_LATTICE) - _FLOOR_M
     assert np.sqrt(np.mean(off_m**2)) < 1.0
     assert 0.0 < np.median(looked[1].sigma_m) < 2.0
+
+
+def test_what_is_sharp_by_chance_below_the_floor_is_no_floor() -> None:
+    bodies_m = np.array([[-4.0, -3.0], [4.0, 5.0]])
+    wood = make_forest(2, 50, 3.0, bodies_m, _FLOOR_M)
+    camera = Camera.from_angle_of_view(256, 256, 50)
+    views = fly(wood, np.arange(-9, 10, 4.5), np.arange(-9, 10, 3.0), seed=2, camera=camera)
+    pictures = [levelled(photograph(wood, view)) for view in views]
+    coarse = Lattice(np.array([[0.15, 0, -12], [0, -0.15, 12], [0, 0, 1]]), 160, 160, 0.15)
+    floor = focus(views, pictures.__getitem__, coarse, -28.0, 7.0)
+    assert abs(np.median(floor.up_m) - _FLOOR_M) < 1.0
 
 
 def test_warm_leaves_in_a_crown_are_no_people(

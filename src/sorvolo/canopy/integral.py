@@ -31,6 +31,7 @@ _CLIP = 3.0  # sigmas: what stands out does not widen the spread that it is meas
 _BLOCK_M = 5.0  # side of the ground that gets one height by focus
 _FOCUS_STEP_M = 1.5
 _CLEAR = 1.25  # times the sharpness below and above the floor
+_STANDS_OUT = 3.0  # times the sharpness below the floor, where nothing is and chance makes tops
 _NEAR_LEVEL_M = 6.0  # the floor is no farther from its own usual level
 _MANY_VIEWS = 32.0
 _SPARE = 0.05  # weight of that level beside what a place shows
@@ -235,7 +236,8 @@ def focus(
     score = gaussian_filter(score, (0, 0.7, 1.0, 1.0))
     # what few views show is crowns that have not blurred away
     pooled = score[0][:, often >= often.max() / 2].mean(axis=1)
-    level_tops = np.flatnonzero(_clear_tops(pooled))
+    stands_out = pooled > _STANDS_OUT * np.minimum.accumulate(pooled)
+    level_tops = np.flatnonzero(_clear_tops(pooled) & stands_out)
     if not len(level_tops):
         raise InputError(
             f"no height between {low_m:.0f} and {high_m:.0f} m brings a floor into focus: the cameras are not known "
