@@ -1,6 +1,6 @@
 """Heights and true orthophotos: how right they are on simulated sites with houses, and what a real flight costs.
 
-python benchmarks/heights.py [--seeds 301] [--flight DATA/flights/brighton_beach] [--colmap cameras.json]
+python benchmarks/heights.py [--seeds 301] [--flight DATA/flights/brighton_beach]
 python benchmarks/heights.py --relief 8 --output benchmarks/results/heights_relief.json
 
 Simulated: three strips of photos over a site with houses and trees, GPS noise 0.3 m; mapped, then heights. What all GPS
@@ -10,8 +10,7 @@ edges), also with the tilt out that GPS fixes leave, and of the ground that two 
 up to the edges; the share of cells within 2 sigma; and how far roofs lie from their place in the flat map and in the
 true orthophoto. In pixels of the map. With --relief the site lies on hills so many
 metres high.
-Real: seconds of the processor and memory of `sorvolo map` and `sorvolo heights`, each a process of its own, and, with
-the cameras of COLMAP (benchmarks/peers.py writes them), the distance of cameras after the best similarity.
+Real: seconds of the processor and memory of `sorvolo map` and `sorvolo heights`, each a process of its own.
 Written to results/heights.json.
 """
 
@@ -80,7 +79,6 @@ def main() -> None:
     )
     parser.add_argument("--relief", type=float, default=0.0, help="of hills under the sites, m")
     parser.add_argument("--flight", type=Path, nargs="*", default=[])
-    parser.add_argument("--colmap", type=Path)
     parser.add_argument("--output", type=Path, default=RESULTS)
     options = parser.parse_args()
     result: dict[str, Any] = {"benchmark": "heights", "machine": machine(), "commit": commit()}
@@ -89,7 +87,7 @@ def main() -> None:
         result |= note_scoring(f"heights, seeds {seeds}")
     result["relief_m"] = options.relief
     result["simulated"] = {str(seed): simulated(seed, options.relief) for seed in seeds}
-    result["real"] = {folder.name: real(folder, options.colmap) for folder in options.flight}
+    result["real"] = {folder.name: real(folder) for folder in options.flight}
     options.output.parent.mkdir(exist_ok=True)
     options.output.write_text(json.dumps(result, indent=1) + "\n")
     print(json.dumps(result, indent=1))
@@ -342,8 +340,8 @@ def _shift_px(
     return np.array(shift)
 
 
-def real(folder: Path, colmap: Path | None) -> dict[str, Any]:
-    """What mapping a flight and its heights cost, and how far its cameras are from COLMAP's."""
+def real(folder: Path) -> dict[str, Any]:
+    """What mapping a flight and its heights cost."""
     with tempfile.TemporaryDirectory() as scratch:
         site = Path(scratch) / "site"
         mapping = ["map", str(folder), "--model", "none", "--site"]
@@ -352,17 +350,12 @@ def real(folder: Path, colmap: Path | None) -> dict[str, Any]:
         whole = _measured([*mapping, str(site.with_name("whole"))])
         report = json.loads(next(site.glob("flights/*/heights.json")).read_text())
         frames = json.loads(next(site.glob("flights/*/frames.geojson")).read_text())["features"]
-        result = {
+        return {
             "photos": len(frames),
             **{"flat": flat, "heights": heights, "whole": whole},
             "residual_rms_px": report["cameras"]["residual_rms_px"],
             "surface": report["surface"],
         }
-        if colmap is not None:
-            result["cameras_against_colmap_m"] = against_colmap(
-                report, json.loads(colmap.read_text())
-            )
-    return result
 
 
 def _measured(arguments: list[str]) -> dict[str, float]:
@@ -376,27 +369,6 @@ def _measured(arguments: list[str]) -> dict[str, float]:
     )
     code, cpu_s, memory_mb = json.loads(done.stdout.splitlines()[-1])
     return {"exit_code": code, "cpu_s": round(cpu_s, 1), "peak_memory_mb": round(memory_mb)}
-
-
-def against_colmap(report: dict[str, Any], reference: dict[str, Any]) -> dict[str, float]:
-    """Rms distance of the cameras after the best similarity in space: east and north, and up."""
-    places = {
-        each["frame"]: [each["east_m"], each["north_m"], each["up_m"]]
-        for each in report["cameras"]["places"]
-    }
-    names = sorted(set(places) & set(reference["cameras"]))
-    ours = np.array([places[name] for name in names])
-    theirs = np.array([reference["cameras"][name]["centre"] for name in names])
-    a, b = ours - ours.mean(axis=0), theirs - theirs.mean(axis=0)
-    u, scale, vt = np.linalg.svd(a.T @ b)
-    turn = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
-    moved = (scale * np.diag(turn)).sum() / (b**2).sum() * b @ (u @ turn @ vt).T
-    off = a - moved
-    return {
-        "east_north": _rms(np.linalg.norm(off[:, :2], axis=1)),
-        "up": _rms(off[:, 2]),
-        "cameras": len(names),
-    }
 
 
 def _rms(values: Any) -> float:

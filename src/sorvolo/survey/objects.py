@@ -61,7 +61,7 @@ class Detections:
 
     def only(self, keep: Mask | Rows | Sequence[int]) -> "Detections":
         """The rows that a mask or indices keep."""
-        index = np.asarray(keep)
+        index = np.asarray(keep) if len(keep) else np.zeros(0, int)  # [] would be floats
         return Detections(
             self.boxes_px[index], self.scores[index], self.labels[index], self.classes
         )

@@ -37,7 +37,6 @@ from sorvolo.paths import AnyPath, Json
 from sorvolo.search.drawing.noise import layer
 from sorvolo.search.drawing.objects import (
     GROUND_LEVEL,
-    LYING,
     POSES,
     Thing,
     ThingLabel,
@@ -293,7 +292,11 @@ def _targets(
     placed: list[Thing] = []
     for label in (ThingLabel.CAR, ThingLabel.PERSON, ThingLabel.SMALL):
         for _ in range(counts[label]):
-            kind = _person(rng) if label is ThingLabel.PERSON else new_kind(label, rng)
+            kind = (
+                str(rng.choice(list(POSES), p=(0.28, 0.34, 0.08, 0.08, 0.1, 0.12)))
+                if label is ThingLabel.PERSON
+                else new_kind(label, rng)
+            )
             size_m = new_size(label, kind, rng)
             new = Thing(
                 len(others) + len(placed) + 1,
@@ -312,13 +315,6 @@ def _targets(
                     placed.append(new)
                     break
     return tuple(placed)
-
-
-def _person(rng: Generator) -> str:
-    """A kind of person: mostly one drawn limb by limb, else the plain figures of simulated flights."""
-    if rng.uniform() < 0.25:
-        return LYING if rng.uniform() < 0.2 else str(ThingLabel.PERSON)
-    return str(rng.choice(list(POSES), p=(0.28, 0.34, 0.08, 0.08, 0.1, 0.12)))
 
 
 def _place(

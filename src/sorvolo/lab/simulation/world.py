@@ -489,7 +489,8 @@ def _set_off(thing: Thing, others: list[Thing], rng: Generator) -> Thing:
             if not other.label.is_target
         ):
             velocity = (float(direction[0] * speed), float(direction[1] * speed))
-            return replace(thing, yaw_deg=float(yaw), velocity_m_s=velocity)
+            kind = thing.kind if is_car else "walking"
+            return replace(thing, kind=kind, yaw_deg=float(yaw), velocity_m_s=velocity)
     return thing
 
 

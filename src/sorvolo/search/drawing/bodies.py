@@ -6,8 +6,6 @@ import numpy as np
 from sorvolo.geometry.arrays import Floats, ImageRGBA
 from sorvolo.search.drawing.noise import fractal
 from sorvolo.search.drawing.objects import (
-    LYING,
-    POSES,
     Body,
     Light,
     Part,
@@ -33,18 +31,6 @@ _PAINTS = np.array(
     ],
     np.float64,
 )
-_CLOTHES = np.array(
-    [
-        [200, 40, 44],
-        [30, 60, 140],
-        [232, 232, 226],
-        [40, 40, 44],
-        [226, 170, 40],
-        [50, 120, 70],
-        [120, 70, 130],
-    ],
-    np.float64,
-)
 
 
 def build_body(thing: Thing, light: Light, m_per_px: float) -> Body:
@@ -53,7 +39,7 @@ def build_body(thing: Thing, light: Light, m_per_px: float) -> Body:
     rng = np.random.default_rng([thing.seed, 7])
     to_object = Light(thing.turn.T @ light.sun, light.ambient)
     builders = {
-        ThingLabel.PERSON: _person,
+        ThingLabel.PERSON: build_person,
         ThingLabel.CAR: _car,
         ThingLabel.SMALL: _small,
         ThingLabel.TREE: _tree,
@@ -147,49 +133,6 @@ def _box_walls(
     texels = (texel_m, 2.5 * texel_m)
     return [
         _plain((side, height_m), texels, colour, grain, rng) for side in (length_m, width_m) * 2
-    ]
-
-
-def _person(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator) -> list[Part]:
-    if thing.kind in POSES:
-        return build_person(thing, light, texel_m, rng)
-    is_lying = thing.kind == LYING
-    height = thing.size_m[0 if is_lying else 2]
-    shirt, trousers = (
-        _CLOTHES[rng.integers(len(_CLOTHES))],
-        rng.uniform(25, 90) * np.array([0.9, 0.95, 1.15]),
-    )
-    skin, hair = (
-        np.array([205.0, 160, 130]) * rng.uniform(0.55, 1.05),
-        np.array([60.0, 44, 32]) * rng.uniform(0.4, 2.2),
-    )
-    # an upright body is seen from above, foreshortened
-    rows = max(6, _texels(height, texel_m if is_lying else 2.0 * texel_m))
-    columns = max(4, _texels(0.5, texel_m))
-    z = (1 - (np.arange(rows) + 0.5) / rows)[:, None]
-    x = (
-        np.abs((np.arange(columns) + 0.5) / columns * 2 - 1)[None, :] * 0.25
-    )  # metres from the middle
-    half = np.select([z > 0.95, z > 0.87, z > 0.83, z > 0.5], [0.07, 0.10, 0.06, 0.22], 0.15)
-    silhouette = np.clip((half - x) / (0.5 / columns) + 0.5, 0, 1).astype(np.float32)
-    colour = np.where((z > 0.87)[..., None], skin, np.where((z > 0.48)[..., None], shirt, trousers))
-    body = np.broadcast_to(colour * 0.8, (rows, columns, 3)).astype(np.uint8)
-    if is_lying:  # the head forward; the light falls on it from above
-        bright = np.clip(colour * light.shade(_UP), 0, 255)
-        flat = cut_out(np.broadcast_to(bright, (rows, columns, 3)).astype(np.uint8), silhouette)
-        rotated = np.ascontiguousarray(np.rot90(flat, -1))
-        return [
-            _level((0.0, 0, share * thing.size_m[2]), (height, 0.5), rotated)
-            for share in (0.3, 1.0)
-        ]
-    arms = _disc((0.26, 0.52), texel_m, shirt, light.shade(_UP))
-    head = _disc((0.2, 0.17), texel_m, hair, light.shade(_UP))
-    feet = _disc((0.3, 0.3), texel_m, trousers, 0.8)
-    return [
-        _level((0.05, 0, 0.08), (0.3, 0.3), feet),
-        StandingPart(0.0, (0.5, height), cut_out(body, silhouette)),
-        _level((0.0, 0, 0.80 * height), (0.26, 0.52), arms),
-        _level((0.03, 0, 0.97 * height), (0.2, 0.17), head),
     ]
 
 

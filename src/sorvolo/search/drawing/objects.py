@@ -35,9 +35,6 @@ class ThingLabel(StrEnum):
 SMALL_KINDS = ("box", "big box", "suitcase", "metal suitcase", "bag", "tyre", "gas bottle")
 """The small objects of the thesis's Table 2.4."""
 
-LYING = "lying person"
-"""The kind of a person who lies on the ground: whom search teams look for."""
-
 POSES = {
     "standing": (0.25, 0.4, 1.0),
     "walking": (0.5, 0.4, 1.0),
@@ -46,8 +43,7 @@ POSES = {
     "sitting": (0.7, 0.5, 0.55),
     "lying": (1.1, 0.7, 0.16),
 }
-"""The kinds of people who are drawn limb by limb, each dressed in an own way: about how long, wide and high they are,
-as shares of their stature."""
+"""The kinds of people, each dressed in an own way: about how long, wide and high they are, as shares of their stature."""
 
 _SMALL_SIZES_M = {  # length, width, height
     "box": (0.45, 0.35, 0.32),
@@ -131,7 +127,7 @@ class Thing:
 
 @dataclass(frozen=True, eq=False)
 class StandingPart:
-    """An upright silhouette that always turns its face to the eye, as a person's body does nearly enough."""
+    """An upright silhouette that always turns its face to the eye, as a trunk does."""
 
     foot_m: float  # height of its lower edge
     size_m: tuple[float, float]  # width, height
@@ -220,15 +216,10 @@ class Light:
 def new_size(label: ThingLabel, kind: str, rng: np.random.Generator) -> tuple[float, float, float]:
     """A likely length, width and height in metres."""
     if label is ThingLabel.PERSON:
-        # Of adults, and in a pose of children now and then
-        if kind in POSES:
-            stature = float(
-                rng.uniform(0.95, 1.4) if rng.uniform() < 0.1 else rng.uniform(1.5, 1.95)
-            )
-            length, width, high = POSES[kind]
-            return length * stature, width * stature, high * stature
-        height = float(rng.uniform(1.6, 1.88))
-        return (height, 0.5, 0.24) if kind == LYING else (0.34, 0.52, height)
+        share = float(rng.uniform())  # one of ten is a child
+        stature = 0.95 + 4.5 * share if share < 0.1 else 1.45 + 0.5 * share
+        length, width, high = POSES[kind]
+        return length * stature, width * stature, high * stature
     if label is ThingLabel.CAR:
         return _CAR_SIZES_M[kind]
     if label is ThingLabel.SMALL:
@@ -242,9 +233,9 @@ def new_size(label: ThingLabel, kind: str, rng: np.random.Generator) -> tuple[fl
 
 
 def new_kind(label: ThingLabel, rng: np.random.Generator) -> str:
-    """A random kind of people, cars or small objects."""
+    """A random kind of cars or small objects; people stand."""
     kinds = {ThingLabel.CAR: tuple(_CAR_SIZES_M), ThingLabel.SMALL: SMALL_KINDS}.get(
-        label, (str(label),)
+        label, ("standing",)
     )
     return kinds[int(rng.integers(len(kinds)))]
 
