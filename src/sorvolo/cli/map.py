@@ -291,12 +291,11 @@ def _quality_rows(report: JsonView) -> list[tuple[str, str]]:
     if found.get("model") is not None:
         objects = f"{counted_list(found['classes'], none='none')} (model {found['model']})"
     offset = report["time_offset"]
-    offsets = []
-    if offset["origin"] != "none":
-        offsets.append(f"{offset['applied_s']:+.2f} s ({offset['origin']})")
+    offsets = [f"{offset['applied_s']:+.2f} s (given)"] if offset["origin"] == "given" else []
     if offset["estimate_s"] is not None:
+        unused = "" if offset["origin"] == "estimated" else ", not applied"
         offsets.append(
-            f"estimated from the motion: {offset['estimate_s']:+.2f} s (1 sigma {offset['sigma_s']:.2f} s)"
+            f"{offset['estimate_s']:+.2f} s by the motion (1 sigma {offset['sigma_s']:.2f} s){unused}"
         )
     return [
         *rows,
