@@ -1,6 +1,8 @@
 """What stands on a map, from sightings whose truth is known: each once, in its place, walkers as walkers."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -58,6 +60,7 @@ def box_of(
     yaw_deg: float,
     *,
     least_shown: float = 1.0,
+    ground_m: float = 0.0,
 ) -> np.ndarray | None:
     """The box around a body of its class's usual size, as far as the picture shows it; None where that is less of
     either side than `least_shown`."""
@@ -71,7 +74,7 @@ def box_of(
     rotation = np.array(
         [[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]]
     )
-    points = corners @ rotation.T + [east_m, north_m, 0.0]
+    points = corners @ rotation.T + [east_m, north_m, ground_m]
     pose = frame.site_from_camera
     assert pose is not None
     image = CAMERA.pixels_from_points((points - pose.translation_m) @ pose.rotation) + 0.5
@@ -85,6 +88,10 @@ def box_of(
     )
 
 
+def _surely(hills, places_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return hills(places_m), np.full(len(places_m), 0.1)
+
+
 def sightings(
     frames: list[PlacedFrame],
     things: list[Thing],
@@ -93,8 +100,10 @@ def sightings(
     false_alarms: float = 0.0,
     seed: int = 1,
     least_shown: float = 1.0,
+    hills: Callable[[np.ndarray], np.ndarray] | None = None,
+    knows_hills: bool = True,
 ) -> list[LaidSighting]:
-    """What a detector sees of things whose boxes' edges err by a pixel."""
+    """What a detector sees of things, on level ground or `hills`, whose boxes' edges err by a pixel."""
     random = np.random.default_rng(seed)
     result: list[LaidSighting] = []
     for frame in frames:
@@ -108,6 +117,7 @@ def sightings(
                 north_m + north_m_s * seconds,
                 yaw_deg,
                 least_shown=least_shown,
+                ground_m=0.0 if hills is None else float(hills(np.array([[east_m, north_m]]))[0]),
             )
             if box is not None and random.random() >= misses:
                 boxes.append(box + random.normal(0, 1.0, 4))
@@ -118,7 +128,9 @@ def sightings(
             labels.append(int(random.integers(3)))
         scores = random.uniform(0.4, 0.95, len(boxes))
         seen = Detections(np.array(boxes).reshape(-1, 4), scores, np.array(labels), CLASSES)
-        result += [each for each in lay_on_ground(seen, frame) if each is not None]
+        ground = None if hills is None or not knows_hills else partial(_surely, hills)
+        laid = lay_on_ground(seen, frame, ground=ground)
+        result += [each for each in laid if each is not None]
     return result
 
 
@@ -129,6 +141,24 @@ THINGS = [
     ("person", 21.2, 1.0, 0.0, (0.0, 0.0)),
     ("small object", 26.0, 6.0, 60.0, (0.0, 0.0)),
 ]
+
+
+def test_on_a_slope_whose_heights_are_known_each_is_there_once_in_its_place() -> None:
+    """Laid on level ground, one of the cars is two, half a metre apart, and the other one none."""
+
+    def hills(places_m: np.ndarray) -> np.ndarray:
+        return -4.0 + 0.1 * (places_m[:, 0] - 12.0)
+
+    cars = [("car", 12.0, 3.0, 30.0, (0.0, 0.0)), ("car", 24.0, 5.0, 30.0, (0.0, 0.0))]
+    frames, off_m = survey(), {}
+    for knows_hills in (True, False):
+        laid = sightings(frames, cars, misses=0.0, hills=hills, knows_hills=knows_hills)
+        objects = sorted(fuse(laid, frames).objects, key=lambda each: each.position_m[0])
+        assert len(objects) == 2
+        off_m[knows_hills] = [
+            float(np.hypot(*(each.position_m - car[1:3]))) for each, car in zip(objects, cars)
+        ]
+    assert max(off_m[True]) < 0.05 and max(off_m[False]) > 5.0
 
 
 def nearest(fused: Fused, east_m: float, north_m: float) -> tuple[str, float]:

@@ -41,7 +41,8 @@ class LaidSighting:
     metre that the middle lies higher: towards the camera. `own_sigma_m` is the place's error against other frames of
     the flight, per axis. `axes` (2, 2) are the directions on the ground, a row each, along which the box's width and
     height are `sides_m` (2,). `beyond_m2` (2, 2) is the covariance of where its middle may lie beyond the picture's
-    edge, zero where that does not cut it; all sightings that are cut alike err alike in that.
+    edge, zero where that does not cut it; all sightings that are cut alike err alike in that. `ground_m` is the ground's
+    height there, above the site's level plane.
     """
 
     sighting: Sighting
@@ -51,6 +52,7 @@ class LaidSighting:
     axes: Floats
     sides_m: Floats
     beyond_m2: Floats
+    ground_m: float = 0.0
 
     @property
     def is_cut(self) -> bool:
@@ -59,9 +61,13 @@ class LaidSighting:
 
 
 def lay_on_ground(
-    seen: Detections, frame: PlacedFrame, *, has_metres: bool = True
+    seen: Detections,
+    frame: PlacedFrame,
+    *,
+    has_metres: bool = True,
+    ground: "MeasuredGround | None" = None,
 ) -> list[LaidSighting | None]:
-    """Where each detection of a frame stands on level ground, None where that is at the horizon or unknown.
+    """Where each detection of a frame stands on the ground (None: level), None where that is at the horizon or unknown.
 
     None as well for what is of a size that its class cannot have (`sizes`).
 
@@ -74,18 +80,26 @@ def lay_on_ground(
     camera = frame.camera
     boxes_px = np.asarray(seen.boxes_px, np.float64).reshape(-1, 4)
     cut = cut_edges(boxes_px, camera.width_px, camera.height_px, TOO_SHORT_CUT_PX)
+    middles_px = (boxes_px[:, :2] + boxes_px[:, 2:]) / 2 - 0.5
+    usual_m = np.array([usual_height_m(name) if has_metres else 0.0 for name in seen.names])
+    planes_m, ground_sigmas_m = usual_m / 2, np.zeros(len(seen))
+    if ground is not None and len(seen):
+        rays = camera.rays_from_pixels(middles_px) @ pose.rotation.T
+        reach, on_it_m = _reach(rays, pose.translation_m, planes_m, lambda at_m: ground(at_m)[0])
+        planes_m = np.where(np.isfinite(on_it_m), on_it_m, planes_m)
+        places_m = pose.translation_m[:2] + np.nan_to_num(reach)[:, None] * rays[:, :2]
+        ground_sigmas_m = ground(places_m)[1]
     laid: list[LaidSighting | None] = []
     for row, name in enumerate(seen.names):
         laid.append(None)
-        height_m = usual_height_m(name) if has_metres else 0.0
-        up_m = height_m / 2
+        height_m, plane_m = float(usual_m[row]), float(planes_m[row])
         # the box's middle, and the middles of its left, right, top and bottom edges
         left, top, right, bottom = boxes_px[row] - 0.5
-        x, y = (left + right) / 2, (top + bottom) / 2
+        x, y = middles_px[row]
         cross_px = np.array([[x, y], [left, y], [right, y], [x, top], [x, bottom]])
-        around_m = ground_from_pixels(camera, pose, cross_px, up_m)
+        around_m = ground_from_pixels(camera, pose, cross_px, plane_m)
         place_m = around_m[0]
-        reach_m = pose.translation_m[2] - up_m
+        reach_m = pose.translation_m[2] - plane_m
         if not np.isfinite(around_m).all() or reach_m <= 0:
             continue
         lean = (pose.translation_m[:2] - place_m) / reach_m
@@ -113,7 +127,7 @@ def lay_on_ground(
             pose_m,
         ]
         own_sigma_m = float(np.sqrt(np.sum(np.square(parts))))
-        usual_sigma_m = _HEIGHT_SIGMA * height_m * lean
+        up_sigma_m = np.hypot(_HEIGHT_SIGMA * height_m, ground_sigmas_m[row]) * lean
         sighting = Sighting(
             frame.index,
             frame.name,
@@ -122,11 +136,14 @@ def lay_on_ground(
             float(seen.scores[row]),
             seen.boxes_px[row],
             place_m + outward_m,
-            own_sigma_m**2 * np.eye(2) + np.outer(usual_sigma_m, usual_sigma_m) + beyond_m2,
+            own_sigma_m**2 * np.eye(2) + np.outer(up_sigma_m, up_sigma_m) + beyond_m2,
             np.sort(sides_m)[::-1],
         )
         own_sigma_m = float(np.hypot(own_sigma_m, np.sqrt(np.trace(beyond_m2) / 2)))
-        laid[row] = LaidSighting(sighting, up_m, lean, own_sigma_m, axes, sides_m, beyond_m2)
+        ground_m = plane_m - height_m / 2
+        laid[row] = LaidSighting(
+            sighting, height_m / 2, lean, own_sigma_m, axes, sides_m, beyond_m2, ground_m
+        )
     return laid
 
 
@@ -169,6 +186,9 @@ def usual_height_m(name: str) -> float:
 
 GroundHeight = Callable[[PointsM], Floats]
 """Heights (N,) of the ground above the site's level plane, m, at east, north (N, 2); NaN where it is not known."""
+
+MeasuredGround = Callable[[PointsM], tuple[Floats, Floats]]
+"""Heights (N,) of the ground as `GroundHeight` has them, and how well they are known (N,), 1 sigma, m."""
 
 IMPOSSIBLE_SIZE = "of a size that its class cannot have"
 """The words for what could be placed, and is set aside: it is not what the detector took it for."""

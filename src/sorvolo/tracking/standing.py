@@ -353,7 +353,7 @@ def _possible_views(
     for row, group in enumerate(groups):
         chosen = [laid[k] for k in group]
         places_m[row] = np.median([each.sighting.position_m for each in chosen], axis=0)
-        up_m[row] = np.median([each.middle_up_m for each in chosen])
+        up_m[row] = np.median([each.ground_m + each.middle_up_m for each in chosen])
         reach_m[row] = np.median([each.sighting.size_m[0] for each in chosen]) / 2
         open_m[row] = np.sqrt(min(np.trace(each.beyond_m2) for each in chosen) / 2)
         if open_m[row] > 0:

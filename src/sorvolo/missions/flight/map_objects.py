@@ -36,7 +36,7 @@ from sorvolo.survey.flight import Frame, Notice, PosedFrame, Site
 from sorvolo.survey.map_objects import MapObject, ObjectSearch, SearchedFrames
 from sorvolo.survey.mosaic import PlacedFrame, Status
 from sorvolo.survey.objects import Detections, Sighting
-from sorvolo.tracking.laying import LaidSighting, lay_on_ground, pose_of
+from sorvolo.tracking.laying import LaidSighting, MeasuredGround, lay_on_ground, pose_of
 from sorvolo.tracking.map_objects import objects_on_map
 from sorvolo.tracking.view_evidence import least_seen
 
@@ -175,9 +175,14 @@ class ObjectFinder:
         self._detector.rest()
 
     def conclude(
-        self, placed: Sequence[PlacedFrame], flight_id: str, *, has_metres: bool
+        self,
+        placed: Sequence[PlacedFrame],
+        flight_id: str,
+        *,
+        has_metres: bool,
+        ground: MeasuredGround | None = None,
     ) -> ObjectSearch:
-        """Lay all detections on the ground by the frames' final places, and report each object once."""
+        """Lay all detections on the ground (None: level) by the frames' final places, and report each object once."""
         self._take(0)
         frames = [
             each
@@ -189,7 +194,7 @@ class ObjectFinder:
         for frame in frames:
             seen = self._seen[frame.index]
             for each, crop in zip(
-                lay_on_ground(seen.found, frame, has_metres=has_metres), seen.crops
+                lay_on_ground(seen.found, frame, has_metres=has_metres, ground=ground), seen.crops
             ):
                 if each is not None:
                     laid.append(each)

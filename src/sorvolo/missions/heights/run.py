@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.geometry.arrays import Floats32, ImageGray, ImageRGB, ImageRGBA
+from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, ImageRGB, ImageRGBA, PointsM
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.geometry.pose import Pose
 from sorvolo.heights.cameras import Cameras3D, Tracks, find_tracks, solve_tracks
@@ -50,6 +50,7 @@ from sorvolo.survey.flight import Site
 
 _MOST_BYTES = 256_000_000  # of frames.geojson; 10,000 frames have some ten; by choice
 _AXES = ("east", "north", "up")
+_ASIDE_M = 2.0  # about a place: one false match pulls less of the ground there down
 
 
 def flight_views(
@@ -194,6 +195,15 @@ class GroundModel:
     pictures: FlightPictures
     figures: Mapping[str, Any]
     seconds: Mapping[str, float]
+
+    def bare_at(self, places_m: PointsM) -> tuple[Floats, Floats]:
+        """Return the bare ground's height about places (N, 2), (N,), and its spread there: how well it is known."""
+        lattice, aside_m = self.surface.lattice, np.linspace(-_ASIDE_M, _ASIDE_M, 5)
+        around_m = np.stack(np.meshgrid(aside_m, aside_m), axis=-1).reshape(-1, 1, 2)
+        cells = np.round(lattice.cells_from_site((places_m + around_m).reshape(-1, 2))).astype(int)
+        column, row = np.clip(cells, 0, [lattice.width - 1, lattice.height - 1]).T
+        up_m = self.bare_m[row, column].reshape(-1, len(places_m)).astype(np.float64)
+        return np.median(up_m, axis=0), up_m.std(axis=0)
 
 
 @mission

@@ -141,15 +141,12 @@ def pieces_of(frames: Sequence[PlacedFrame], model: GroundModel) -> list[list[in
 
 def _on_plane(view: View, matrix: Matrix3, model: GroundModel) -> Matrix3:
     """(3, 3) from pixels of a view's picture, whose camera has this matrix, to site metres on the bare ground's plane."""
-    lattice = model.surface.lattice
     corners_m = ground_outlines_m([view], float(np.median(model.bare_m)))
     share = np.linspace(0.05, 0.95, _SIDE)
     low, high = corners_m.min(axis=0), corners_m.max(axis=0)
     x, y = (each.ravel() for each in np.meshgrid(*(low + np.outer(share, high - low)).T))
-    cells = np.round(lattice.cells_from_site(np.column_stack([x, y]))).astype(int)
-    column, row = np.clip(cells, 0, [lattice.width - 1, lattice.height - 1]).T
     terms = np.column_stack([x, y, np.ones(len(x))])
-    plane = np.linalg.lstsq(terms, model.bare_m[row, column], rcond=None)[0]
+    plane = np.linalg.lstsq(terms, model.bare_at(terms[:, :2])[0], rcond=None)[0]
     turn = view.site_from_camera.rotation.T
     project = matrix @ np.column_stack([turn, -turn @ view.site_from_camera.translation_m])
     raised = np.array([[1.0, 0, 0], [0, 1, 0], plane, [0, 0, 1]])

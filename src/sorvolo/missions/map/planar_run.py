@@ -146,13 +146,18 @@ class FlightRun(ABC):
         as it was, when no frame has a place.
         """
 
-    def _search(self, placed: Sequence[PlacedFrame]) -> ObjectSearch | None:
+    def _search(
+        self, placed: Sequence[PlacedFrame], model: GroundModel | None = None
+    ) -> ObjectSearch | None:
         """Return what stands on the ground by the frames' final places; None where nobody looked."""
         if self._finder is None:
             return None
         with self._log.stage(Stage.DETECT):
             return self._finder.conclude(
-                placed, self._setup.source.name, has_metres=not self._archive.site().is_local
+                placed,
+                self._setup.source.name,
+                has_metres=not self._archive.site().is_local,
+                ground=None if model is None else model.bare_at,
             )
 
     def _add_search(
@@ -426,7 +431,7 @@ class PlanarRun(FlightRun):
             raise self._nothing_placed()
         placed, shape, model = self._paint_ground(painter, placed)
         writer = self.begin()
-        search = self._search(placed)
+        search = self._search(placed, model)
         with self._log.stage(Stage.REPORT):
             shown = picture(writer.tiles, 1600)
         result = FlightResult(
