@@ -23,7 +23,7 @@ from rasterio.enums import Resampling
 from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
-from sorvolo.canopy.integral import lay, levelled, seeing
+from sorvolo.canopy.integral import against_surroundings, lay, levelled, seeing
 from sorvolo.errors import SorvoloError
 from sorvolo.geometry.arrays import Floats, Floats32, ImageRGBA
 from sorvolo.geometry.camera import Camera
@@ -388,6 +388,7 @@ _FLOOR_VIEWS = 64  # of a tile at most: what one costs is bound
 _FLOOR_PX = 640  # the longest side of their pictures
 _FLOOR_BYTES = 96 << 20
 _LEAST_SHOWN = 8  # views of a pixel
+_AROUND_M = 2.0  # of a tile, that its edges are held against, too
 
 
 class FloorTiles:
@@ -448,7 +449,10 @@ class FloorTiles:
         across, down = (right - first) / TILE_PX, (below - first) / TILE_PX
         middle = first + (across + down) / 2
         affine = np.vstack([np.column_stack([across, down, middle]), [0.0, 0.0, 1.0]])
-        lattice = Lattice(affine, TILE_PX, TILE_PX, float(np.linalg.norm(across)))
+        cell_m = float(np.linalg.norm(across))
+        margin = int(np.ceil(_AROUND_M / cell_m))
+        end = TILE_PX + margin
+        lattice = Lattice(affine, TILE_PX, TILE_PX, cell_m).window(-margin, -margin, end, end)
         views, pictures = self._opened(archive, site_id, about)
         numbers = seeing(views, lattice, up_m)
         numbers = numbers[:: -(-len(numbers) // _FLOOR_VIEWS) or 1]
@@ -459,10 +463,12 @@ class FloorTiles:
             laid = lay(views[number], small.astype(np.float32), lattice, float(up_m))[..., 0]
             count += np.isfinite(laid)
             total += np.nan_to_num(laid)
+        mean = np.where(count < _LEAST_SHOWN, np.float32(np.nan), total / np.maximum(count, 1))
+        contrast = against_surroundings(mean[..., None], cell_m)[margin:-margin, margin:-margin, 0]
         dark, bright = about["levels"]
-        grey = (total / np.maximum(count, 1) - dark) / max(bright - dark, 1e-6) * 255
-        shown = 255 * (count >= _LEAST_SHOWN)
-        rgba = np.clip(np.dstack([grey, grey, grey, shown]), 0, 255).astype(np.uint8)
+        shown = np.isfinite(contrast)
+        grey = np.nan_to_num((contrast - dark) / max(bright - dark, 1e-6)) * 255
+        rgba = np.clip(np.dstack([grey, grey, grey, 255 * shown]), 0, 255).astype(np.uint8)
         return encoded(rgba, ".webp") if shown.any() else b""
 
     def _opened(

@@ -135,7 +135,7 @@ def search_under_trees(
             name, finds, sigma_m, keyframes, [_crop(each, views, picture) for each in finds.people]
         )
         archive.keep_under_trees(name, found)
-        low, high = np.nanpercentile(under.mean, [1, 99.5])
+        low, high = np.nanpercentile(under.contrast, [1, 99.5])
         kept_floor = {
             "run": run_of(keyframes),
             "floor_m": float(np.median(floor.up_m)),
