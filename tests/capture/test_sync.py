@@ -285,6 +285,11 @@ def test_an_offset_is_seen_on_a_curved_path(offset_s, seed):
     assert abs(found.offset_s - offset_s) < 3 * found.sigma_s
     assert 0.005 < found.sigma_s < 0.2
     assert found.is_significant == (offset_s != 0)
+    order = rng.permutation(len(frames_s))  # photos that were retried come after later ones
+    mixed = estimate_offset(
+        track, frames_s[order], seen_path(curved, frames_s + offset_s)[order], reach_s=4.0
+    )
+    assert mixed == found
     corrected = shifted(track, found.offset_s)
     again = estimate_offset(
         corrected, frames_s, seen_path(curved, frames_s + offset_s), reach_s=4.0

@@ -85,6 +85,8 @@ def estimate_offset(
     from the motion that the pictures show, with the misfit as the noise: the fixes' own noise bends a path as well,
     and would pass for motion. How far neighbouring misfits err alike is learnt from them (`_offset_sigma_s`).
     """
+    in_time = np.argsort(times_s, kind="stable")  # photos that were retried come last
+    times_s, seen_m = times_s[in_time], seen_m[in_time]
     usable = np.isfinite(track.east_north_m[:, 0])
     unknown = OffsetEstimate(0.0, float("inf"), float("nan"), float("nan"))
     if usable.sum() < _LEAST_FIXES or len(times_s) < _LEAST_FRAMES or reach_s <= 0:
@@ -321,8 +323,9 @@ def shared_motion_m_s(times_s: Sequence[float], places_m: PointsM) -> float:
 
     On a straight line it is all of the speed. Strips flown to and fro move against each other, and the map less.
     """
-    known = np.isfinite(places_m[:, 0])
-    if known.sum() < 2:
+    known = np.flatnonzero(np.isfinite(places_m[:, 0]))
+    known = known[np.argsort(np.array(times_s)[known], kind="stable")]
+    if len(known) < 2:
         return 0.0
     known_m = places_m[known, :2]
     velocity_m_s = np.gradient(known_m, np.array(times_s)[known], axis=0).T.ravel()
