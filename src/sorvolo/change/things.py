@@ -1,8 +1,6 @@
 """Things without the shadows they throw: a shadow is part of what changed, but not where the thing is."""
 
-from collections.abc import Sequence
 from dataclasses import replace
-from itertools import combinations
 
 import cv2
 import numpy as np
@@ -22,11 +20,11 @@ _CONTRARY = {
 _LEAST_PX = 6  # bare of shadow: with fewer, or less than ...
 _LEAST_SHARE = 0.02  # ... this of the change, all of it is a dark thing
 _LEAST_PIECE = 0.15  # of the largest lit piece: smaller ones are specks of the shadow's rim
-_APART_M = 0.5  # things so far from each other are two ...
+_GAP_M = 0.4  # pieces so far from each other are two
+_APART_M = 0.5  # things in one piece so far from each other are two ...
 _LEAST_M2 = 0.035  # ... if each is as large as a football at least ...
 _SOLID = 0.45  # ... fills so much of its hull, for specks of a dark thing scatter, ...
 _CAR_M = (1.2, 6.0)  # ... and all is not as wide and as long as one dark car with bright parts
-_GAP_M = 0.4  # pieces that lie so far apart are not one
 
 
 def without_shadow(change: Change) -> Change:
@@ -53,10 +51,6 @@ def shadow_of(patch: Patch, kind: ChangeKind) -> Mask:
     return np.asarray((patch.shade & np.uint8(bits.get(kind, Shade.LATER))) > 0)
 
 
-def _is_dark(patch: Patch) -> Mask:
-    return np.asarray((patch.shade & np.uint8(Shade.LATER_DARK | Shade.EARLIER_DARK)) > 0)
-
-
 def thing_of(changed: Mask, shadow: Mask) -> Mask:
     """The part of the change that is the thing, not its shadow; `changed` itself where hardly anything would stay."""
     lit = changed & ~shadow
@@ -76,48 +70,30 @@ def things_of(patch: Patch, kind: ChangeKind, changed: Mask) -> list[tuple[Mask,
     """The things in a change, each with its own kind and the part of `changed` that lies nearest to it, the largest
     first; the shadow of what came does not go to what left.
 
-    They are separated by the ground or the shadow between them, what left from what came also where they touch;
-    `changed` alone where it is but one thing. A dark car has bright parts far from each other: what fills a rectangle
-    of about its size stays whole, unless something left beside what came.
+    They are separated by the ground or the shadow between them; `changed` alone where it is but one thing. A dark car
+    has bright parts far from each other: what fills a rectangle of about its size stays whole.
     """
-    groups = _groups(patch, changed) or [(changed, kind)]
-    found = [each for group, own in groups for each in _things_of_group(patch, own, group)]
+    if _may_be_a_car(changed, patch.m_per_px):
+        return [(changed, kind)]
+    labels = _joined(changed, int((_GAP_M / patch.m_per_px - 1) / 2))
+    dark = np.asarray((patch.shade & np.uint8(Shade.LATER_DARK | Shade.EARLIER_DARK)) > 0)
+    # what is all shadow is no piece of its own
+    bare_m2 = np.bincount(labels[changed & ~dark]) * patch.m_per_px**2
+    pieces = [changed & (labels == each) for each in np.flatnonzero(bare_m2 >= _LEAST_M2)]
+    if len(pieces) < 2:
+        found = _joined_by_shadow(patch, kind, changed)
+    else:
+        nearest = np.argmin([_distance(each) for each in pieces], axis=0)
+        parts = [changed & (nearest == index) for index in range(len(pieces))]
+        found = [
+            thing
+            for part in parts
+            for thing in _joined_by_shadow(patch, kind_of(replace(patch, changed=part)), part)
+        ]
     return sorted(found, key=lambda each: -np.count_nonzero(each[0]))
 
 
-def _groups(patch: Patch, changed: Mask) -> list[tuple[Mask, ChangeKind]]:
-    """The pieces of a change that lie apart, with their kinds; nothing where it is but one piece. What is all shadow is
-    no piece of its own."""
-    count, labels = cv2.connectedComponents(changed.view(np.uint8))
-    if count < 3 or _may_be_a_car(changed, patch.m_per_px):
-        return []
-    bare_m2 = np.bincount(labels[~_is_dark(patch)], minlength=count) * patch.m_per_px**2
-    pieces = [labels == each for each in range(1, count) if bare_m2[each] >= _LEAST_M2]
-    if len(pieces) < 2:
-        return []
-    distances = [_distance(each) * patch.m_per_px for each in pieces]
-    group = _group_of_pieces(patch, pieces, distances)
-    if len(set(group)) < 2:
-        return []
-    nearest = np.array(group)[np.argmin(distances, axis=0)]
-    found = [changed & (nearest == each) for each in dict.fromkeys(group)]
-    return [(each, kind_of(replace(patch, changed=each))) for each in found]
-
-
-def _group_of_pieces(
-    patch: Patch, pieces: Sequence[Mask], distances_m: Sequence[Floats32]
-) -> list[int]:
-    """The group of each piece: those near each other are one, unless one came and the other left."""
-    kinds = [kind_of(replace(patch, changed=each)) for each in pieces]
-    group = list(range(len(pieces)))
-    for first, second in combinations(range(len(pieces)), 2):
-        is_contrary = _CONTRARY.get(kinds[first]) is kinds[second]
-        if not is_contrary and float(distances_m[first][pieces[second]].min()) < _GAP_M:
-            group = [group[first] if each == group[second] else each for each in group]
-    return group
-
-
-def _things_of_group(
+def _joined_by_shadow(
     patch: Patch, kind: ChangeKind, changed: Mask
 ) -> list[tuple[Mask, ChangeKind]]:
     """The things in one piece of a change, as `things_of` gives them."""
@@ -142,7 +118,7 @@ def _things_of_group(
 def _lit_things(bare: Mask, m_per_px: float) -> list[Mask]:
     """The solid things, the largest first, in the part of a change that is no shadow."""
     lit = cv2.morphologyEx(bare.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    labels = _joined(np.asarray(lit > 0), m_per_px)
+    labels = _joined(np.asarray(lit > 0), round(_APART_M / 2 / m_per_px))
     areas_m2 = np.bincount(labels[lit > 0]) * m_per_px**2
     large = [
         (labels == each) & (lit > 0)
@@ -165,9 +141,9 @@ def _hull(mask: Mask | Bytes) -> Mask:
     return hull.view(bool)
 
 
-def _joined(mask: Mask, m_per_px: float) -> Ints32:
+def _joined(mask: Mask, near_px: int) -> Ints32:
     """The number from 1 on of the thing that each pixel of a mask (h, w) belongs to, and those near it; else 0."""
-    reach = 2 * round(_APART_M / 2 / m_per_px) + 1
+    reach = 2 * near_px + 1
     padded = cv2.copyMakeBorder(
         mask.view(np.uint8), reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=0
     )
