@@ -8,7 +8,6 @@ from sorvolo.capture.source import GivenFrames as GivenFrames
 from sorvolo.capture.source import frames as frames
 from sorvolo.change.compare import Comparison as Comparison
 from sorvolo.change.compare import compare_images as compare_images
-from sorvolo.change.robust import RobustSettings as RobustSettings
 from sorvolo.detection.contract import ModelInfo as ModelInfo
 from sorvolo.detection.detector import Detector as Detector
 from sorvolo.errors import GeometryError as GeometryError

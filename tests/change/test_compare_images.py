@@ -8,7 +8,7 @@ import pytest
 
 import sorvolo
 from sorvolo.change.robust import compare_robust
-from sorvolo.errors import InputError, SettingsError
+from sorvolo.errors import InputError
 
 
 def scene() -> tuple[Any, Any]:
@@ -83,18 +83,3 @@ def test_input_that_cannot_be_used_is_named(
 def test_pictures_too_small_to_compare_are_refused() -> None:
     with pytest.raises(InputError, match="50 x 20 px; at least 32"):
         sorvolo.compare_images(PICTURE[:20], PICTURE[:20])
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (
-            {"settings": sorvolo.ThesisSettings()},
-            "settings are ThesisSettings; give RobustSettings",
-        ),
-        ({"settings": {"T_B": 0.3}}, "settings are dict"),
-    ],
-)
-def test_settings_that_contradict_are_named(options: Any, message: str) -> None:
-    with pytest.raises(SettingsError, match=message):
-        sorvolo.compare_images(PICTURE, PICTURE, **options)

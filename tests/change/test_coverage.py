@@ -18,7 +18,7 @@ from sorvolo.change.planting import (
     recall_curve,
     sensitivities,
 )
-from sorvolo.change.robust import RobustSettings, compare_robust
+from sorvolo.change.robust import compare_robust
 from sorvolo.survey.coverage import CoveredGround, Gap
 from sorvolo.survey.findings import ComparedView
 
@@ -216,7 +216,7 @@ def test_large_plain_things_are_found_on_real_ground_and_small_faint_ones_are_no
     def find(picture: np.ndarray) -> np.ndarray:
         query = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
         return (
-            compare_robust(reference, query, view.valid, RobustSettings(least_score=0.5)).mask > 0
+            compare_robust(reference, query, view.valid, 0.5).mask > 0
         )
 
     planted = [

@@ -6,12 +6,12 @@ import pytest
 from sensor_noise import camera
 
 from sorvolo.change.regions import FEATURES
-from sorvolo.change.robust import RobustSettings, compare_robust, examine
+from sorvolo.change.robust import compare_robust, examine
 
 
 def signs(reference: np.ndarray, query: np.ndarray) -> dict[str, float]:
     """The features of the largest region that differs."""
-    regions, *_ = examine(reference, query, None, RobustSettings())
+    regions, *_ = examine(reference, query, None)
     assert len(regions.boxes)
     return dict(zip(FEATURES, regions.features[np.argmax(regions.features[:, 0])]))
 

@@ -13,9 +13,9 @@ from sensor_noise import camera
 
 from sorvolo import kernels
 from sorvolo.change.regions import FEATURES
-from sorvolo.change.robust import RobustSettings, Trees, compare_robust, examine, how_sure
+from sorvolo.change.robust import Trees, compare_robust, examine, how_sure
 from sorvolo.change.settling import settle
-from sorvolo.change.tuning import FlightTuning, PairMeasures
+from sorvolo.change.tuning import FlightMeasures, PairMeasures
 
 
 def with_box(image: np.ndarray, colour: tuple[int, int, int] = (190, 60, 40)) -> np.ndarray:
@@ -42,7 +42,7 @@ def test_no_result_is_written_over_by_the_next_pair(ground: np.ndarray) -> None:
         (camera(ground, 1), camera(with_box(ground), 2)),
         (camera(with_box(ground), 3), camera(ground, 4)),
     )
-    examined, compared = examine(*first, None, RobustSettings()), compare_robust(*first)
+    examined, compared = examine(*first, None), compare_robust(*first)
     arrays = [
         examined.views.after,
         examined.views.lit,
@@ -54,7 +54,7 @@ def test_no_result_is_written_over_by_the_next_pair(ground: np.ndarray) -> None:
         compared.light.gains,
     ]
     kept = [each.copy() for each in arrays]
-    examine(*second, None, RobustSettings())
+    examine(*second, None)
     compare_robust(*second)
     assert all(np.array_equal(a, b) for a, b in zip(arrays, kept, strict=True))
 
@@ -143,22 +143,17 @@ def test_trees_know_their_features() -> None:
     assert tuple(stored["names"]) == FEATURES
 
 
-def test_a_flight_tunes_itself_and_shows_how(ground: np.ndarray) -> None:
-    tuning = FlightTuning()
-    assert tuning.settings() == RobustSettings() and "nothing" in str(tuning.chosen()["settings"])
-    loud = np.random.default_rng(5).normal(0, 14, ground.shape)
+def test_a_flight_shows_how_noisy_it_is(ground: np.ndarray) -> None:
+    loud, quiet = FlightMeasures(), FlightMeasures()
+    assert loud.summary() == {"frames": 0} and np.isnan(loud.brightness)
+    noise = np.random.default_rng(5).normal(0, 14, ground.shape)
     for seed in range(3):
-        query = np.clip(camera(ground, seed) + loud, 0, 255).astype(np.uint8)
-        tuning.observe(PairMeasures.of(compare_robust(ground, query, settings=tuning.settings())))
-    chosen = tuning.chosen()
-    quiet = FlightTuning()
+        query = np.clip(camera(ground, seed) + noise, 0, 255).astype(np.uint8)
+        loud.observe(PairMeasures.of(compare_robust(ground, query)))
     quiet.observe(PairMeasures.of(compare_robust(ground, camera(ground, 1))))
-    assert chosen["frames"] == 3
-    assert float(chosen["noise_levels"]) > float(quiet.chosen()["noise_levels"])
-    assert float(chosen["least_difference_levels"]) > float(
-        quiet.chosen()["least_difference_levels"]
-    )
-    assert tuning.settings().regions.least_noise > quiet.settings().regions.least_noise
+    assert loud.summary()["frames"] == 3
+    assert float(loud.summary()["noise_levels"]) > float(quiet.summary()["noise_levels"])
+    assert 0.9 < quiet.brightness < 1.1
 
 
 pictures = st.integers(0, 2**31).map(np.random.default_rng)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sorvolo.change.corroboration import Difference, believed, is_whole, unwitnessed
-from sorvolo.change.robust import RobustSettings, compare_robust
+from sorvolo.change.robust import compare_robust
 
 SHAPE = (60, 80)
 ALL = np.ones(SHAPE, bool)
@@ -81,7 +81,7 @@ def test_a_seam_of_the_map_through_a_thing_is_no_change_where_a_whole_picture_sh
     sees = np.ones(ground.shape[:2], bool)
 
     def differences(reference: np.ndarray) -> Difference:
-        found = compare_robust(reference, whole, sees, RobustSettings(least_score=0.2))
+        found = compare_robust(reference, whole, sees, 0.2)
         return Difference(found.mask, found.boxes, found.scores)
 
     by_map = differences(torn)

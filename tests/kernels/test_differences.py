@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sorvolo import kernels
-from sorvolo.change.regions import MOST_KEPT_PX, RegionSettings, Scratch, find_regions
+from sorvolo.change.regions import MOST_KEPT_PX, Scratch, find_regions
 from sorvolo.change.robust import compare_robust
 
 SIDES = st.integers(2, 40)
@@ -119,14 +119,14 @@ def test_what_does_not_fit_is_refused() -> None:
 
 def test_what_is_handed_out_survives_the_next_pictures() -> None:
     before, after = pictures(60, 80, 1)
-    regions = find_regions(before, after, None, RegionSettings(), 0.1, 0.0)
+    regions = find_regions(before, after, None, 0.1, 0.0)
     kept = (
         regions.weak.copy(),
         regions.labels.copy(),
         regions.features.copy(),
         regions.strength.copy(),
     )
-    find_regions(*pictures(60, 80, 2), None, RegionSettings(), 0.1, 0.0)
+    find_regions(*pictures(60, 80, 2), None, 0.1, 0.0)
     now = regions.weak, regions.labels, regions.features, regions.strength
     assert all(np.array_equal(a, b) for a, b in zip(kept, now, strict=True))
 

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.change.robust import RobustSettings, as_bgr, compare_robust
-from sorvolo.errors import InputError, SettingsError
+from sorvolo.change.robust import as_bgr, compare_robust
+from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Boxes, ImageGray, Mask
 
 _LEAST_PX = 32  # along a side
@@ -42,21 +42,18 @@ def compare_images(
     reference: NDArray[np.uint8],
     query: NDArray[np.uint8],
     valid: Mask | None = None,
-    settings: RobustSettings | None = None,
 ) -> Comparison:
     """What changed from `reference` to `query`, two aligned RGB pictures (h, w, 3) uint8.
 
     Where the bool mask `valid` (h, w) is False, as in a hole of a mosaic, the answer is unknown: never changed.
-    Raises InputError and SettingsError.
+    Raises InputError.
     """
-    if settings is not None and not isinstance(settings, RobustSettings):
-        raise SettingsError(f"settings are {type(settings).__name__}; give RobustSettings")
     reference, query = checked_pair(reference, query, valid)
     if min(query.shape[:2]) < _LEAST_PX:
         raise InputError(
             f"the pictures are {_size(query)}; at least {_LEAST_PX} px are needed each way"
         )
-    found = compare_robust(as_bgr(reference), as_bgr(query), valid, settings)
+    found = compare_robust(as_bgr(reference), as_bgr(query), valid)
     return Comparison(found.mask, found.boxes)
 
 

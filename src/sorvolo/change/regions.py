@@ -139,8 +139,12 @@ _DETAIL_PX = 11  # details are what is smaller
 
 
 _CHROMA_WEIGHT = 2  # times a gray difference: ground that changes differs less in colour
-LEAST_DIFFERENCE = 9.0  # grey levels, weak threshold where nothing disturbs
-NOISE_FACTOR = 0.8  # of the frame's own 95 % quantile of differences
+# a value counts as known where it occurs this near in the other picture ...
+_REACH_PX = 2
+_CALM_REACH_PX = 1  # ... and this near where hardly anything moves: less is hidden by it ...
+_CALM_PX = 0.4  # ... where so much is left of the flow
+_LEAST_DIFFERENCE = 9.0  # grey levels, weak threshold where nothing disturbs
+_NOISE_FACTOR = 0.8  # of the frame's own 95 % quantile of differences
 _ACTIVITY_FACTOR = 1.4  # of the mean difference around
 _STRONG_FACTOR = 1.5  # strong over weak threshold
 _CORE = 0.45  # a region keeps what exceeds this part of its own height
@@ -149,16 +153,6 @@ _LEAST_AREA_PX = 6  # smaller ones are noise
 _SPECK_PX = 9
 _MOST_CLUTTER = 48.0  # grey levels that a small difference counts as clutter at most
 _AROUND_PX = 41  # side of the window that clutter is averaged over
-
-
-@dataclass(frozen=True)
-class RegionSettings:
-    """What is looked at as a possible change. Lengths in px of the (half size) pictures."""
-
-    reach_px: int = 2  # a value counts as known where it occurs this near in the other picture
-    least_noise: float = (
-        0.0  # what the flight shows elsewhere: a frame is not taken for quieter than this
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +193,6 @@ def find_regions(
     reference: Image,
     query: Image,
     known: Mask | None,
-    settings: RegionSettings,
     rest_px: float,
     unevenness: float,
     scratch: Scratch | None = None,
@@ -214,7 +207,7 @@ def find_regions(
         reference,
         query,
         known,
-        settings.reach_px,
+        _CALM_REACH_PX if rest_px < _CALM_PX else _REACH_PX,
         _CHROMA_WEIGHT,
         scratch.stack("planes", size, 6),
     )
@@ -233,7 +226,7 @@ def find_regions(
     cv2.blur(difference, (3, 3), dst=smooth)
     cv2.threshold(specks, _MOST_CLUTTER, _MOST_CLUTTER, cv2.THRESH_TRUNC, dst=specks)
     activity = cv2.blur(specks, (_AROUND_PX, _AROUND_PX), dst=spare)
-    base = LEAST_DIFFERENCE + NOISE_FACTOR * max(noise, settings.least_noise)
+    base = _LEAST_DIFFERENCE + _NOISE_FACTOR * noise
     cv2.addWeighted(activity, _ACTIVITY_FACTOR, activity, 0.0, base, dst=threshold)
     weak = np.asarray(cv2.compare(smooth, threshold, cv2.CMP_GT), np.uint8)
     labels, boxes = core_regions(

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from importlib.resources import files
 from math import ceil, floor
@@ -15,7 +15,6 @@ from sorvolo.change.light import PairLight, fit_light, relit
 from sorvolo.change.regions import (
     Image,
     Regions,
-    RegionSettings,
     Scratch,
     find_regions,
     scratch_of_thread,
@@ -203,21 +202,12 @@ _RIM_PX = 5
 # ... of what it was before the ground's own range, grey levels, was taken off ...
 _SLACK_LEVELS = 5.0
 _LEAST_SHARE = 0.4  # ... at least this share
+_ALONE_SCORE = 0.69  # for a pair on its own; where several views vote less will do
 _SAME_PLACE_PX = 0.6  # a reference displaced by more shows what left at its own pixels
 
 
-# half size; where less is left of the flow, values are looked for one pixel less far around
-_CALM_PX = 0.4
 # half size; around the unknown nothing is compared: resampling mixes it into what is known
 _UNKNOWN_PX = 4
-
-
-@dataclass(frozen=True)
-class RobustSettings:
-    """How sure a change must be, and what is looked at; the rest each pair of pictures sets itself."""
-
-    least_score: float = 0.69  # for a pair on its own; where several views vote less will do
-    regions: RegionSettings = field(default_factory=RegionSettings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,17 +236,16 @@ def compare_robust(
     reference: Bytes,
     query: Bytes,
     valid: Mask | None = None,
-    settings: RobustSettings | None = None,
+    least_score: float = _ALONE_SCORE,
 ) -> RobustResult:
     """Compare two aligned BGR pictures (h, w, 3) uint8 of at least 32 px; up to about 5 px apart is fine.
 
     Where `valid` (h, w) is False the answer is unknown: nothing is found there, nor in a thin rim around it.
     """
-    settings = settings or RobustSettings()
     scratch = scratch_of_thread()
-    examined = examine(reference, query, valid, settings, scratch)
+    examined = examine(reference, query, valid, scratch)
     scores = how_sure(examined.regions.features, trained_trees())
-    return _result(examined, scores, settings, query.shape[1::-1])
+    return _result(examined, scores, least_score, query.shape[1::-1])
 
 
 class Examined(NamedTuple):
@@ -273,7 +262,6 @@ def examine(
     reference: Bytes,
     query: Bytes,
     valid: Mask | None,
-    settings: RobustSettings,
     scratch: Scratch | None = None,
 ) -> Examined:
     """Look at a pair of pictures as `compare_robust` does. Pictures and strengths of the result lie in `scratch`, in
@@ -312,10 +300,7 @@ def examine(
         else _without_rim(known, _UNKNOWN_PX + int(np.ceil(settling.moved_px)))
     )
     lit = relit(before, light, spare)
-    # where hardly anything moves values need not be looked for as far around, and less is hidden by them
-    reach_px = settings.regions.reach_px - int(settling.rest_px < _CALM_PX)
-    for_pair = replace(settings.regions, reach_px=max(1, reach_px))
-    regions = find_regions(lit, after, known, for_pair, settling.rest_px, light.unevenness, scratch)
+    regions = find_regions(lit, after, known, settling.rest_px, light.unevenness, scratch)
     share = 1.0 if known is None else cv2.countNonZero(known.view(np.uint8)) / known.size
     return Examined(regions, light, settling, share, Views(lit, after))
 
@@ -340,12 +325,12 @@ def _without_rim(known: Mask, rim_px: int) -> Mask:
 def _result(
     examined: Examined,
     scores: Floats,
-    settings: RobustSettings,
+    least_score: float,
     size: tuple[int, int],
 ) -> RobustResult:
     """The answer at full `size` (w, h): the regions whose scores (N,) suffice."""
     regions, light, settling, known, views = examined
-    sure = scores >= settings.least_score
+    sure = scores >= least_score
     if not sure.any():
         nothing = np.zeros(size[::-1], np.uint8), np.zeros((0, 4), np.int64), np.zeros(0)
         return RobustResult(*nothing, light, settling, regions.noise, known)

@@ -23,9 +23,9 @@ from sorvolo.change.earlier_pictures import EarlierPictures
 from sorvolo.change.map_search import MapSearch
 from sorvolo.change.planting import Planted, Planting
 from sorvolo.change.reference import ReferenceMap
-from sorvolo.change.robust import RobustSettings, as_bgr, compare_robust
+from sorvolo.change.robust import as_bgr, compare_robust
 from sorvolo.change.shade import shade_of_view
-from sorvolo.change.tuning import FlightTuning, PairMeasures
+from sorvolo.change.tuning import FlightMeasures, PairMeasures
 from sorvolo.geometry.arrays import (
     Boxes,
     Floats,
@@ -270,7 +270,7 @@ class ViewRecord:
 class OneSided:
     """A frame compared with the map, before earlier pictures corroborate it; `image` is RGB, `query` the same as BGR.
 
-    `settings` are those by which earlier pictures are to be compared, `outcome` is what is known of its ending.
+    `outcome` is what is known of its ending.
     """
 
     posed: PosedFrame
@@ -280,7 +280,6 @@ class OneSided:
     query: ImageBGR
     valid: Mask
     found: Difference
-    settings: RobustSettings | None
     outcome: ViewOutcome
 
 
@@ -326,7 +325,7 @@ class ViewMaker:
         self._pictures = pictures
         self._aligner = Aligner(reference, site_grid)
         self._method = method
-        self._tuning = FlightTuning() if method is None else None
+        self._measures = FlightMeasures() if method is None else None
         self._planting = Planting()
 
     def compare_with_map(
@@ -380,9 +379,7 @@ class ViewMaker:
             with_flight=aligned.with_flight,
             traces=ViewTraces(self._aligner.step, aligned, measured),
         )
-        return OneSided(
-            posed, aligned, image, reference, query, valid, found, self._settings_now(), outcome
-        )
+        return OneSided(posed, aligned, image, reference, query, valid, found, outcome)
 
     def corroborate(self, compared: ViewOutcome | OneSided) -> ViewOutcome:
         """Keep the differences that earlier pictures of the ground confirm: how the frame's comparison ended."""
@@ -410,12 +407,12 @@ class ViewMaker:
         self._aligner.recall(
             image, self._lens.camera, posed.prior, posed.frame.time_ns, traces.step
         )
-        if traces.measured is not None and self._tuning is not None:
-            self._tuning.observe(traces.measured)
+        if traces.measured is not None and self._measures is not None:
+            self._measures.observe(traces.measured)
         aligned, boxes, scores = traces.aligned, record.boxes, record.scores
         if record.changed is None or aligned is None or boxes is None or scores is None:
             return outcome
-        if self._tuning is not None:
+        if self._measures is not None:
             self._planting.pass_over()
         reference, known = self._map_under(aligned)
         image, valid = _laid(aligned, image, known)
@@ -459,9 +456,9 @@ class ViewMaker:
             posed, prior=replace(posed.prior, rotation=pose.rotation, attitude_sigma_deg=sigma_deg)
         )
 
-    def chosen(self) -> dict[str, Any]:
-        """What the robust method's parameters set themselves to on this flight; nothing for another method."""
-        return {} if self._tuning is None else self._tuning.chosen()
+    def measured(self) -> dict[str, Any]:
+        """What the robust method measured of this flight's unchanged ground; nothing by another method."""
+        return {} if self._measures is None else self._measures.summary()
 
     def change_m_per_px(self, first: ComparedView) -> float:
         """Of the pictures of changes: the map's pixels, or the views' where these are coarser.
@@ -482,7 +479,7 @@ class ViewMaker:
     @property
     def brightness(self) -> float:
         """How many times as bright as the map the flight is; NaN where that is not known."""
-        return float("nan") if self._tuning is None else self._tuning.brightness
+        return float("nan") if self._measures is None else self._measures.brightness
 
     @property
     def earlier_pictures(self) -> EarlierPictures | None:
@@ -541,7 +538,7 @@ class ViewMaker:
     def _corroborated(self, compared: OneSided) -> tuple[Difference, Mask | None]:
         """What differs from the map or from one of the nearest earlier pictures, as far as they confirm it; and the
         ground (h, w) that leans another way in them."""
-        if self._pictures is None or compared.settings is None:
+        if self._pictures is None or self._measures is None:
             return compared.found, None
         (height, width) = compared.valid.shape
         leans, level = np.zeros((height, width), bool), level_of(as_bgr(compared.reference))
@@ -568,46 +565,35 @@ class ViewMaker:
             mask = compared.found.mask
             if is_further and not any(is_whole(mask, each, sees) for each in open_parts):
                 continue
-            found = compare_robust(picture, compared.query, sees, compared.settings)
+            found = compare_robust(picture, compared.query, sees, LEAST_SCORE)
             earlier.append((Difference(found.mask, found.boxes, found.scores), sees))
             leans |= leaning(level, picture, sees & compared.valid)
         return believed((compared.found, compared.valid), earlier), leans
 
     def _plant(self, view: ComparedView, compared: OneSided) -> tuple[Planted, ...]:
         """What is found of things drawn into a view, if it is its turn; nothing by another method."""
-        if compared.settings is None:
+        if self._measures is None:
             return ()
-        sure, reference = SURE, as_bgr(compared.reference)
-        settings = replace(compared.settings, least_score=sure)
+        reference = as_bgr(compared.reference)
         return self._planting.plant(
             view,
             lambda picture: (
-                compare_robust(reference, as_bgr(picture), compared.valid, settings).mask > 0
+                compare_robust(reference, as_bgr(picture), compared.valid, SURE).mask > 0
             ),
         )
 
     def _difference(
         self, reference: ImageRGB, image: ImageRGB, query: ImageBGR, valid: Mask
     ) -> tuple[Difference, PairMeasures | None]:
-        """What differs from the map; the flight's tuning learns of it, by what was measured."""
-        settings = self._settings_now()
-        if self._tuning is None or settings is None:
+        """What differs from the map, and what was measured."""
+        if self._measures is None:
             assert self._method is not None
             other = self._method.compare(reference, image, valid)
             return Difference(other.mask, other.boxes, np.full(len(other.boxes), 0.5)), None
-        found = compare_robust(as_bgr(reference), query, valid, settings)
+        found = compare_robust(as_bgr(reference), query, valid, LEAST_SCORE)
         measured = PairMeasures.of(found)
-        self._tuning.observe(measured)
+        self._measures.observe(measured)
         return Difference(found.mask, found.boxes, found.scores), measured
-
-    def _settings_now(self) -> RobustSettings | None:
-        """Those of the robust method as the flight has set them so far; None for another method."""
-        least_score = LEAST_SCORE
-        return (
-            None
-            if self._tuning is None
-            else replace(self._tuning.settings(), least_score=least_score)
-        )
 
 
 def _laid(aligned: Aligned, image: ImageRGB, known: Mask) -> tuple[ImageRGB, Mask]:

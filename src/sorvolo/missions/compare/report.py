@@ -142,7 +142,7 @@ def comparison_summary(
         "unknown_share": counts.ground.unknown_share,
         "votes": settings.votes,
         "voters": settings.voters,
-        "chosen": views.chosen(),
+        "chosen": views.measured(),
         "map_updated": settings.updates_map,
         "most_missed": views.brightness < NIGHT,
     }
