@@ -215,9 +215,7 @@ def test_large_plain_things_are_found_on_real_ground_and_small_faint_ones_are_no
 
     def find(picture: np.ndarray) -> np.ndarray:
         query = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
-        return (
-            compare_robust(reference, query, view.valid, 0.5).mask > 0
-        )
+        return compare_robust(reference, query, view.valid, 0.5).mask > 0
 
     planted = [
         each for seed in range(3) for each in planted_in(view, find, np.random.default_rng(seed))

@@ -107,27 +107,16 @@ def test_rasters_move_between_windows_without_loss():
 def laid_of(flags, seen, window):
     nothing = np.zeros_like(flags)
     score, legs = np.full(flags.shape, 200, np.uint8), np.zeros(flags.shape, np.int32)
-    return LaidView(window, flags & seen, seen, score, nothing, nothing, legs)
+    return LaidView(window, flags & seen, seen, score, nothing, legs)
 
 
-def test_a_piece_that_only_its_shadow_leaves_is_whole():
+def test_a_piece_that_ends_at_unknown_ground_is_at_the_rim():
     seen = np.ones((20, 20), bool)
     seen[:4] = False
     flags = np.zeros_like(seen)
-    flags[4:12, 3:6] = flags[4:12, 9:12] = flags[8:12, 15:18] = (
-        True  # two of three reach the view's rim
-    )
-    shaded = np.zeros_like(seen)
-    shaded[:9, 3:6] = True
+    flags[4:12, 3:6] = flags[8:12, 15:18] = True  # one of two reaches the view's rim
     laid = laid_of(flags, seen, CellWindow(0, 0, 20, 20))
-    assert np.array_equal(np.flatnonzero(laid.cut_off.any(axis=0)), [3, 4, 5, 9, 10, 11])
-    assert np.array_equal(
-        np.flatnonzero(replace(laid, shaded=shaded).cut_off.any(axis=0)), [9, 10, 11]
-    )
-    all_shade = replace(
-        laid, shaded=np.ones_like(seen)
-    )  # a dark wall: no shadow of anything that is seen
-    assert np.array_equal(all_shade.cut_off, laid.cut_off)
+    assert np.array_equal(laid.at_rim, flags & (np.arange(20) < 6))
 
 
 @given(st.lists(st.tuples(st.booleans(), st.booleans()), min_size=1, max_size=20))

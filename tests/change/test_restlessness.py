@@ -18,7 +18,7 @@ def laid(flagged: np.ndarray, seen: np.ndarray | None = None) -> LaidView:
     seen = np.ones(GROUND.shape, bool) if seen is None else seen
     score, legs = np.full(GROUND.shape, 255, np.uint8), np.zeros(GROUND.shape, np.int32)
     nothing = np.zeros(GROUND.shape, bool)
-    return LaidView(GROUND, flagged & seen, seen, score, nothing, nothing, legs)
+    return LaidView(GROUND, flagged & seen, seen, score, nothing, legs)
 
 
 def grid_after(views: list[LaidView]) -> EvidenceGrid:

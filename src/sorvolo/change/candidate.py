@@ -260,8 +260,6 @@ class Parts:
 # a view that flags less of what it sees misses it: from above a person covers few cells
 _SHOWS = 0.12
 _SEEN = 0.5  # a view that sees less is not asked
-_ALL_SEEN = 0.99  # a view that sees more knows its place
-_MOST_PLACES = 64  # of views, for the spread of its place
 _MOST_CAMERAS = 256  # of views that show it; of more every second one is kept
 _MOST_LEGS = 64  # of followed blobs that showed it; the oldest are forgotten
 
@@ -292,7 +290,6 @@ class Candidate:
         self.pictures = Pictures()
         self.cells = cells
         self.tally = Tally(first_seen_ns, first_seen_ns)
-        self._places: list[Floats] = []
         self._cameras: list[Floats] = []
         self._shown_by: dict[
             int, Tally
@@ -313,42 +310,36 @@ class Candidate:
         """It reaches into this window, too."""
         self.cells = self.cells.joined(window)
 
-    def recall(self, view: KeptView, cells: Mask, cell_m: float) -> None:
+    def recall(self, view: KeptView, cells: Mask) -> None:
         """Count a view from before the candidate was found, whose `cells` lie in its window, and its mask."""
-        report = view.laid.report(self.cells, cells, cell_m)
+        report = view.laid.report(self.cells, cells)
         if report.seen < _SEEN:
             return
         if report.flagged < _SHOWS * report.seen:
             self.miss()
             return
-        self._count(view, report, cells, residual_m=0.0, knows_place=True)
+        self._count(view, report, cells, residual_m=0.0)
         self.pictures.vote(view.site_from_image, view.changed, view.valid)
 
-    def see(self, view: KeptView, cells: Mask, cell_m: float) -> bool:
+    def see(self, view: KeptView, cells: Mask) -> bool:
         """Count this view; whether it shows the candidate. One that sees less than half of it does not count, unless
         the candidate is as large as the view."""
-        report = view.laid.report(self.cells, cells, cell_m)
+        report = view.laid.report(self.cells, cells)
         is_large = max(self.cells.shape) > 0.5 * max(view.laid.window.shape)
         if report.seen < _SEEN and not (is_large and report.flagged > 0):
             return False
         if report.flagged < _SHOWS * report.seen:
             self.miss()
             return False
-        leg = self._count(view, report, cells, view.residual_m, knows_place=report.seen > _ALL_SEEN)
+        leg = self._count(view, report, cells, view.residual_m)
         self._note_rim(view, cells, leg)
         return True
 
-    def ask(self, view: KeptView, cells: Mask, cell_m: float) -> bool:
+    def ask(self, view: KeptView, cells: Mask) -> bool:
         """Count this view as for a seed: whatever shows some of it shows it; and its mask. Whether it does."""
-        report = view.laid.report(self.cells, cells, cell_m)
+        report = view.laid.report(self.cells, cells)
         if report.flagged >= max(_SHOWS * report.seen, 1e-9):
-            leg = self._count(
-                view,
-                report,
-                cells,
-                view.residual_m,
-                knows_place=report.seen > _ALL_SEEN,
-            )
+            leg = self._count(view, report, cells, view.residual_m)
             self.pictures.vote(view.site_from_image, view.changed, view.valid)
             self._note_rim(view, cells, leg)
             return True
@@ -374,19 +365,14 @@ class Candidate:
     ) -> Change:
         """What is known of it.
 
-        `sigma_m` is that of `place_sigma_m`, and the spread of its middle over the views, per axis, / sqrt(views).
-        Raises GeometryError if it has no pictures.
+        `sigma_m` is that of `place_sigma_m`. Raises GeometryError if it has no pictures.
         """
         patch, tally = self.pictures.patch(outline_m), self.tally
         if self._kind is None or self._kind_outline is not outline_m:
             self._kind, self._kind_outline = kind_of(patch), outline_m
         size = measures(outline_m)
         residual_m = tally.residual_m_sum / max(tally.views, 1)
-        spread_m = (
-            float(np.sqrt(np.mean(np.var(self._places, axis=0)))) if len(self._places) > 1 else 0.0
-        )
-        placed_m = place_sigma_m(residual_m, cell_m, aside_of(outline_m, self.cameras_m))
-        sigma_m = np.hypot(placed_m, spread_m / np.sqrt(max(len(self._places), 1)))
+        sigma_m = place_sigma_m(residual_m, cell_m, aside_of(outline_m, self.cameras_m))
         return Change(
             f"{id_prefix}-{self.number}",
             self._kind,
@@ -397,7 +383,7 @@ class Candidate:
             tally.views,
             size.area_m2,
             size.length_m,
-            float(sigma_m),
+            sigma_m,
             patch,
             announced_ns=announced_ns,
         )
@@ -422,8 +408,6 @@ class Candidate:
         report: CellReport,
         cells: Mask,
         residual_m: float,
-        *,
-        knows_place: bool,
     ) -> int:
         """Count a view that shows it; the leg of the followed blob that shows it there, 0 for none."""
         seen = view.time_ns, report.score, residual_m, view.camera_m
@@ -437,12 +421,10 @@ class Candidate:
         self._cameras.append(view.camera_m)
         if len(self._cameras) > _MOST_CAMERAS:
             del self._cameras[1::2]
-        if knows_place and len(self._places) < _MOST_PLACES:
-            self._places.append(report.place_m)
         return leg
 
     def _note_rim(self, view: KeptView, cells: Mask, leg: int) -> None:
-        if view.laid.part_of(view.laid.cut_off, self.cells, cells).any():
+        if view.laid.part_of(view.laid.at_rim, self.cells, cells).any():
             return
         self.tally = replace(self.tally, whole=self.tally.whole + 1)
         if leg in self._shown_by:
@@ -506,7 +488,7 @@ class Seeds:
             del sizes[0], self._seeds[0]
 
     def _ask(self, seed: Candidate, kept_view: KeptView) -> None:
-        seed.ask(kept_view, self._grid.read(seed.cells).changed > 0, self._cell_m)
+        seed.ask(kept_view, self._grid.read(seed.cells).changed > 0)
 
     def _new(self, laid: LaidView, weak: Mask) -> list[CellWindow]:
         """The windows of large enough `weak` pieces, the surest first."""

@@ -331,7 +331,7 @@ class EvidenceMap:
         long_ago = (
             each for each in earlier if (kept_view.time_ns - each.time_ns) * 1e-9 >= _STANDS_S
         )
-        return any(each.laid.report(window, cells, self._cell_m).flagged > 0.5 for each in long_ago)
+        return any(each.laid.report(window, cells).flagged > 0.5 for each in long_ago)
 
     def _begin(
         self, view: ComparedView, earlier: Sequence[KeptView], window: CellWindow, cells: Mask
@@ -340,7 +340,7 @@ class EvidenceMap:
         self._found[candidate.number] = candidate
         candidate.pictures.show(view, *window.box_m(self._cell_m), self._m_per_px)
         for each in earlier:
-            candidate.recall(each, cells, self._cell_m)
+            candidate.recall(each, cells)
         return candidate.number
 
     def _merge(self, number: int, gone: int) -> None:
@@ -398,7 +398,7 @@ class EvidenceMap:
             if (passing := self._passing(evidence, own)) is not None:
                 own &= ~passing
                 self._give_up(candidate, passing, evidence, own, kept_view)
-            if candidate.see(kept_view, own, self._cell_m):
+            if candidate.see(kept_view, own):
                 shown.append(candidate)
                 if candidate.pictures.wants_votes and number not in new:
                     candidate.pictures.vote(view.site_from_image, view.changed, view.valid)

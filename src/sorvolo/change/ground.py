@@ -23,7 +23,7 @@ from sorvolo.geometry.arrays import (
     PointsM,
 )
 from sorvolo.geometry.homography import apply_homography, resized
-from sorvolo.survey.findings import ComparedView, Patch, Shade
+from sorvolo.survey.findings import ComparedView, Patch
 
 CHUNK = 64  # cells, along a side of a stored piece
 _VOTES: Bytes = np.array([bin(bits).count("1") for bits in range(256)], np.uint8)
@@ -126,16 +126,14 @@ class CellReport(NamedTuple):
     seen: float  # share of them
     flagged: float  # share of them
     score: float  # 0 to 1, the highest of the flagged ones
-    place_m: Floats  # (2,) the middle of the flagged ones
 
 
 @dataclass(frozen=True, eq=False)
 class LaidView:
     """One view as cells of a window: `flagged` where it shows a change, `seen` where it knows the ground.
 
-    `score` is 255 times the sureness of the change there; `held` marks cells under things that may move. `shaded` is
-    where one date is no brighter than the other, all colours alike: where a shadow may lie. `legs` has the leg of
-    the followed blob that shows the change there, 0 where none does.
+    `score` is 255 times the sureness of the change there; `held` marks cells under things that may move. `legs` has the
+    leg of the followed blob that shows the change there, 0 where none does.
     """
 
     window: CellWindow
@@ -143,61 +141,34 @@ class LaidView:
     seen: Mask
     score: ImageGray
     held: Mask
-    shaded: Mask
     legs: Ints32
 
     @cached_property
     def at_rim(self) -> Mask:
         """The flagged pieces that end at unknown ground or at the view's rim."""
-        return self._pieces_that(self._beside_unseen)
-
-    @cached_property
-    def cut_off(self) -> Mask:
-        """Those of them that are not whole: what only its shadow leaves is. Of what is all shade, all counts."""
-        is_lit = self._pieces_that(~self.shaded)
-        return self._pieces_that(self._beside_unseen & ~(self.shaded & is_lit))
-
-    @cached_property
-    def _labels(self) -> Ints32:
-        return np.asarray(
-            cv2.connectedComponents(self.flagged.view(np.uint8), connectivity=8)[1], np.int32
-        )
-
-    @cached_property
-    def _beside_unseen(self) -> Mask:
         unseen = cv2.copyMakeBorder(
             (~self.seen).view(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1
         )
-        return np.asarray(cv2.dilate(unseen, np.ones((3, 3), np.uint8))[1:-1, 1:-1] > 0)
-
-    def _pieces_that(self, reach: Mask) -> Mask:
-        """The flagged pieces of which any cell lies in a raster."""
-        found = np.unique(self._labels[reach & self.flagged])
-        return np.isin(self._labels, found) if len(found) else np.zeros_like(self.flagged)
+        beside = cv2.dilate(unseen, np.ones((3, 3), np.uint8))[1:-1, 1:-1] > 0
+        _, labels = cv2.connectedComponents(self.flagged.view(np.uint8), connectivity=8)
+        return np.isin(labels, np.unique(labels[beside & self.flagged]))
 
     def leg_of(self, window: CellWindow, cells: Mask) -> int:
         """The leg of the followed blob that shows most of what is flagged of some `cells` of a window; or 0."""
         legs = self.legs[window.within(self.window)][self.part_of(self.flagged, window, cells)]
         return int(np.bincount(legs).argmax()) if len(legs) else 0
 
-    def report(self, window: CellWindow, cells: Mask, cell_m: float) -> "CellReport":
+    def report(self, window: CellWindow, cells: Mask) -> "CellReport":
         """What the view reports of some `cells` of a window."""
         inner = window.overlap(self.window)
         if 0 in inner.shape:
-            return CellReport(0.0, 0.0, 0.0, np.zeros(2))
+            return CellReport(0.0, 0.0, 0.0)
         here, there = inner.within(window), inner.within(self.window)
         mine, total = cells[here], max(int(np.count_nonzero(cells)), 1)
         flagged = mine & self.flagged[there]
         seen = np.count_nonzero(mine & self.seen[there]) / total
-        if not flagged.any():
-            return CellReport(seen, 0.0, 0.0, np.zeros(2))
-        rows, columns = np.nonzero(flagged)
-        middle = (
-            np.array([columns.mean() + inner.x0 + 0.5, -(rows.mean() + inner.y0 + 0.5)]) * cell_m
-        )
-        return CellReport(
-            seen, len(rows) / total, float(self.score[there][flagged].max()) / 255, middle
-        )
+        score = float(self.score[there][flagged].max(initial=0)) / 255
+        return CellReport(seen, np.count_nonzero(flagged) / total, score)
 
     def part_of(self, marked: Mask, window: CellWindow, cells: Mask) -> Mask:
         """Which of some `cells` of a window the view has `marked`, as far as it reaches."""
@@ -248,16 +219,12 @@ def lay(view: ComparedView, cell_m: float, ignored: Mask, held: Mask, legs: Labe
     _clear_behind(seen, cell_from_small)
     flagged = (laid(changed, cv2.INTER_LINEAR) >= 128) & seen
     may_move = laid(in_held, cv2.INTER_NEAREST) > 0 if held.any() else np.zeros_like(seen)
-    in_shade = (
-        view.shade[::shrink, ::shrink][:rows, :columns] & (Shade.LATER | Shade.EARLIER) > 0
-    ).view(np.uint8)
     return LaidView(
         window,
         flagged,
         seen,
         np.where(flagged, laid(score, cv2.INTER_NEAREST), 0),
         may_move,
-        laid(in_shade, cv2.INTER_NEAREST) > 0,
         numbers[laid(followed, cv2.INTER_NEAREST)].astype(np.int32),
     )
 
