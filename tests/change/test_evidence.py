@@ -101,17 +101,8 @@ def candidate(number: int, shown: int, missed: int) -> Candidate:
             np.zeros((5, 5), bool),
             np.zeros((5, 5), np.int32),
         )
-        view = KeptView(
-            START_NS + each,
-            laid,
-            np.array([each, 0.0, CAMERA_HEIGHT_M]),
-            np.eye(3),
-            np.zeros((4, 4), np.uint8),
-            np.ones((4, 4), bool),
-            0.1,
-            True,
-        )
-        assert result.see(view, one) == flagged.any()
+        view = view_of(each, each, (each, 0.0, CAMERA_HEIGHT_M), [])
+        assert result.see(KeptView(view, laid, True), one) == flagged.any()
     return result
 
 

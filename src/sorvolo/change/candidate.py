@@ -20,7 +20,7 @@ from sorvolo.change.outlines import aside_of, measures, outline_of, overlap, pla
 from sorvolo.change.patches import Cut, PatchWindow, cut, moved, patch_of, quality
 from sorvolo.change.things import things_of
 from sorvolo.errors import GeometryError
-from sorvolo.geometry.arrays import Bytes, Floats, ImageGray, Mask, Matrix3, PointsM
+from sorvolo.geometry.arrays import Bytes, Floats, Mask, PointsM
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Patch
 
 _MOST_VOTES = 250  # a byte counts them
@@ -83,19 +83,19 @@ class Pictures:
         else:
             self._best = self._best.over(new)
 
-    def vote(self, site_from_image: Matrix3, changed: Bytes, valid: Mask) -> None:
+    def vote(self, view: ComparedView) -> None:
         """Count one view's mask, pixel by pixel, towards the outline."""
         if self._window is None or self._votes >= _MOST_VOTES:
             return
         self._votes += 1
-        patch_from_image = np.linalg.inv(self._window.site_from_patch) @ site_from_image
+        patch_from_image = np.linalg.inv(self._window.site_from_patch) @ view.site_from_image
         size = self._window.size_px
         self._yes += (
-            cv2.warpPerspective(changed, patch_from_image, size, flags=cv2.INTER_LINEAR) >= 128
+            cv2.warpPerspective(view.changed, patch_from_image, size, flags=cv2.INTER_LINEAR) >= 128
         )
         self._asked += (
             cv2.warpPerspective(
-                valid.view(np.uint8), patch_from_image, size, flags=cv2.INTER_NEAREST
+                view.valid.view(np.uint8), patch_from_image, size, flags=cv2.INTER_NEAREST
             )
             > 0
         )
@@ -266,16 +266,17 @@ _MOST_LEGS = 64  # of followed blobs that showed it; the oldest are forgotten
 
 @dataclass(frozen=True, eq=False)
 class KeptView:
-    """What is kept of one of the last views; it `counts` if the camera had moved on since the one before."""
+    """One of the last views; it `counts` if the camera had moved on since the one before."""
 
-    time_ns: int
+    view: ComparedView
     laid: LaidView
-    camera_m: Floats
-    site_from_image: Matrix3
-    changed: ImageGray
-    valid: Mask
-    residual_m: float  # of its alignment with the map
     counts: bool
+
+    @property
+    def residual_m(self) -> float:
+        """Of its alignment with the map, 0 where that is not known."""
+        residual_px = self.view.residual_px
+        return residual_px * self.view.m_per_px if np.isfinite(residual_px) else 0.0
 
 
 class Candidate:
@@ -310,38 +311,38 @@ class Candidate:
         """It reaches into this window, too."""
         self.cells = self.cells.joined(window)
 
-    def recall(self, view: KeptView, cells: Mask) -> None:
+    def recall(self, kept: KeptView, cells: Mask) -> None:
         """Count a view from before the candidate was found, whose `cells` lie in its window, and its mask."""
-        report = view.laid.report(self.cells, cells)
+        report = kept.laid.report(self.cells, cells)
         if report.seen < _SEEN:
             return
         if report.flagged < _SHOWS * report.seen:
             self.miss()
             return
-        self._count(view, report, cells, residual_m=0.0)
-        self.pictures.vote(view.site_from_image, view.changed, view.valid)
+        self._count(kept, report, cells, residual_m=0.0)
+        self.pictures.vote(kept.view)
 
-    def see(self, view: KeptView, cells: Mask) -> bool:
+    def see(self, kept: KeptView, cells: Mask) -> bool:
         """Count this view; whether it shows the candidate. One that sees less than half of it does not count, unless
         the candidate is as large as the view."""
-        report = view.laid.report(self.cells, cells)
-        is_large = max(self.cells.shape) > 0.5 * max(view.laid.window.shape)
+        report = kept.laid.report(self.cells, cells)
+        is_large = max(self.cells.shape) > 0.5 * max(kept.laid.window.shape)
         if report.seen < _SEEN and not (is_large and report.flagged > 0):
             return False
         if report.flagged < _SHOWS * report.seen:
             self.miss()
             return False
-        leg = self._count(view, report, cells, view.residual_m)
-        self._note_rim(view, cells, leg)
+        leg = self._count(kept, report, cells, kept.residual_m)
+        self._note_rim(kept, cells, leg)
         return True
 
-    def ask(self, view: KeptView, cells: Mask) -> bool:
+    def ask(self, kept: KeptView, cells: Mask) -> bool:
         """Count this view as for a seed: whatever shows some of it shows it; and its mask. Whether it does."""
-        report = view.laid.report(self.cells, cells)
+        report = kept.laid.report(self.cells, cells)
         if report.flagged >= max(_SHOWS * report.seen, 1e-9):
-            leg = self._count(view, report, cells, view.residual_m)
-            self.pictures.vote(view.site_from_image, view.changed, view.valid)
-            self._note_rim(view, cells, leg)
+            leg = self._count(kept, report, cells, kept.residual_m)
+            self.pictures.vote(kept.view)
+            self._note_rim(kept, cells, leg)
             return True
         if report.seen >= _SEEN:
             self.miss()
@@ -402,17 +403,12 @@ class Candidate:
         self.extend(other.cells)
         return self
 
-    def _count(
-        self,
-        view: KeptView,
-        report: CellReport,
-        cells: Mask,
-        residual_m: float,
-    ) -> int:
+    def _count(self, kept: KeptView, report: CellReport, cells: Mask, residual_m: float) -> int:
         """Count a view that shows it; the leg of the followed blob that shows it there, 0 for none."""
+        view = kept.view
         seen = view.time_ns, report.score, residual_m, view.camera_m
         self.tally = self.tally.with_view(*seen)
-        leg = view.laid.leg_of(self.cells, cells)
+        leg = kept.laid.leg_of(self.cells, cells)
         if leg:
             known = self._shown_by.get(leg, Tally(view.time_ns, view.time_ns))
             self._shown_by[leg] = known.with_view(*seen)
@@ -423,8 +419,8 @@ class Candidate:
             del self._cameras[1::2]
         return leg
 
-    def _note_rim(self, view: KeptView, cells: Mask, leg: int) -> None:
-        if view.laid.part_of(view.laid.at_rim, self.cells, cells).any():
+    def _note_rim(self, kept: KeptView, cells: Mask, leg: int) -> None:
+        if kept.laid.part_of(kept.laid.at_rim, self.cells, cells).any():
             return
         self.tally = replace(self.tally, whole=self.tally.whole + 1)
         if leg in self._shown_by:
@@ -456,12 +452,10 @@ class Seeds:
     def __iter__(self) -> Iterator[Candidate]:
         return iter(self._seeds)
 
-    def keep(
-        self, view: ComparedView, kept_view: KeptView, evidence: CellEvidence, most_pictures: int
-    ) -> None:
+    def keep(self, last: KeptView, evidence: CellEvidence, most_pictures: int) -> None:
         """Ask the view about the seeds, forget those that no view flags any more or that a candidate owns by now, and
         keep what the view flags besides, the surest first, with at most `most_pictures`."""
-        laid = kept_view.laid
+        view, laid = last.view, last.laid
         weak = laid.flagged & (evidence.owner == 0)
         kept = []
         for seed in self._seeds:
@@ -471,7 +465,7 @@ class Seeds:
                 kept.append(seed)
             elif (votes > 0).any() and not (owner > 0).any():
                 kept.append(seed)
-                self._ask(seed, kept_view)
+                self._ask(seed, last)
                 weak[here] = False
         self._seeds = kept
         if most_pictures <= 0 or not weak.any():
@@ -479,7 +473,7 @@ class Seeds:
         for window in self._new(laid, weak)[:most_pictures]:
             seed = Candidate(0, window, view.time_ns)
             seed.pictures.show(view, *window.box_m(self._cell_m), self._m_per_px)
-            self._ask(seed, kept_view)
+            self._ask(seed, last)
             self._seeds.append(seed)
         # Let the oldest go where there are too many: a large site has hundreds that only its
         # first photos show.
@@ -487,8 +481,8 @@ class Seeds:
         while len(sizes) > _MOST_SEEDS and sum(sizes) > _MOST_SEEDS_PX:
             del sizes[0], self._seeds[0]
 
-    def _ask(self, seed: Candidate, kept_view: KeptView) -> None:
-        seed.ask(kept_view, self._grid.read(seed.cells).changed > 0)
+    def _ask(self, seed: Candidate, kept: KeptView) -> None:
+        seed.ask(kept, self._grid.read(seed.cells).changed > 0)
 
     def _new(self, laid: LaidView, weak: Mask) -> list[CellWindow]:
         """The windows of large enough `weak` pieces, the surest first."""

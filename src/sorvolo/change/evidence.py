@@ -140,18 +140,15 @@ class EvidenceMap:
         waited_s = np.inf if self._last is None else (view.time_ns - self._last[1]) * 1e-9
         most_pictures = pictures_for(waited_s)
         self._last = (view.index, view.time_ns, view.camera_m)
-        kept_view, moving = self._lay(view)
-        evidence = self._grid.record(kept_view.laid, kept_view.counts)
-        earlier = list(self._recent)
-        self._recent.append(kept_view)
-        begun = self._gather(view, kept_view, earlier, evidence)
+        kept, moving = self._lay(view)
+        evidence = self._grid.record(kept.laid, kept.counts)
+        begun = self._gather(kept, evidence)
+        self._recent.append(kept)
         new = {each for each in begun if self._current(each) == each}
-        shown, pictures = self._update(
-            view, kept_view, evidence.owner, new, most_pictures - len(begun)
-        )
+        shown, pictures = self._update(kept, evidence.owner, new, most_pictures - len(begun))
         announced = [change for each in shown for change in self._announce(each, view.time_ns)]
         announced += self._movers.see(view, moving, self._named)
-        self._seeds.keep(view, kept_view, evidence, most_pictures - len(begun) - pictures)
+        self._seeds.keep(kept, evidence, most_pictures - len(begun) - pictures)
         return tuple(announced)
 
     def changes(self) -> tuple[Change, ...]:
@@ -235,18 +232,7 @@ class EvidenceMap:
         moving, held = (followed.is_moving, followed.may_move) if may_follow else (nothing, nothing)
         legs = followed.legs if may_follow else np.zeros(len(view.boxes), np.int64)
         laid = lay(view, self._cell_m, moving, held, legs)
-        residual_m = view.residual_px * view.m_per_px if np.isfinite(view.residual_px) else 0.0
-        kept_view = KeptView(
-            view.time_ns,
-            laid,
-            view.camera_m,
-            view.site_from_image,
-            view.changed,
-            view.valid,
-            residual_m,
-            self._is_new_place(view),
-        )
-        return kept_view, followed
+        return KeptView(view, laid, self._is_new_place(view)), followed
 
     def _is_new_place(self, view: ComparedView) -> bool:
         last, least_m = self._counted_at_m, _MOVED_HEIGHTS * float(view.camera_m[2])
@@ -257,16 +243,10 @@ class EvidenceMap:
 
     # ---- from cells to candidates -----------------------------------------------------------------------------
 
-    def _gather(
-        self,
-        view: ComparedView,
-        kept_view: KeptView,
-        earlier: Sequence[KeptView],
-        evidence: CellEvidence,
-    ) -> list[int]:
+    def _gather(self, kept: KeptView, evidence: CellEvidence) -> list[int]:
         """Give the cells that are certain to the candidates that they belong to, in `evidence` as well; the numbers of
         the candidates that begin with this view."""
-        laid = kept_view.laid
+        laid = kept.laid
         sure = (evidence.votes >= self._settings.k) & laid.flagged
         if not (sure & (evidence.owner == 0)).any():
             return []
@@ -287,10 +267,10 @@ class EvidenceMap:
                 for younger in owners[1:]:
                     self._merge(owners[0], younger)
                 number = owners[0]
-            elif self._may_begin(kept_view, earlier, evidence, part, cells):
+            elif self._may_begin(kept, evidence, part, cells):
                 number = self._forgotten_at(window, cells)
                 if not number:
-                    number = self._begin(view, earlier, window, cells)
+                    number = self._begin(kept.view, window, cells)
                     begun.append(number)
             else:
                 continue
@@ -300,46 +280,31 @@ class EvidenceMap:
         return begun
 
     def _may_begin(
-        self,
-        kept_view: KeptView,
-        earlier: Sequence[KeptView],
-        evidence: CellEvidence,
-        part: tuple[slice, slice],
-        cells: Mask,
+        self, kept: KeptView, evidence: CellEvidence, part: tuple[slice, slice], cells: Mask
     ) -> bool:
         """Whether certain cells that nobody owns are a new candidate: large enough, standing, and all of it in view."""
-        laid = kept_view.laid
         if np.count_nonzero(cells) < self._least_cells:
             return False
-        if np.mean(laid.held[part][cells]) > 0.5 and not self._stands(
-            kept_view, earlier, part, cells
-        ):
+        if np.mean(kept.laid.held[part][cells]) > 0.5 and not self._stands(kept, part, cells):
             return False
         # of what ends at a rim more will come into view soon
-        is_at_rim = (cells & laid.at_rim[part]).any()
+        is_at_rim = (cells & kept.laid.at_rim[part]).any()
         return not is_at_rim or int(evidence.votes[part][cells].max()) >= self._settings.n
 
-    def _stands(
-        self,
-        kept_view: KeptView,
-        earlier: Sequence[KeptView],
-        part: tuple[slice, slice],
-        cells: Mask,
-    ) -> bool:
+    def _stands(self, kept: KeptView, part: tuple[slice, slice], cells: Mask) -> bool:
         """Whether views over a long enough time show these very cells."""
-        window = kept_view.laid.window.part(part)
-        long_ago = (
-            each for each in earlier if (kept_view.time_ns - each.time_ns) * 1e-9 >= _STANDS_S
+        window = kept.laid.window.part(part)
+        return any(
+            each.laid.report(window, cells).flagged > 0.5
+            for each in self._recent
+            if (kept.view.time_ns - each.view.time_ns) * 1e-9 >= _STANDS_S
         )
-        return any(each.laid.report(window, cells).flagged > 0.5 for each in long_ago)
 
-    def _begin(
-        self, view: ComparedView, earlier: Sequence[KeptView], window: CellWindow, cells: Mask
-    ) -> int:
+    def _begin(self, view: ComparedView, window: CellWindow, cells: Mask) -> int:
         candidate = Candidate(self._next_number(), window, view.time_ns)
         self._found[candidate.number] = candidate
         candidate.pictures.show(view, *window.box_m(self._cell_m), self._m_per_px)
-        for each in earlier:
+        for each in self._recent:
             candidate.recall(each, cells)
         return candidate.number
 
@@ -381,12 +346,7 @@ class EvidenceMap:
     # ---- candidates brought up to date ------------------------------------------------------------------------
 
     def _update(
-        self,
-        view: ComparedView,
-        kept_view: KeptView,
-        owner: Ints32,
-        new: set[int],
-        most_pictures: int,
+        self, kept: KeptView, owner: Ints32, new: set[int], most_pictures: int
     ) -> tuple[list[Candidate], int]:
         """Bring the candidates in view up to date; those that it shows, in the order of their numbers, and how many
         pictures were cut."""
@@ -397,14 +357,14 @@ class EvidenceMap:
             own = evidence.owner == candidate.number
             if (passing := self._passing(evidence, own)) is not None:
                 own &= ~passing
-                self._give_up(candidate, passing, evidence, own, kept_view)
-            if candidate.see(kept_view, own):
+                self._give_up(candidate, passing, evidence, own, kept)
+            if candidate.see(kept, own):
                 shown.append(candidate)
                 if candidate.pictures.wants_votes and number not in new:
-                    candidate.pictures.vote(view.site_from_image, view.changed, view.valid)
-        pictures = self._cut_pictures(view, shown, most_pictures)
+                    candidate.pictures.vote(kept.view)
+        pictures = self._cut_pictures(kept.view, shown, most_pictures)
         for number in new:
-            self._found[number].pictures.vote(view.site_from_image, view.changed, view.valid)
+            self._found[number].pictures.vote(kept.view)
         return shown, pictures
 
     def _cut_pictures(
@@ -439,14 +399,14 @@ class EvidenceMap:
         passing: Mask,
         evidence: CellEvidence,
         own: Mask,
-        kept_view: KeptView,
+        kept: KeptView,
     ) -> None:
         """Take cells from a candidate whose `own` ones stay. The views that are counted then are those that its own
         cells had, if it lost most."""
         self._grid.own(candidate.cells, passing, 0)
         if np.count_nonzero(passing) <= np.count_nonzero(own):
             return
-        now = int(kept_view.counts)  # this view is counted apart
+        now = int(kept.counts)  # this view is counted apart
         changed, seen = (
             int(np.median(each[own])) - now for each in (evidence.changed, evidence.seen)
         )
