@@ -18,30 +18,6 @@ class Objection(StrEnum):
     MOVES = "most views that show it show something that moves"
 
 
-@dataclass(frozen=True)
-class Announce:
-    """The candidate is a change."""
-
-    score: float  # 0 to 1
-
-
-@dataclass(frozen=True)
-class Wait:
-    """Not yet: more views may confirm it."""
-
-    reason: Objection
-
-
-@dataclass(frozen=True)
-class Drop:
-    """No view is left to confirm it: not announced, or withdrawn."""
-
-    reason: Objection
-
-
-Verdict = Announce | Wait | Drop
-
-
 # When a candidate is announced.
 LEAST_SCORE = 0.38  # half the threshold of trees that were not trained on flights
 _LARGE_M2 = 2.0  # from this size on ...
@@ -148,12 +124,16 @@ class Tally:
         return self.views > 1 and self.heights_apart < _ONE_PLACE
 
 
-def judge(tally: Tally, *, is_over: bool) -> Verdict:
-    """Whether a candidate is a change. `is_over`: no more views will come."""
-    reason = _objection(tally)
-    if reason is None:
-        return Announce(sureness(tally))
-    return Drop(reason) if is_over else Wait(reason)
+def judge(tally: Tally) -> Objection | None:
+    """Why a candidate is no change, as far as it was seen; None where it is one, as sure as `sureness` has it."""
+    score, look = sureness(tally), tally.look
+    if score < LEAST_SCORE:
+        return Objection.MOVES if tally.moved > tally.views else Objection.UNSURE
+    if look is None or score >= _LARGE_SCORE or tally.is_from_one_place():
+        return None
+    # a wall that leans is large; snow is longer than the flying height
+    may_be_a_wall = look.area_m2 >= _LARGE_M2 and look.length_m < tally.flying_height_m
+    return Objection.LARGE_AND_UNSURE if may_be_a_wall else None
 
 
 def sureness(tally: Tally) -> float:
@@ -174,18 +154,6 @@ def views_score(tally: Tally, calm: float = 1.0) -> float:
     score = tally.score_sum / tally.views * (tally.views + 1) / (tally.asked + 2) * calm
     wholeness = _CUT_OFF + (1 - _CUT_OFF) * min(2 * tally.whole / tally.views, 1.0)
     return float(np.clip(score * (0.5 if tally.is_from_one_place() else 1.0) * wholeness, 0, 1))
-
-
-def _objection(tally: Tally) -> Objection | None:
-    """The first rule that a candidate fails."""
-    score, look = sureness(tally), tally.look
-    if score < LEAST_SCORE:
-        return Objection.MOVES if tally.moved > tally.views else Objection.UNSURE
-    if look is None or score >= _LARGE_SCORE or tally.is_from_one_place():
-        return None
-    # a wall that leans is large; snow is longer than the flying height
-    may_be_a_wall = look.area_m2 >= _LARGE_M2 and look.length_m < tally.flying_height_m
-    return Objection.LARGE_AND_UNSURE if may_be_a_wall else None
 
 
 def _three(values: Floats) -> tuple[float, float, float]:

@@ -14,11 +14,9 @@ import numpy as np
 
 from sorvolo.change.announcing import (
     LEAST_SCORE,
-    Announce,
     Look,
     Objection,
     Tally,
-    Verdict,
     judge,
     sureness,
     views_score,
@@ -112,7 +110,7 @@ class EvidenceMap:
         self._parts: dict[
             int, Parts
         ] = {}  # the things that an announced change holds, by its number
-        self._stopped: dict[int, Verdict] = {}  # at the flight's end, by number
+        self._stopped: dict[int, Objection | None] = {}  # at the flight's end, by number
         self._seen_once: set[int] = (
             set()
         )  # the numbers of those with ground that one view alone shows
@@ -174,11 +172,11 @@ class EvidenceMap:
             if number not in self._announced_ns:
                 self._announce(candidate, -1)
                 continue
-            verdict, whole = self._judged(candidate, is_over=True)
-            if whole is not None and isinstance(verdict, Announce):
+            objection, whole = self._judged(candidate)
+            if whole is not None and objection is None:
                 self._part(candidate, -1, whole)
             else:
-                self._stopped[number] = verdict
+                self._stopped[number] = objection
         return self.changes()
 
     @property
@@ -190,9 +188,9 @@ class EvidenceMap:
         """What became of the candidates, for a report after `conclude`: how many changes are `announced`, those that
         stay in place and those that move; by reason how many candidates were `withdrawn`, or `never_announced`."""
         reasons = {
-            number: verdict.reason.value
-            for number, verdict in self._stopped.items()
-            if not isinstance(verdict, Announce)
+            number: objection.value
+            for number, objection in self._stopped.items()
+            if objection is not None
         }
         withdrawn = Counter(
             each for number, each in reasons.items() if number in self._announced_ns
@@ -424,26 +422,24 @@ class EvidenceMap:
             parts = self._parts.get(number)
             is_due = now_ns >= 0 and (parts is None or parts.is_due(candidate.tally.views))
             return self._part(candidate, now_ns, self._record(candidate)) if is_due else []
-        verdict, whole = self._judged(candidate, is_over=now_ns < 0)
-        if whole is None or not isinstance(verdict, Announce):
+        objection, whole = self._judged(candidate)
+        if whole is None or objection is not None:
             if now_ns < 0:
-                self._stopped[number] = verdict
+                self._stopped[number] = objection
             return []
         self._announced_ns[number] = now_ns
         return self._part(candidate, now_ns, replace(whole, announced_ns=now_ns))
 
-    def _judged(self, candidate: Candidate, *, is_over: bool) -> tuple[Verdict, Change | None]:
-        """Whether a candidate is a change, and its record if its views alone make it one."""
+    def _judged(self, candidate: Candidate) -> tuple[Objection | None, Change | None]:
+        """Why a candidate is no change, if so, and its record if its views alone make it one."""
         is_worth_it = views_score(self._tally_of(candidate)) >= LEAST_SCORE
         candidate.note_restlessness(self._restlessness(candidate) if is_worth_it else 0.0)
         tally = self._tally_of(candidate)
-        verdict = judge(tally, is_over=is_over)
-        whole = self._record(candidate) if isinstance(verdict, Announce) else None
+        objection = judge(tally)
+        whole = self._record(candidate) if objection is None else None
         if whole is None:
-            return verdict, None
-        return judge(
-            replace(tally, look=Look(whole.area_m2, whole.length_m)), is_over=is_over
-        ), whole
+            return objection, None
+        return judge(replace(tally, look=Look(whole.area_m2, whole.length_m))), whole
 
     def _restlessness(self, candidate: Candidate) -> float:
         return restlessness(self._grid, candidate.cells, self._cells_of(candidate), self._cell_m)
