@@ -11,7 +11,6 @@ from sorvolo.change.gathered import GatheredThings
 from sorvolo.change.learned import learned_difference
 from sorvolo.change.things import without_shadow
 from sorvolo.geometry.arrays import ImageRGB
-from sorvolo.geometry.sun import direction_from_angles, slide_of
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Shade
 
 M_PER_PX = 0.1
@@ -220,52 +219,3 @@ def test_what_one_view_shows_or_may_be_a_shadow_is_not_reported(ground, views, s
 def test_unchanged_ground_in_another_light_and_no_flight_at_all_give_nothing(ground):
     assert gathered(ground, (0.7 * ground).astype(np.uint8), 4).conclude("b", count(1), []) == []
     assert GatheredThings().conclude("b", count(1), []) == []
-
-
-EARLIER, LATER = slide_of(direction_from_angles(237, 29)), slide_of(direction_from_angles(165, 39))
-
-
-def shadow_of_box(slide: np.ndarray) -> np.ndarray:
-    """The shadow of a box, 2 x 2 m and 2.5 m tall, without the box, in pixels of the ground."""
-    box = np.zeros((480, 640), bool)
-    box[150:170, 210:230] = True
-    shadow = np.zeros_like(box)
-    for up_m in np.arange(0.0, 2.5, 0.05):
-        east, north = np.rint(slide * up_m / M_PER_PX).astype(int)
-        shadow |= np.roll(box, (-north, east), (0, 1))
-    return shadow & ~box
-
-
-def outline_around(pixels: np.ndarray) -> np.ndarray:
-    rows, columns = np.nonzero(pixels)
-    corners = cv2.convexHull(np.column_stack([columns, rows]))[:, 0].astype(float)
-    return corners * M_PER_PX * [1, -1]
-
-
-def test_the_shadow_of_a_box_that_stays_has_moved_and_that_of_one_that_came_has_not(ground):
-    earlier, later = shadow_of_box(EARLIER), shadow_of_box(LATER)
-    came, left = later & ~earlier, earlier & ~later
-    both = gathered(
-        ground, ground, 3, came * np.uint8(Shade.LATER_DARK) + left * np.uint8(Shade.EARLIER_DARK)
-    )
-    assert both.is_moved_shadow(outline_around(came), EARLIER, LATER)
-    back = gathered(
-        ground, ground, 3, came * np.uint8(Shade.EARLIER_DARK) + left * np.uint8(Shade.LATER_DARK)
-    )
-    assert back.is_moved_shadow(outline_around(came), LATER, EARLIER)
-    assert not both.is_moved_shadow(
-        outline_around(came), LATER, EARLIER
-    )  # the sun went another way
-    assert not both.is_moved_shadow(outline_around(came), LATER, LATER)  # it did not move
-    assert not both.is_moved_shadow(outline_around(came) - [0, 9], EARLIER, LATER)  # no shade there
-
-    alone = gathered(ground, ground, 3, later * np.uint8(Shade.LATER_DARK))
-    assert not alone.is_moved_shadow(outline_around(later), EARLIER, LATER)
-    assert not gathered(ground, ground, 0).is_moved_shadow(outline_around(came), EARLIER, LATER)
-
-
-def test_outlines_beyond_the_ground_that_was_gathered_are_no_moved_shadow(ground):
-    things = gathered(ground, ground, 1)
-    for middle_m in ([-50, -50], [90, -9], [5, 60]):
-        outline_m = np.array([[0, 0], [1, 0], [1, 1.0]]) + middle_m
-        assert not things.is_moved_shadow(outline_m, EARLIER, LATER)

@@ -7,7 +7,7 @@ import pytest
 from sorvolo.change.earlier_pictures import EarlierPicture, EarlierPictures, with_known_pixels
 from sorvolo.change.relief import ReliefMap
 from sorvolo.geometry.camera import Camera
-from sorvolo.geometry.homography import apply_homography, site_from_image_homography
+from sorvolo.geometry.homography import site_from_image_homography
 from sorvolo.geometry.pose import NADIR_CAMERA_NORTH_UP, Pose
 
 CAMERA = Camera.from_angle_of_view(320, 240, 62.0)
@@ -66,24 +66,6 @@ def rendered(over: ReliefMap | None):
 @pytest.fixture(scope="module")
 def truth():
     return seen(LATER)
-
-
-def test_when_the_newest_picture_of_a_place_was_taken() -> None:
-    pictures = []
-    for east_m, time_ns in ((0.0, 7), (6.0, 5)):
-        pose = Pose(NADIR_CAMERA_NORTH_UP, EARLIER + np.array([east_m, 0, 0]))
-        homography = site_from_image_homography(CAMERA, pose)
-        pictures.append(EarlierPicture(CAMERA, homography, pose, time_ns))
-    earlier = EarlierPictures(pictures, lambda _: with_known_pixels(seen(EARLIER)[0]))
-    place = EARLIER[:2] + np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
-    assert earlier.time_ns(place) == 7
-    corners_m = apply_homography(
-        pictures[1].site_from_image, np.array([[0.0, 0], [CAMERA.width_px, 0]])
-    )
-    # 1.5 m from the east edge of the second, which the first one does not reach
-    east_m = 6.0 + np.ptp(corners_m[:, 0]) / 2 - 1.5
-    assert earlier.time_ns(place + np.array([east_m, 0])) == 5
-    assert earlier.time_ns(place + np.array([1000.0, 0])) is None
 
 
 def test_a_roof_is_rendered_where_the_later_camera_sees_it(truth) -> None:

@@ -13,17 +13,14 @@ from sorvolo.geometry.homography import apply_homography, pose_from_homography
 from sorvolo.geometry.pose import Pose
 
 _EDGE = 0.01  # of a stored picture: the lens's correction repeats pixels there
-_INNER = 0.8  # of an outline, about its middle, that a picture shows which shows it
 
 
 class EarlierPicture(NamedTuple):
-    """Where a picture of an earlier flight lies, and its time, UTC; `site_from_camera` is None where its method has no
-    pose."""
+    """Where a picture of an earlier flight lies; `site_from_camera` is None where its method has no pose."""
 
     camera: Camera
     site_from_image: Matrix3
     site_from_camera: Pose | None
-    time_ns: int = 0
 
 
 class EarlierPictures:
@@ -68,12 +65,6 @@ class EarlierPictures:
             )
             bgr = np.asarray(cv2.cvtColor(seen, cv2.COLOR_RGBA2BGR), np.uint8)
             yield bgr, np.asarray(cv2.extractChannel(seen, 3) == 255)
-
-    def time_ns(self, outline_m: PointsM) -> int | None:
-        """When the newest picture that shows an outline, (N, 2), was taken, UTC; None where none shows it."""
-        return max(
-            (each.time_ns for each in self._pictures if _shows(each, outline_m)), default=None
-        )
 
     def _as_coarse(self, index: int, site_from_other: Matrix3) -> tuple[ImageRGBA, Matrix3] | None:
         """A picture, and its (3, 3) place, made so much smaller that resampling it for another raster skips no pixels;
@@ -141,19 +132,6 @@ class EarlierPictures:
                 chosen.append(each)
         chosen += [each for each in order if each not in chosen][: most - len(chosen)]
         return chosen
-
-
-def _shows(picture: EarlierPicture, outline_m: PointsM) -> bool:
-    """Whether a picture shows an outline, (N, 2) site metres, but for a rim: at the map's edge it ends where the
-    picture that the map was made of ends."""
-    middle_m = outline_m.mean(axis=0)
-    inner_m = middle_m + _INNER * (outline_m - middle_m)
-    x, y = apply_homography(np.linalg.inv(picture.site_from_image), inner_m).T
-    with np.errstate(invalid="ignore"):
-        inside = (
-            (x >= 0) & (x < picture.camera.width_px) & (y >= 0) & (y < picture.camera.height_px)
-        )
-    return bool(inside.all())
 
 
 def with_known_pixels(rgb: ImageRGB) -> ImageRGBA:

@@ -41,9 +41,6 @@ _OWN_SPREADS = 0.5  # from which on a view by itself agrees
 _LEAST_CELLS = 44  # smaller things are found by their outline
 _MOST_OF_CELLS = 2000  # larger ground is an area
 _MOST_DARK = 0.7  # share of it that is darker on one date as in a shadow: it may be one
-_IS_MOVED = 0.6  # share of an outline that is shade, and of it that lies on the other date's, moved
-# what may throw a moved shadow; of higher things too many shades lie along the way
-_TALLEST_M = 5.0
 _SURE_SPREADS = 1.8  # what lies so far apart is sure
 _HELD = 0.3  # share of another change that things hold: it is reported as they are
 _LEAST_APART = 0.4  # spreads; ground of another change that lies less apart is the same
@@ -130,36 +127,15 @@ class GatheredThings:
         )  # what is dark in its outline is the object, not its shadow
         return replace(change, patch=replace(change.patch, shade=lit))
 
-    def is_moved_shadow(self, outline_m: PointsM, earlier: Floats, later: Floats) -> bool:
-        """Whether an outline's ground, (N, 2), is shade of one date, and shade of the other lies where what stays
-        threw it; the shadow of a point 1 m up lies (2,) off, east and north: `earlier` and `later`."""
-        slide = earlier - later
-        part, own = self._around(outline_m, float(np.abs(slide).max()) * _TALLEST_M)
-        if not own.any():
-            return False
-        step = slide * [1, -1] / self._ground.cell_m
-        seen = np.maximum(self._ground.sums["seen"][part], 1)
-        shades = {name: self._ground.sums[name][part] > 0.5 * seen for name in _SHADES}
-        for name, other, along in (("came", "left", step), ("left", "came", -step)):
-            shade = own & shades[name]
-            if np.count_nonzero(shade) > _IS_MOVED * np.count_nonzero(own):
-                return _share_moved(shade, shades[other], along, _TALLEST_M) > _IS_MOVED
-        return False
-
-    def _around(
-        self, outline_m: PointsM, margin_m: float = 0.0
-    ) -> tuple[tuple[slice, slice], Mask]:
+    def _around(self, outline_m: PointsM) -> tuple[tuple[slice, slice], Mask]:
         """The part of the raster around an outline, (N, 2), and which cells of it are the outline's and were seen."""
         if self._ground.is_empty:
             return np.s_[:0, :0], np.zeros((0, 0), bool)
         site_from_cell = self._ground.window.site_from_cell(self._ground.cell_m)
-        at, margin = (
-            apply_homography(np.linalg.inv(site_from_cell), outline_m),
-            margin_m / self._ground.cell_m + 1,
-        )
+        at = apply_homography(np.linalg.inv(site_from_cell), outline_m)
         (left, top), (right, low) = (
-            (at.min(axis=0) - margin).astype(int).clip(0),
-            (at.max(axis=0) + margin).astype(int),
+            (at.min(axis=0) - 1).astype(int).clip(0),
+            (at.max(axis=0) + 1).astype(int),
         )
         part = np.s_[top : max(low, top), left : max(right, left)]
         seen = self._ground.sums["seen"][part] > 0
@@ -306,21 +282,3 @@ def _going_on(thing: Change, known: Change) -> Change:
         last_seen_ns=known.last_seen_ns,
         announced_ns=known.announced_ns,
     )
-
-
-def _share_moved(own: Mask, other: Mask, step: Floats, most: float) -> float:
-    """The greatest share of a shade, `own` (h, w), that lies on the `other` date's shade when it is moved by a multiple
-    up to `most` of `step`, (2,) columns and rows."""
-    rows, columns = np.nonzero(own)
-    longest = float(np.abs(step).max()) * most
-    if not len(rows) or longest < 1:
-        return 0.0
-    best = 0
-    for times in np.arange(1.0, longest + 1) / longest * most:
-        x, y = (
-            np.rint(each + times * along).astype(int)
-            for each, along in ((columns, step[0]), (rows, step[1]))
-        )
-        inside = (x >= 0) & (y >= 0) & (x < other.shape[1]) & (y < other.shape[0])
-        best = max(best, int(np.count_nonzero(other[y[inside], x[inside]])))
-    return best / len(rows)

@@ -16,7 +16,7 @@ from sorvolo.change.outlines import (
     thing_sigma_m,
 )
 from sorvolo.change.things import without_shadow
-from sorvolo.geometry.arrays import Floats, PointsM
+from sorvolo.geometry.arrays import PointsM
 from sorvolo.survey.findings import Change, ChangeKind, Patch
 
 # When a change is a part of an area, or an area only changes.
@@ -31,22 +31,16 @@ def reconcile(
     gathered: GatheredThings | None,
     id_prefix: str,
     numbers: Iterator[int],
-    slides: Callable[[Change], tuple[Floats, Floats] | None],
 ) -> list[Change]:
     """Make one list of what all finders claim, each piece of ground reported once.
 
-    `gathered` is what all views together show, None where that is not asked: it keeps things within areas, goes on as
-    the changes that it holds, under the next of `numbers` where it holds none, and drops moved shadows. `slides` are
-    how far off, (2,) each, a point 1 m up threw its shadow before and after a change; None where no sun is known.
+    `gathered` is what all views together show, None where that is not asked: it keeps things within areas, and goes on
+    as the changes that it holds, under the next of `numbers` where it holds none.
     """
     if gathered is None:
         return with_areas(changes, areas)
     claims = with_areas(changes, areas, gathered.lies_apart)
-    return [
-        claim
-        for claim in gathered.conclude(id_prefix, numbers, claims)
-        if (at := slides(claim)) is None or not gathered.is_moved_shadow(claim.outline_m, *at)
-    ]
+    return gathered.conclude(id_prefix, numbers, claims)
 
 
 def with_areas(

@@ -482,11 +482,6 @@ class ViewMaker:
         return float("nan") if self._measures is None else self._measures.brightness
 
     @property
-    def earlier_pictures(self) -> EarlierPictures | None:
-        """The pictures of earlier flights; None where they are not asked."""
-        return self._pictures
-
-    @property
     def times_coarser(self) -> float:
         """The map's pixels over those of the flight's own frames, at its usual height; NaN where that is not known."""
         return self._site_grid.grid.m_per_px * self._flight.full.fx_px / self._flight.height_m

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, Vector3
+from sorvolo.geometry.arrays import Vector3
 from sorvolo.geometry.units import DAY_NS
 
 _J2000_NS = 946_728_000_000_000_000  # 2000-01-01 12:00 UTC
@@ -46,8 +46,3 @@ def direction_from_angles(azimuth_deg: float, elevation_deg: float) -> Vector3:
             math.sin(elevation),
         ]
     )
-
-
-def slide_of(sun: Vector3 | None) -> Floats | None:
-    """(2,) how far east and north of a point 1 m up its shadow lies on level ground; None where there is no sun."""
-    return None if sun is None or sun[2] <= 0 else np.asarray(-sun[:2] / sun[2], np.float64)

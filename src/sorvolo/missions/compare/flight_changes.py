@@ -12,14 +12,11 @@ from sorvolo.change.gathered import GatheredThings
 from sorvolo.change.reconcile import reconcile
 from sorvolo.change.views import ViewMaker
 from sorvolo.findings.register import GroundFinding
-from sorvolo.geometry.arrays import Floats, Mask
-from sorvolo.geometry.sun import slide_of
+from sorvolo.geometry.arrays import Mask
 from sorvolo.missions.compare.extension import NIGHT
 from sorvolo.missions.flight.settings import CompareSettings
-from sorvolo.missions.flight.setup import sun_over
 from sorvolo.mosaic.selection import StretchSelection
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView
-from sorvolo.survey.flight import Site
 
 # longest side of a compared picture; a video's frames come faster, and show a place more often
 _VIDEO_PX, _PHOTO_PX = 1280, 1600
@@ -64,11 +61,10 @@ class FlightChanges:
         self,
         flight: str,
         views: ViewMaker,
-        site: Site,
         settings: CompareSettings,
         plan: ComparePlan,
     ) -> None:
-        self._flight, self._views, self._site, self._settings = flight, views, site, settings
+        self._flight, self._views, self._settings = flight, views, settings
         self._evidence: EvidenceMap | None = None
         self._areas = AreaMap()
         self._gathered = GatheredThings(plan.larger) if plan.gathers else None
@@ -102,7 +98,7 @@ class FlightChanges:
         # in the dark the ground has neither its structure nor its colour
         areas = () if self._views.brightness < NIGHT else self._areas.conclude(self._flight, first)
         self._numbers = itertools.count(first + len(areas))
-        return reconcile(things, areas, gathered, self._flight, self._numbers, self._slides)
+        return reconcile(things, areas, gathered, self._flight, self._numbers)
 
     def of_objects(
         self, changes: Sequence[Change], objects: Sequence[tuple[ChangeKind, GroundFinding]]
@@ -127,14 +123,3 @@ class FlightChanges:
     def candidates(self) -> dict[str, Any] | None:
         """What became of all candidates, for the report; None if no view was compared."""
         return None if self._evidence is None else self._evidence.outcomes()
-
-    def _slides(self, change: Change) -> tuple[Floats, Floats] | None:
-        """How far off a point 1 m up threw its shadow, before and after a change that may be one."""
-        earlier = self._views.earlier_pictures
-        before_ns = None if earlier is None else earlier.time_ns(change.outline_m)
-        if before_ns is None or change.kind is ChangeKind.MOVING:
-            return None
-        before, after = (
-            slide_of(sun_over(self._site, each)) for each in (before_ns, change.first_seen_ns)
-        )
-        return None if before is None or after is None else (before, after)

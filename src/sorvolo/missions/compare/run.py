@@ -121,7 +121,6 @@ class CompareRun:
         self._changes = FlightChanges(
             source.name,
             self._views,
-            archive.site(),
             settings,
             ComparePlan.of(source, archive.site_grid().grid.m_per_px, settings),
         )
@@ -422,7 +421,7 @@ def _earlier_pictures(archive: Archive, superseded: str) -> EarlierPictures:
     )
     return EarlierPictures(
         [
-            EarlierPicture(each.camera, each.site_from_image, each.site_from_camera, each.time_ns)
+            EarlierPicture(each.camera, each.site_from_image, each.site_from_camera)
             for each in keyframes
         ],
         images.get,
