@@ -30,6 +30,7 @@ from sorvolo.lab.simulation.settings import OutputSettings
 from sorvolo.missions import worker
 from sorvolo.missions.compare.classes import ChangeClasses, class_at
 from sorvolo.missions.compare.flights import compare_flights
+from sorvolo.missions.compare.objects import settled
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.map_objects import ObjectFinder, open_detector
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
@@ -40,7 +41,7 @@ from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.findings import Change, ChangeKind, Patch, Verdict
 from sorvolo.survey.flight import CameraPrior, Frame, PosedFrame
-from sorvolo.survey.map_objects import MapObject
+from sorvolo.survey.map_objects import MapObject, ObjectSearch, SearchedFrames
 from sorvolo.survey.objects import Detections, Sighting, no_detections
 from sorvolo.survey.wording import counted
 
@@ -390,10 +391,29 @@ def test_what_left_or_came_where_another_thing_stands_was_replaced(simulated: Pa
         "person",
         "car",
     )
-    assert classes.preliminary(came).kind == ChangeKind.REPLACED
+    assert classes.final(came, (), ()).kind == ChangeKind.REPLACED
     for other in (beside, small, walks):
         assert classes.final(left, [other], []).kind == ChangeKind.DISAPPEARED
-    assert ChangeClasses(Sees(simulated, 0.1), []).preliminary(came).kind == ChangeKind.APPEARED
+    assert ChangeClasses(Sees(simulated, 0.1), []).final(came, (), ()).kind == ChangeKind.APPEARED
+
+
+def test_changes_and_objects_of_a_flight_are_one_list() -> None:
+    """What a change saw leave stands there still; whom it saw come and no frame shows is there, once."""
+    left = replace(change_at(ChangeKind.DISAPPEARED), class_before="person")
+    came = replace(change_at(ChangeKind.APPEARED), id="f-2", class_after="person")
+    here, away = standing("person", 10.2, 20.0, 0.8), standing("person", 40.0, 20.0, 0.8)
+    search = ObjectSearch("", ("person", "car"), (), SearchedFrames(np.zeros((0, 4, 2))), 9, 9, 0)
+
+    def states(changes: list[Change], *objects: MapObject) -> tuple[list[str], list[str]]:
+        kept, found = settled(changes, replace(search, objects=objects), "f")
+        return [each.id for each in kept], [each.id for each in found.objects]
+
+    assert states([left], here) == ([], ["person"])
+    assert states([left], away) == (["f-1"], ["person"])
+    assert states([came], away) == (["f-2"], ["person", "f-2"])
+    assert states([came], here) == (["f-2"], ["person"])
+    assert states([left, came]) == (["f-1", "f-2"], ["f-2"])
+    assert states([replace(came, class_after="small object")]) == (["f-2"], [])
 
 
 def test_a_changes_own_pictures_are_the_last_word(simulated: Path) -> None:
@@ -405,9 +425,9 @@ def test_a_changes_own_pictures_are_the_last_word(simulated: Path) -> None:
         (ChangeKind.REPLACED, "person", "car"),
         (ChangeKind.MOVING, "", "car"),
     ):
-        named = classes.preliminary(change_at(kind))
+        named = classes.final(change_at(kind), (), ())
         assert (named.class_before, named.class_after) == (before, after)
-    unsure = ChangeClasses(Sees(simulated, 0.1), []).preliminary(change_at(ChangeKind.REPLACED))
+    unsure = ChangeClasses(Sees(simulated, 0.1), []).final(change_at(ChangeKind.REPLACED), (), ())
     assert (unsure.class_before, unsure.class_after) == ("", "")
 
 
@@ -444,8 +464,8 @@ def test_a_changes_own_pictures_are_searched_for_the_classes_asked_for(simulated
             return super().detect(image)
 
     for classes in ((), ("person",)):
-        ChangeClasses(Notes(simulated, 0.8), [], classes).preliminary(
-            change_at(ChangeKind.APPEARED)
+        ChangeClasses(Notes(simulated, 0.8), [], classes).final(
+            change_at(ChangeKind.APPEARED), (), ()
         )
     assert asked == [None, ("person",)]
 

@@ -151,11 +151,6 @@ class Register:
     findings: tuple[GroundFinding, ...] = ()
     looks: tuple[SearchedDate, ...] = ()
 
-    @property
-    def present(self) -> list[GroundFinding]:
-        """What is there by the newest look at each place."""
-        return [each for each in self.findings if not each.gone]
-
 
 def associate(
     sightings: Sequence[MissionSighting],

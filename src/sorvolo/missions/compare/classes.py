@@ -29,13 +29,6 @@ _LIKE_LENGTHS = 1.6  # times the other's, at most
 LENIENT = 0.4  # times each class's score: that something is there is known already
 
 
-def stands_in(change: Change, thing: MapObject) -> bool:
-    """Whether an object that does not move stands in a change's outline and is about as long."""
-    if thing.moving or _outside_m(change.outline_m, thing.position_m) > 0:
-        return False
-    return change.length_m / _LIKE_LENGTHS <= thing.length_m <= change.length_m * _LIKE_LENGTHS
-
-
 def class_at(change: Change, things: Iterable[MapObject | Sighting]) -> str:
     """The class of the objects or sightings in a change's outline, or nearly, by their summed scores: the nearer in
     place and size, the more they count. "" where there is none.
@@ -81,11 +74,6 @@ def object_of(change: Change) -> MapObject:
         "",
         jpeg_from_image(np.where(rgba[..., 3:] > 0, rgba[..., :3], np.uint8(127))),
     )
-
-
-def can_show(patch: Patch, rgba: ImageRGBA) -> bool:
-    """Whether a picture of the patch shows anything, and the patch marks any change in it."""
-    return bool(patch.changed.any()) and bool((rgba[..., 3] > 0).any())
 
 
 def enlarged(rgba: ImageRGBA) -> tuple[ImageRGB, tuple[int, int]]:
@@ -158,10 +146,6 @@ class ChangeClasses:
     ) -> None:
         self._detector, self._known, self._wanted = detector, known, tuple(classes) or None
 
-    def preliminary(self, change: Change) -> Change:
-        """The change with its classes by its own pictures and the known objects alone: while the flight goes on."""
-        return self.final(change, (), ())
-
     def final(
         self, change: Change, found: Sequence[MapObject], sightings: Sequence[Sighting]
     ) -> Change:
@@ -174,7 +158,13 @@ class ChangeClasses:
         others = {ChangeKind.DISAPPEARED: found, ChangeKind.APPEARED: self._known}.get(
             change.kind, ()
         )
-        if any(stands_in(change, each) for each in others):
+        least_m, most_m = change.length_m / _LIKE_LENGTHS, change.length_m * _LIKE_LENGTHS
+        if any(
+            not each.moving
+            and _outside_m(change.outline_m, each.position_m) <= 0
+            and least_m <= each.length_m <= most_m
+            for each in others
+        ):
             change = replace(change, kind=ChangeKind.REPLACED)
         before = after = ""
         if change.kind in _HAS_BEFORE:
@@ -188,7 +178,7 @@ class ChangeClasses:
 
     def _in_picture(self, change: Change, rgba: ImageRGBA) -> str:
         """The class that the detector finds where a picture of the change shows it; "" where it finds none."""
-        if not can_show(change.patch, rgba):
+        if not change.patch.changed.any() or not (rgba[..., 3] > 0).any():
             return ""
         picture, offset_px = enlarged(rgba)
         thresholds = self._detector.thresholds_for(picture)

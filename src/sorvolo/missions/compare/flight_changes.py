@@ -109,15 +109,11 @@ class FlightChanges:
         if self._gathered is None:
             return result
         for kind, each in objects:
-            length_m = each.newest.length_m
-            change = self._gathered.standing_at(each.position_m, length_m, [*changes, *result])
+            newest, others = each.newest, [*changes, *result]
+            change = self._gathered.standing_at(each.position_m, newest.length_m, others)
             if change is not None:
-                number = next(self._numbers)
-                result.append(
-                    replace(
-                        change, id=f"{self._flight}-{number}", kind=kind, score=each.newest.score
-                    )
-                )
+                own_id = f"{self._flight}-{next(self._numbers)}"
+                result.append(replace(change, id=own_id, kind=kind, score=newest.score))
         return result
 
     def candidates(self) -> dict[str, Any] | None:

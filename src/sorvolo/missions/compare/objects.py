@@ -85,11 +85,11 @@ class ComparisonObjects:
         if outline_m is not None and self._selection.take(outline_m):
             self._finder.look(posed)
 
-    def named(self, announced: Sequence[Change]) -> tuple[Change, ...]:
-        """The changes with their classes so far."""
+    def named(self, announced: Sequence[Change]) -> Sequence[Change]:
+        """The changes with their classes so far: by their own pictures and the known objects alone."""
         if self._classes is None:
-            return tuple(announced)
-        return tuple(self._classes.preliminary(each) for each in announced)
+            return announced
+        return [self._classes.final(each, (), ()) for each in announced]
 
     def conclude(self, placed: Sequence[PlacedFrame]) -> ObjectSearch | None:
         """The flight's objects by its frames' final places; None: nobody searched."""
@@ -103,7 +103,7 @@ class ComparisonObjects:
         if search is None:
             return []
         look = SearchedDate(self._name, math.inf, search.frames)
-        register = self._archive.register(self._sightings(search), [look], self._known_by)
+        register = self._archive.register(_sightings(search, self._name), [look], self._known_by)
         return [
             (kind, each)
             for kind, each in begun_and_ended(register, self._before, self._name)
@@ -113,31 +113,13 @@ class ComparisonObjects:
     def classified(
         self, changes: list[Change], search: ObjectSearch | None
     ) -> tuple[list[Change], ObjectSearch | None]:
-        """The changes with their classes, after `conclude`; the search with what they alone saw of its classes."""
+        """The changes with their classes, after `conclude`, and the search, as both agree."""
         if self._finder is None or self._classes is None or search is None:
             return changes, search
         named = [
             self._classes.final(each, search.objects, self._finder.sightings) for each in changes
         ]
-        seen, detected = self._sightings(search), {each.id for each in search.objects}
-        for change in stored_changes(self._name, named):
-            seen += sightings_of_change(change, {self._name: math.inf}, {})
-        alone = {
-            each.id
-            for found in associate(seen).findings
-            for each in found.sightings
-            if each.label in search.classes
-            and detected.isdisjoint(one.id for one in found.sightings)
-        }
-        others = (
-            object_of(each)
-            for each in named
-            if each.id in alone and not class_at(each, search.objects)
-        )
-        return named, replace(search, objects=(*search.objects, *others))
-
-    def _sightings(self, search: ObjectSearch) -> list[MissionSighting]:
-        return [sighting_of(each, self._name, math.inf) for each in search.objects]
+        return settled(named, search, self._name)
 
     def summary(
         self, search: ObjectSearch | None, placed: Sequence[PlacedFrame], site: Site
@@ -149,3 +131,33 @@ class ComparisonObjects:
         enough = 0.0 if site.is_local else self._settings.enough_looked_at
         looked, ground = self._finder.looked_at(placed, site, enough)
         return search_summary(search, looked, self._finder.seconds), searched_document(ground, site)
+
+
+def settled(
+    changes: Sequence[Change], search: ObjectSearch, flight: str
+) -> tuple[list[Change], ObjectSearch]:
+    """A flight's changes, with their classes, and its search, as one list of things: what left by a change and is found
+    there has not left, and what came or moves by a change alone, of a class that was looked for, is found."""
+    seen, detected = _sightings(search, flight), {each.id for each in search.objects}
+    for change in stored_changes(flight, changes):
+        seen += sightings_of_change(change, {"before": -math.inf, flight: math.inf}, {})
+    findings = associate(seen).findings
+    still = {
+        each.id for found in findings if not found.gone for each in found.sightings if each.gone
+    }
+    alone = {
+        each.id
+        for found in findings
+        if detected.isdisjoint(each.id for each in found.sightings)
+        for each in found.sightings
+        if each.label in search.classes and not each.gone
+    }
+    kept = [each for each in changes if each.kind is ChangeKind.REPLACED or each.id not in still]
+    others = [
+        object_of(each) for each in kept if each.id in alone and not class_at(each, search.objects)
+    ]
+    return kept, replace(search, objects=(*search.objects, *others))
+
+
+def _sightings(search: ObjectSearch, flight: str) -> list[MissionSighting]:
+    return [sighting_of(each, flight, math.inf) for each in search.objects]

@@ -284,8 +284,11 @@ class Archive:
 
     def new_people(self, flight_id: str) -> list[Any]:
         """The findings that are people whom no flight before this one had found."""
-        people = self.findings(flight_id, PERSON)
-        return [each for each in people if each["properties"]["flights"][0] == flight_id]
+        return [
+            each
+            for each in self.findings(flight_id, PERSON)
+            if each["properties"]["flights"][0] == flight_id
+        ]
 
     def _known(self, flight_id: str | None) -> str | None:
         """The flight, None for all. Raises NotFoundError for one that the site has not."""

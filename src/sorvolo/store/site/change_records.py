@@ -62,11 +62,6 @@ class StoredReview:
     kind: ChangeKind
     outline_m: PointsM
 
-    @property
-    def centre_m(self) -> PointsM:
-        """(2,) the middle of the outline's box, site metres."""
-        return (self.outline_m.min(axis=0) + self.outline_m.max(axis=0)) / 2
-
 
 def stored_changes(flight_id: str, changes: Sequence[Change]) -> list[StoredChange]:
     """The changes as they are stored, by number: the one that ends the id, or all by their places in the list.

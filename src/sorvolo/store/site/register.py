@@ -113,7 +113,8 @@ def flown_flights(connection: Connection) -> list[tuple[str, int, int, int]]:
 
 def present_objects(register: Register, objects: Sequence[StoredObject]) -> list[StoredObject]:
     """What stands on the site by the newest look at each place, as the newest flight that detected it found it."""
-    of_finding = {seen.id: each for each in register.present for seen in each.sightings}
+    there = (each for each in register.findings if not each.gone)
+    of_finding = {seen.id: each for each in there for seen in each.sightings}
     newest: dict[str, StoredObject] = {}
     for each in objects:
         if (found := of_finding.get(each.thing.id)) is not None:
