@@ -1917,25 +1917,19 @@ def test_the_height_below_crowns_is_chosen_with_a_slider(
     with Served(tmp_path) as station:
         context = context_of(browser)
         page = context.new_page()
-        asked: list[str] = []
-
-        def give(route: Any) -> None:
-            asked.append(route.request.url.split("/under-trees/")[1])
-            route.fulfill(status=204)
-
-        page.route("**/under-trees/**", give)
+        page.route("**/under-trees/**", lambda route: route.fulfill(status=204))
         page.goto(f"{station.url}/#/site/field/layers")
         page.get_by_label("Track").wait_for()
         assert page.get_by_label("Under the trees").count() == 0
         page.goto(f"{station.url}/#/site/looked/layers")
-        page.get_by_label("Under the trees", exact=True).check()
         run = station.ask("/api/sites/looked")["under_trees"]["run"]
-        wait_for(lambda: any(each.startswith(f"{run}/-20/") for each in asked))
+        with page.expect_request(f"**/under-trees/{run}/-20/**"):
+            page.get_by_label("Under the trees", exact=True).check()
         slider = page.get_by_label("Height under the trees")
         slider.focus()
-        slider.press("ArrowRight")
+        with page.expect_request(f"**/under-trees/{run}/-19/**"):
+            slider.press("ArrowRight")
         page.get_by_text("1 m above the floor").wait_for()
-        wait_for(lambda: any(each.startswith(f"{run}/-19/") for each in asked))
         context.close()
 
 
