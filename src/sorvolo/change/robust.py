@@ -20,7 +20,7 @@ from sorvolo.change.regions import (
     scratch_of_thread,
 )
 from sorvolo.change.settling import Settling, settle
-from sorvolo.change.shade import ShadeSettings, shade_between
+from sorvolo.change.shade import shade_between
 from sorvolo.geometry.arrays import (
     Boxes,
     Bytes,
@@ -81,7 +81,7 @@ _EXTENT_CONVEXITY = 0.8  # part of its hull that a thing fills
 _BESIDE = 0.5
 # of the largest difference: what differs less and is darker is the thing's shadow
 _SHADE_OF_TOP = 0.35
-_SHADE = ShadeSettings(no_brighter=1.0, alike=0.1)  # what of a thing is its own shadow
+_SHADE = (1.0, 0.1)  # what of a thing is its own shadow, as `shade_between` takes it
 _BLURRED = 0.2  # of the largest difference within 5 px: what differs less is a thing's blurred rim
 
 
@@ -98,7 +98,7 @@ class Views:
         lit, after = (
             np.asarray(cv2.blur(each, (3, 3)), np.uint8) for each in (self.lit, self.after)
         )
-        return shade_between(lit, after, _SHADE)
+        return shade_between(lit, after, *_SHADE)
 
 
 @dataclass(frozen=True, eq=False)

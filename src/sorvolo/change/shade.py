@@ -1,6 +1,5 @@
 """The shade mask of a view, made once: where one date shows ground no brighter than the other, all colours alike."""
 
-from dataclasses import dataclass
 from math import ceil
 
 import cv2
@@ -18,19 +17,14 @@ _BLACK = 8.0  # grey levels: below it a camera shows noise, not light
 _DARK = 0.8  # part; clearly darker, a shadow's core
 
 
-@dataclass(frozen=True)
-class ShadeSettings:
-    """What is as dark as a shadow. Parts are of the light on the other date; black is lifted first."""
-
-    no_brighter: float = (
-        1.08  # part; a shadow's rim, and what is as dark as a shadow, keep so much at most
-    )
-    alike: float = 0.22  # from the part of one colour to that of another: a shadow takes about the same of each
+# What is as dark as a shadow. Parts are of the light on the other date; black is lifted first.
+_NO_BRIGHTER = 1.08  # part; a shadow's rim, and what is as dark as a shadow, keep so much at most
+_ALIKE = (
+    0.22  # from the part of one colour to that of another: a shadow takes about the same of each
+)
 
 
-def shade_of_view(
-    reference: ImageRGB, image: ImageRGB, valid: Mask, settings: ShadeSettings = ShadeSettings()
-) -> ImageGray:
+def shade_of_view(reference: ImageRGB, image: ImageRGB, valid: Mask) -> ImageGray:
     """The shade mask (h, w), bits of `Shade`, of a view `image` beside the map's picture `reference`, (h, w, 3) each.
 
     The map's picture is brought to the view's light first; 0 where not `valid` (h, w).
@@ -48,14 +42,12 @@ def shade_of_view(
         np.asarray(cv2.resize(each, half, interpolation=cv2.INTER_AREA), np.uint8)
         for each in (before, after)
     )
-    shade = shade_between(
-        relit(before, fit_light(small_before, small_after, known)), after, settings
-    )
+    shade = shade_between(relit(before, fit_light(small_before, small_after, known)), after)
     return np.asarray(cv2.copyTo(shade, valid.view(np.uint8)), np.uint8)
 
 
 def shade_between(
-    before: ImageRGB, after: ImageRGB, settings: ShadeSettings = ShadeSettings()
+    before: ImageRGB, after: ImageRGB, no_brighter: float = _NO_BRIGHTER, alike: float = _ALIKE
 ) -> ImageGray:
     """The shade mask (h, w), bits of `Shade`, of two pictures (h, w, 3) uint8 in the same light."""
     one, other = (cv2.convertScaleAbs(each, alpha=1.0, beta=_BLACK) for each in (before, after))
@@ -65,10 +57,10 @@ def shade_between(
         (other, one, Shade.EARLIER, Shade.EARLIER_DARK),
     ):
         most, spread = _parts(lighter, darker)
-        alike = _below(spread, settings.alike * _ONE, 255)
-        for limit, marks in ((settings.no_brighter, bit), (_DARK, dark_bit)):
+        even = _below(spread, alike * _ONE, 255)
+        for limit, marks in ((no_brighter, bit), (_DARK, dark_bit)):
             cv2.bitwise_or(
-                shade, cv2.bitwise_and(alike, _below(most, limit * _ONE, int(marks))), dst=shade
+                shade, cv2.bitwise_and(even, _below(most, limit * _ONE, int(marks))), dst=shade
             )
     return shade
 
