@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from sensor_noise import camera
 
 from sorvolo import kernels
+from sorvolo.change.measures import FlightMeasures, PairMeasures
 from sorvolo.change.regions import FEATURES
 from sorvolo.change.robust import Trees, compare_robust, examine, how_sure
 from sorvolo.change.settling import settle
-from sorvolo.change.tuning import FlightMeasures, PairMeasures
 
 
 def with_box(image: np.ndarray, colour: tuple[int, int, int] = (190, 60, 40)) -> np.ndarray:

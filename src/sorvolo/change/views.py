@@ -21,11 +21,11 @@ from sorvolo.change.corroboration import (
 )
 from sorvolo.change.earlier_pictures import EarlierPictures
 from sorvolo.change.map_search import MapSearch
+from sorvolo.change.measures import FlightMeasures, PairMeasures
 from sorvolo.change.planting import Planted, Planting
 from sorvolo.change.reference import ReferenceMap
 from sorvolo.change.robust import as_bgr, compare_robust
 from sorvolo.change.shade import shade_of_view
-from sorvolo.change.tuning import FlightMeasures, PairMeasures
 from sorvolo.geometry.arrays import (
     Boxes,
     Floats,
