@@ -141,6 +141,19 @@ def test_each_part_of_the_sigma_is_what_moving_that_part_does(pitch_deg, what):
         )
 
 
+def test_the_middle_of_a_larger_box_is_known_less() -> None:
+    """In shares of its side, from a pixel on."""
+    box = LocateSettings(height_sigma_share=0.0)
+    sigmas_m = [
+        place(one([300.0, 400.0], side_px=side_px), EXACT, settings=box)[0].sigma_m
+        for side_px in (60.0, 90.0)
+    ]
+    assert sigmas_m[1] == pytest.approx(1.5 * sigmas_m[0], rel=1e-3)
+    m_per_px = (60 - TYPICAL_SIZE_M["car"][2] / 2) / CAMERA.fx_px
+    (least,) = (place(one([479.5, 269.5], "person", 8.0), EXACT, settings=box)[0].sigma_m,)
+    assert least == pytest.approx(m_per_px, rel=0.02)
+
+
 def test_what_the_pictures_edge_cuts_lies_farther_out_than_its_box():
     whole_px = np.array([-37.0, 250.0, 33.0, 280.0])  # a car of 4.4 m, half of it in the picture
     whole, cut = (

@@ -161,6 +161,19 @@ def test_on_a_slope_whose_heights_are_known_each_is_there_once_in_its_place() ->
     assert max(off_m[True]) < 0.05 and max(off_m[False]) > 5.0
 
 
+def test_a_terrace_is_shown_by_fewer_frames_than_level_ground() -> None:
+    """Six metres up, what a picture shows is narrower: a frame past its edge is none that failed to see a car."""
+    frames = survey()
+    laid = sightings(
+        frames,
+        [("car", 12.0, 3.0, 30.0, (0.0, 0.0))],
+        misses=0.0,
+        hills=lambda places_m: np.full(len(places_m), 6.0),
+    )
+    (car,) = fuse(laid, frames).objects
+    assert car.possible_views == len(car.members)
+
+
 def nearest(fused: Fused, east_m: float, north_m: float) -> tuple[str, float]:
     """Class and distance of the object nearest to a place."""
     distances_m = [
@@ -369,6 +382,27 @@ def test_a_walker_is_one_and_moves() -> None:
         / SECOND_NS
     )
     assert np.hypot(*(walker.position_m - [8.0 + 1.3 * last_s, 2.0 - 0.3 * last_s])) < 0.5
+
+
+def test_a_walk_does_not_go_on_as_a_car() -> None:
+    """Where a walker would be again after some seconds out of view comes a car: both are there."""
+    frames = survey()[:10]
+    walker = sightings(frames[1:5], [("person", 8.0, 2.0, 0.0, (2.5, 0.0))], misses=0.0)
+    car = sightings(frames[6:], [("car", 8.0, 2.0, 0.0, (2.5, 0.0))], misses=0.0)
+    objects = fuse([*walker, *car], frames).objects
+    assert sorted(each.label for each in objects) == ["car", "person"]
+    same = sightings(frames[6:], [("person", 8.0, 2.0, 0.0, (2.5, 0.0))], misses=0.0)
+    assert len(fuse([*walker, *same], frames).objects) == 1
+
+
+@pytest.mark.parametrize("together, people", [(3, 2), (1, 1)])
+def test_what_frames_show_beside_each_other_is_two(together: int, people: int) -> None:
+    """Two people half a metre apart, each seen by five frames: by so many of them, both."""
+    frames = [placed(k, 2.0 * k, 0.0) for k in range(10)]
+    one, other = ("person", 9.0, 1.0, 0.0, (0.0, 0.0)), ("person", 9.3, 1.0, 0.0, (0.0, 0.0))
+    first = sightings(frames[:5], [one], misses=0.0)
+    second = sightings(frames[5 - together : 10 - together], [other], misses=0.0)
+    assert len(fuse([*first, *second], frames).objects) == people
 
 
 def test_two_boxes_of_one_walker_are_one_step() -> None:

@@ -54,6 +54,16 @@ def test_what_stands_is_one_track_at_its_mean():
     assert 1.4 < track.sigma_m < 1.55
 
 
+def test_the_picture_of_a_track_is_its_largest_of_like_score_and_its_surest_of_like_size():
+    tracker, middle = Tracker(), np.array([640.0, 640.0])
+    for frame, (half_px, score) in enumerate([(5, 0.8), (20, 0.8), (10, 0.8), (20, 0.7)]):
+        seen = sighting(frame, [0.0, 0.0], score=score)
+        box_px = np.concatenate([middle - half_px, middle + half_px])
+        tracker.update([replace(seen, box_px=box_px)], time_ns=seen.time_ns, footprint_m=AROUND_M)
+    (track,) = tracker.finish()
+    assert track.best.frame_index == 1
+
+
 def test_the_shared_error_is_averaged_only_as_fast_as_it_forgets_itself():
     tracker = Tracker()
     for frame in range(5):
