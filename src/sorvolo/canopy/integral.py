@@ -103,9 +103,8 @@ def integrate(
     count = np.zeros(lattice.shape, np.uint16)
     for x0, y0, x1, y1 in lattice.windows(_TILE_CELLS):
         box = np.s_[y0:y1, x0:x1]
-        total, halves = _sums(views, picture, lattice.window(x0, y0, x1, y1), [floor_m[box]])[0]
-        count[box] = halves.sum(axis=0)
-        mean[box] = _mean(total.sum(axis=0), count[box], LEAST_VIEWS)
+        window = lattice.window(x0, y0, x1, y1)
+        mean[box], count[box] = averaged(views, picture, window, floor_m[box], LEAST_VIEWS)
     contrast = against_surroundings(mean, lattice.cell_m)
     return UnderTrees(
         lattice,
@@ -115,6 +114,19 @@ def integrate(
         _anomaly(contrast, lattice.cell_m),
         count,
     )
+
+
+def averaged(
+    views: Sequence[View],
+    picture: Picture,
+    lattice: Lattice,
+    floor_m: Floats32 | float,
+    least: int,
+) -> tuple[Floats32, Numbers]:
+    """(H, W, bands) the mean of views laid on the floor, one height or (H, W), NaN below so many; (H, W) how many."""
+    total, halves = _sums(views, picture, lattice, [floor_m])[0]
+    count = halves.sum(axis=0)
+    return _mean(total.sum(axis=0), count, least), count
 
 
 def seeing(views: Sequence[View], lattice: Lattice, floor_m: Floats32 | float) -> list[int]:

@@ -141,12 +141,11 @@ def adjust(scene: Scene, priors: Priors, settings: AdjustmentSettings) -> Scene:
         system = normal.cameras - reduced.toarray()
         system[np.diag_indices_from(system)] += damping * np.diag(normal.cameras) + 1e-9
         gradient = normal.gradient - through @ normal.point_gradient.ravel()
-        free = _steady(scene) if settings.is_steady else eye_array(len(gradient), format="csr")
-        system, gradient = free.T @ (free.T @ system).T, free.T @ gradient
-        try:
-            cameras = free @ cho_solve(cho_factor(system), gradient)
-        except LinAlgError:
-            cameras = free @ np.linalg.lstsq(system, gradient, rcond=None)[0]
+        if settings.is_steady:
+            free = _steady(scene)
+            cameras = free @ _solution(free.T @ (free.T @ system).T, free.T @ gradient)
+        else:
+            cameras = _solution(system, gradient)
         points = np.einsum(
             "pij,pj->pi",
             inverse,
@@ -164,6 +163,14 @@ def adjust(scene: Scene, priors: Priors, settings: AdjustmentSettings) -> Scene:
         if gain < 1e-5 * normal.cost:
             break
     return scene
+
+
+def _solution(system: Floats, gradient: Floats) -> Floats:
+    """The step that a system gives; where it is not positive definite, the least that fits it best."""
+    try:
+        return np.asarray(cho_solve(cho_factor(system), gradient))
+    except LinAlgError:
+        return np.asarray(np.linalg.lstsq(system, gradient, rcond=None)[0])
 
 
 def _steady(scene: Scene) -> csr_matrix:

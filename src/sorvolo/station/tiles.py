@@ -23,9 +23,9 @@ from rasterio.enums import Resampling
 from rasterio.errors import RasterioError
 from rasterio.windows import Window
 
-from sorvolo.canopy.integral import against_surroundings, lay, levelled, seeing
+from sorvolo.canopy.integral import against_surroundings, averaged, levelled, seeing
 from sorvolo.errors import SorvoloError
-from sorvolo.geometry.arrays import Floats, Floats32, ImageRGBA
+from sorvolo.geometry.arrays import Floats, Floats32, ImageRGBA, Numbers
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import Grid, SiteGrid, TileIndex
 from sorvolo.heights.lattice import Lattice
@@ -290,10 +290,7 @@ def render(
         return b""
     # (17, 17, 2) grid pixels of places spread over a tile, its outer edges included
     steps = np.linspace(0.0, 1.0, _LATTICE)
-    across, down = np.meshgrid(x + steps, y + steps)
-    longitude = across / 2**z * 360.0 - 180.0
-    latitude = np.degrees(np.arctan(np.sinh(np.pi * (1 - 2 * down / 2**z))))
-    lonlat = np.column_stack([longitude.ravel(), latitude.ravel()])
+    lonlat = _lonlat(z, *np.meshgrid(x + steps, y + steps))
     wanted_px = site_grid.grid_from_site(site_grid.frame.ground_from_lonlat(lonlat)).reshape(
         _LATTICE, _LATTICE, 2
     )
@@ -330,15 +327,18 @@ def _pixels_from_lattice(places: Floats32) -> Floats32:
     return rows[:, low] * (1 - share) + rows[:, low + 1] * share
 
 
+def _lonlat(z: int, across: Numbers, down: Numbers) -> Floats:
+    """(N, 2) longitudes and latitudes, degrees, of places counted in tiles of a zoom from the world's north-west."""
+    latitude = np.degrees(np.arctan(np.sinh(np.pi * (1 - 2 * down / 2**z))))
+    return np.column_stack([(across / 2**z * 360.0 - 180.0).ravel(), latitude.ravel()])
+
+
 def _meets_map(state: TilePyramid, site_grid: SiteGrid, z: int, x: int, y: int) -> bool:
     """Whether a tile's ground meets the map's: far around the Earth the site's plane would show it again."""
     bounds = bounds_lonlat(state.corner_tiles, site_grid)
     if bounds is None:
         return False
-    west, east = (each / 2**z * 360.0 - 180.0 for each in (x, x + 1))
-    south, north = (
-        np.degrees(np.arctan(np.sinh(np.pi * (1 - 2 * each / 2**z)))) for each in (y + 1, y)
-    )
+    (west, south), (east, north) = _lonlat(z, np.array([x, x + 1]), np.array([y + 1, y]))
     return bool(
         bounds[0] <= east and bounds[2] >= west and bounds[1] <= north and bounds[3] >= south
     )
@@ -442,9 +442,7 @@ class FloorTiles:
 
     def _tile(self, site_id: str, about: Json, up_m: float, z: int, x: int, y: int) -> bytes:
         archive = self._shelf.open(site_id)
-        corners = np.array([[x, y], [x + 1, y], [x, y + 1]]) / 2**z
-        latitude = np.degrees(np.arctan(np.sinh(np.pi * (1 - 2 * corners[:, 1]))))
-        lonlat = np.column_stack([corners[:, 0] * 360.0 - 180.0, latitude])
+        lonlat = _lonlat(z, np.array([x, x + 1, x]), np.array([y, y, y + 1]))
         first, right, below = archive.site_grid().frame.ground_from_lonlat(lonlat)
         across, down = (right - first) / TILE_PX, (below - first) / TILE_PX
         middle = first + (across + down) / 2
@@ -456,15 +454,17 @@ class FloorTiles:
         views, pictures = self._opened(archive, site_id, about)
         numbers = seeing(views, lattice, up_m)
         numbers = numbers[:: -(-len(numbers) // _FLOOR_VIEWS) or 1]
-        total, count = np.zeros(lattice.shape, np.float32), np.zeros(lattice.shape, np.float32)
-        for number in numbers:
-            key, size = (site_id, about["run"], str(number)), views[number].camera
-            small = self._kept.get(key, partial(_levels, pictures, number, size))
-            laid = lay(views[number], small.astype(np.float32), lattice, float(up_m))[..., 0]
-            count += np.isfinite(laid)
-            total += np.nan_to_num(laid)
-        mean = np.where(count < _LEAST_SHOWN, np.float32(np.nan), total / np.maximum(count, 1))
-        contrast = against_surroundings(mean[..., None], cell_m)[margin:-margin, margin:-margin, 0]
+        if not numbers:
+            return b""
+
+        def picture(k: int) -> Floats32:
+            key, size = (site_id, about["run"], str(numbers[k])), views[numbers[k]].camera
+            small = self._kept.get(key, partial(_levels, pictures, numbers[k], size))
+            return small.astype(np.float32)
+
+        chosen = [views[each] for each in numbers]
+        mean, _ = averaged(chosen, picture, lattice, float(up_m), _LEAST_SHOWN)
+        contrast = against_surroundings(mean, cell_m)[margin:-margin, margin:-margin, 0]
         dark, bright = about["levels"]
         shown = np.isfinite(contrast)
         grey = np.nan_to_num((contrast - dark) / max(bright - dark, 1e-6)) * 255

@@ -200,8 +200,8 @@ class GroundModel:
         """Return the bare ground's height about places (N, 2), (N,), and its spread there: how well it is known."""
         lattice, aside_m = self.surface.lattice, np.linspace(-_ASIDE_M, _ASIDE_M, 5)
         around_m = np.stack(np.meshgrid(aside_m, aside_m), axis=-1).reshape(-1, 1, 2)
-        cells = np.round(lattice.cells_from_site((places_m + around_m).reshape(-1, 2))).astype(int)
-        column, row = np.clip(cells, 0, [lattice.width - 1, lattice.height - 1]).T
+        cells = np.round(lattice.cells_from_site((places_m + around_m).reshape(-1, 2)))
+        column, row = cells.clip(0, [lattice.width - 1, lattice.height - 1]).astype(int).T
         up_m = self.bare_m[row, column].reshape(-1, len(places_m)).astype(np.float64)
         return np.median(up_m, axis=0), up_m.std(axis=0)
 
