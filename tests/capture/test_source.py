@@ -269,6 +269,16 @@ def test_an_empty_telemetry_file_beside_the_video_is_named(tmp_path: Path) -> No
     assert not source.telemetry.has_fixes
 
 
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may read every file")
+def test_telemetry_beside_the_video_that_may_not_be_read_is_named(tmp_path: Path) -> None:
+    write_video(tmp_path / "DJI_0001.mp4")
+    (tmp_path / "DJI_0001.SRT").write_text(SRT)
+    (tmp_path / "DJI_0001.SRT").chmod(0)
+    (source,) = open_sources([tmp_path / "DJI_0001.mp4"])
+    found = {notice.code: notice.text for notice in source.notices()}
+    assert "cannot be read and is not used: Permission denied" in found["unusable_telemetry"]
+
+
 def test_djis_telemetry_track_is_named_where_nothing_else_has_positions(tmp_path: Path) -> None:
     """A track of sound is renamed in the file to what DJI's metadata track is called."""
     video = write_video(tmp_path / "DJI_0001.mp4", with_sound=True)

@@ -85,6 +85,21 @@ def test_a_single_bad_fix_at_either_end():
         assert lost(cleaned(times, latitude, longitude)) == [place]
 
 
+@pytest.mark.parametrize("part", [slice(0, 20), slice(20, 50), slice(40, 50)])
+def test_a_sign_that_is_lost_on_the_way_is_refused(part):
+    """Whichever part is the longer: it says nothing of which hemisphere is right."""
+    times, latitude, longitude = track(50)
+    longitude[part] *= -1
+    with pytest.raises(InputError, match="positions have the other sign of longitude"):
+        cleaned(times, latitude, longitude)
+    # a glitch is none, nor is a flight across the meridian of Greenwich
+    times, latitude, longitude = track(50)
+    latitude[[3, 9]] *= -1
+    assert lost(cleaned(times, latitude, longitude)) == [3, 9]
+    times, latitude, longitude = track(50)
+    assert lost(cleaned(times, latitude, longitude - longitude[25])) == []
+
+
 def test_fast_flight_is_no_jump_and_neither_is_a_long_gap():
     times, latitude, longitude = track(50, speed_m_s=60.0)
     assert codes(cleaned(times, latitude, longitude)) == {}

@@ -189,6 +189,16 @@ def test_decimal_commas():
     assert_is_the_flight(
         flight_table.read(table(delimiter=";").replace(".", ",").encode(), "a.csv")
     )
+    quoted = table(delimiter='","').replace("\n", '"\n"').removesuffix('"')
+    assert_is_the_flight(flight_table.read(f'"{quoted}'.replace(".", ",").encode(), "a.csv"))
+
+
+def test_decimal_commas_that_break_cells_apart_are_refused():
+    """Read as they stand, "5,41,8923,12,6032" under time, latitude, longitude is a place 5000 km away."""
+    lines = [f"{k},5,41,{8923 + k},12,{6032 + k}" for k in range(20)]
+    text = "\n".join(["time,latitude,longitude", *lines]) + "\n"
+    with pytest.raises(InputError, match="20 rows have more cells than the header"):
+        flight_table.read(text.encode(), "a.csv")
 
 
 @pytest.mark.parametrize(

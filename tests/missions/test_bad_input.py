@@ -111,6 +111,19 @@ def test_inputs_that_are_not_there_or_hold_nothing(
     assert not site.exists()
 
 
+def test_names_that_are_not_utf_8_are_refused_before_the_work(
+    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What an old disk or zip leaves: no text of ours, nor of the libraries', can hold such a name."""
+    broken = os.fsdecode(b"caf\xe9")
+    assert "not UTF-8" in refused(capsys, photos, "--site", tmp_path / broken)
+    photo = next(photos.iterdir())
+    photo.rename(photos / f"{broken}.jpg")
+    words = refused(capsys, photos, "--site", tmp_path / "site")
+    assert "caf\\udce9.jpg': a name that is not UTF-8" in words
+    assert not (tmp_path / "site").exists()
+
+
 def test_a_video_without_frames(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "sound.mp4"
     with av.open(str(path), "w") as container:
@@ -169,6 +182,18 @@ def test_telemetry_of_another_day(
     telemetry.write_text(_nmea(filmed, earlier))
     words = refused(capsys, film, "--telemetry", telemetry, "--site", tmp_path / "site")
     assert "no time in common: the log begins 2283 d 1 s before the pictures" in words
+
+
+def test_a_receiver_that_had_stopped_gives_no_scale(film: Path, tmp_path: Path) -> None:
+    """All fixes are one place: the pictures that are laid on them shrink to a point, without any misfit."""
+    telemetry = tmp_path / "still.csv"
+    rows = [f"{0.2 * k:.1f},41.8923377,12.6032935" for k in range(80)]
+    telemetry.write_text("\n".join(["offsetTime,latitude,longitude", *rows]) + "\n")
+    report = mapped(tmp_path / "site", film, "--telemetry", telemetry, code=3)
+    assert report["headline"]["quality"] == "contradictory"
+    assert (
+        "80 positions are all one place, while the pictures moved on" in report["headline"]["text"]
+    )
 
 
 def test_half_written_telemetry_with_lost_jumping_and_backward_fixes(

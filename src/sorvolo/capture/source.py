@@ -342,6 +342,13 @@ def _sort_inputs(inputs: Sequence[Path]) -> tuple[list[RecordedVideo], list[_Alb
     if single:
         place = single[0].resolve() if len(single) == 1 else single[0].resolve().parent
         albums.append(_AlbumInput(place, single))
+    pictures = [*(path for each in found for path in each.chapters)]
+    pictures += [path for each in albums for path in each.photos]
+    for path in pictures:
+        if path.name != path.name.encode(errors="ignore").decode():
+            raise InputError(
+                f"{str(path)!a}: a name that is not UTF-8, as from an old disk or zip; rename it"
+            )
     return found, albums
 
 
@@ -606,6 +613,11 @@ def _not_used(beside: Path) -> Notice:
     if beside.stat().st_size == 0:
         text = f"{beside.name} beside the video is empty (0 bytes) and not used; copy it from the drone again"
         return Notice("empty_telemetry", 1, text)
+    try:
+        beside.open("rb").close()
+    except OSError as error:
+        text = f"{beside.name} beside the video cannot be read and is not used: {error.strerror}"
+        return Notice("unusable_telemetry", 1, text)
     text = f"{beside.name} beside the video is of no known telemetry format and not used"
     return Notice("unknown_telemetry", 1, text)
 

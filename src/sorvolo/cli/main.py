@@ -230,6 +230,8 @@ def _words_of(error: Exception) -> str:
         return f"{where}{error.strerror}; check that the path exists and may be read and written"
     if isinstance(error, MemoryError):
         return "out of memory; close other programs, or make a coarser map with --gsd"
+    if isinstance(error, UnicodeEncodeError) and error.reason.startswith("surrogates"):
+        return "the name of a file or folder is not UTF-8, as from an old disk or zip; rename it"
     return (
         f"this is a bug in sorvolo {build()}: {type(error).__name__}: {error}. Please report it with the "
         "command and what `sorvolo --debug ...` prints (see CONTRIBUTING.md)"

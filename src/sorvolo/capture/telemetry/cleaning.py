@@ -10,6 +10,7 @@ import numpy as np
 
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, Mask, Rows, TimesNs
+from sorvolo.geometry.summary import median_or_nan
 from sorvolo.geometry.units import M_PER_DEG_LATITUDE, SECOND_NS
 from sorvolo.survey.flight import Notice, Telemetry
 
@@ -30,6 +31,10 @@ _Table: TypeAlias = dict[str, Floats]
 _JUMP_SLACK_M = 10.0  # receivers step this far when their set of satellites changes
 _HELD_FIX_S = 1.0  # a receiver that repeats its fix made it at most this long ago
 _COARSE_DECIMALS = 4  # at five decimals the rounding (1.1 m) is below the receiver's own noise
+_MIRRORED_DEG = (
+    0.02  # that positions lie about the mirror of the others, whose signs are then in question ...
+)
+_MANY_MIRRORED = 0.1  # ... if they are more than this share: a few are glitches
 _SEGMENTS_BACK = 200  # of a track that jumps: bounds the time that a hostile file takes
 _TIME = re.compile(
     r"(\d{4})[-./](\d{1,2})[-./](\d{1,2})[ T]+(\d{1,2}):(\d{2}):(\d{2})"
@@ -107,7 +112,7 @@ def clean(
     )
     found += reported
     if "latitude_deg" in table and "longitude_deg" in table:
-        table, reported = _cleaned_fixes(times, table, position_decimals)
+        table, reported = _cleaned_fixes(times, table, position_decimals, name)
         found += reported
     if not any(np.isfinite(value).any() for key, value in table.items() if "_sigma_" not in key):
         found_text = "; ".join(notice.text for notice in found) or "it holds no samples"
@@ -120,7 +125,7 @@ def clean(
 
 
 def _cleaned_fixes(
-    times: TimesNs, table: _Table, decimals: int | None
+    times: TimesNs, table: _Table, decimals: int | None, name: str
 ) -> tuple[_Table, list[Notice]]:
     """The table with only the fixes that the flight made, their sigma no smaller than their rounding."""
     latitude, longitude = table["latitude_deg"], table["longitude_deg"]
@@ -146,8 +151,19 @@ def _cleaned_fixes(
         )
         table, rounded = widened, notice("coarse_position", int(placed.sum()), text)
         found += rounded
-    table, jumps = _without_jumps(times, table)
-    return table, found + jumps
+    cleaned, jumps = _without_jumps(times, table)
+    # a sign that is lost on the way: which half of the world is right, the longer part does not decide
+    kept = np.isfinite(cleaned["latitude_deg"])
+    lost = np.isfinite(table["latitude_deg"]) & ~kept
+    for column in ("latitude_deg", "longitude_deg"):
+        middle = median_or_nan(table[column][kept])
+        mirrored = int((np.abs(table[column][lost] + middle) < _MIRRORED_DEG).sum())
+        if abs(middle) > _MIRRORED_DEG and mirrored > _MANY_MIRRORED * len(kept):
+            raise InputError(
+                f"{name}: {mirrored} of {len(kept)} positions have the other sign of {column.removesuffix('_deg')}, "
+                f"{-middle:+.3f} where the rest have {middle:+.3f}; correct the sign, or leave these positions out"
+            )
+    return cleaned, found + jumps
 
 
 def increasing(times_ns: TimesNs) -> Mask:

@@ -188,9 +188,7 @@ def _table(text: str, name: str) -> _Table:
             f"{name}: {notices[0].text}; latitude and longitude must be in degrees or radians"
         )
     is_utc = "utc" in places and bool(re.search("utc|gps", " ".join(header.columns[places["utc"]])))
-    rows, found = _rows(
-        text, header, list(places.values()), 1 + max(places["latitude"], places["longitude"])
-    )
+    rows, found = _rows(text, header, places, name)
     return _Table(
         {key: index for index, key in enumerate(places)}, factors, is_utc, rows, notices + found
     )
@@ -235,22 +233,29 @@ def _known_columns(header: _Header) -> tuple[dict[str, int], dict[str, float], l
 
 
 def _rows(
-    text: str, header: _Header, places: list[int], needed: int
+    text: str, header: _Header, places: Mapping[str, int], name: str
 ) -> tuple[list[list[str]], list[Notice]]:
     """The cells at `places` of the rows that reach the position's columns, decimal commas made points."""
     rows: list[list[str]] = []
-    short = width = 0
+    position = [places["latitude"], places["longitude"]]
+    needed = 1 + max(position)
+    short = split = width = 0
     for line in _LINE.finditer(text, header.rows_from):
         if not line[0].strip():
             continue
-        cells = _split(
-            line[0] if header.delimiter == "," else line[0].replace(",", "."), header.delimiter
-        )
+        cells = [each.strip().replace(",", ".") for each in _split(line[0], header.delimiter)]
         width = len(cells)
         if width < needed:
             short += 1
+        elif width > len(header.columns) and not any("." in cells[place] for place in position):
+            split += 1
         else:
-            rows.append([cells[place].strip() if place < width else "" for place in places])
+            rows.append([cells[place] if place < width else "" for place in places.values()])
+    if split > len(rows):
+        raise InputError(
+            f"{name}: {split} rows have more cells than the header has names, and no decimals in their positions: decimal "
+            "commas in a table separated by commas; save it with semicolons or decimal points"
+        )
     # a last line without its end that lacks cells was being written when the recording stopped
     is_cut = 0 < width < len(header.columns) and text[-1] not in "\r\n"
     if is_cut and width >= needed:

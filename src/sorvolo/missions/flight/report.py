@@ -3,7 +3,7 @@
 import resource
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from math import isfinite
 from typing import Any
 
@@ -15,6 +15,7 @@ from sorvolo.missions.flight.headline import (
     clock_doubts,
     flight_warnings,
     map_headline,
+    still_fixes,
     unlevelled,
 )
 from sorvolo.missions.flight.log import FlightLog, Stage
@@ -86,6 +87,7 @@ def build_report(
     # what the plane of a flat map shows of itself is no witness of a map that stands on heights
     plane = graph if result.shape.is_flat else None
     agreement = consistency(placed, result.pieces, figures, _stated(setup, result), plane)
+    agreement = replace(agreement, faults=(*still_fixes(figures, setup), *agreement.faults))
     headline = {}
     others = clock_doubts(setup, result.offset, settings.offset_s)
     if result.makes_map:

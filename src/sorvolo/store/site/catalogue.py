@@ -190,6 +190,8 @@ class Catalogue:
     def _naming_damage(self) -> Iterator[None]:
         try:
             yield
+        except UnicodeEncodeError:  # what is to be written, not what was read
+            raise
         except _IMPOSSIBLE as error:
             raise StoreError(
                 f"{self._database.place} is damaged: {error}; restore it from a copy of the site, or map into a new "
