@@ -258,6 +258,18 @@ def test_a_log_without_a_date_is_dated_by_the_video(counts_from_first_frame):
     assert tied(undated, START_NS).first_frame_utc_ns == START_NS
 
 
+@pytest.mark.parametrize("begins_s", [-30.0, 4.0, 86_390.0])
+def test_a_log_of_times_of_day_is_tied_by_them(begins_s):
+    """START_NS is 09:00 UTC of its day; the log may begin before, and the pictures after a midnight."""
+    times_s = np.arange(0, 80.0)
+    since_midnight_ns = np.round((9 * 3600 + begins_s + times_s) * 1e9).astype(np.int64)
+    of_day = replace(straight(times_s), time_ns=since_midnight_ns)
+    clock = tied(of_day, START_NS + round(max(begins_s, 0.0) * 1e9) + 10**10)
+    assert clock.sample_s[0] == pytest.approx(min(begins_s, 0.0) - 10)
+    # of another time of day than the pictures it says nothing: it begins with them, as far as is known
+    assert tied(of_day, START_NS + 3600 * 10**9).sample_s[0] == 0.0
+
+
 # ---- the offset that motion shows -----------------------------------------------------------------------------
 
 

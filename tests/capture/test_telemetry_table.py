@@ -1,6 +1,8 @@
 """The UMCD table: its 60 columns, any order, printed units, clocks, and broken rows."""
 
 import math
+import re
+from datetime import datetime, timedelta
 
 import numpy as np
 import pytest
@@ -451,6 +453,47 @@ def test_a_column_of_dates_gives_utc():
         assert "no_date" not in codes(telemetry) and "time_zone_unknown" not in codes(telemetry), (
             name
         )
+
+
+@pytest.mark.parametrize(
+    "header, text",
+    [
+        ("datetime", "{0:%d.%m.%Y %H:%M:%S.%f}"),
+        ("datetime", "{0:%m/%d/%Y %I:%M:%S.%f %p}"),
+        ("datetime", "{0:%Y-%m-%d %I:%M:%S.%f %p}"),
+        ("date,time", "{0:%Y-%m-%d},{0:%H:%M:%S.%f}"),
+        ("date,time", "{0:%d.%m.%Y},{0:%H:%M:%S.%f}"),
+        ("time", "{0:%H:%M:%S.%f}"),
+        ("gpsTime", "{0:%I:%M:%S.%f %p}"),
+    ],
+)
+def test_dates_and_times_of_day_in_every_dress_across_midnight(header, text):
+    begins = datetime(2026, 4, 2, 23, 59, 58)
+    moments = [begins + timedelta(seconds=0.5 * k) for k in range(20)]
+    rows = [f"{text.format(each)},41.90,{12.6 + 1e-5 * k}" for k, each in enumerate(moments)]
+    telemetry = flight_table.read("\n".join([f"{header},lat,lon", *rows, ""]).encode(), "a.csv")
+    day = (
+        datetime(1970, 1, 1) if "date" in header else datetime(2026, 4, 2)
+    )  # a clock alone counts from 1970
+    first_s = (begins - day).total_seconds()
+    assert telemetry.time_ns / 1e9 == pytest.approx(first_s + 0.5 * np.arange(20), abs=1e-5)
+    assert (telemetry.video_time_ns == -1).all()
+
+
+@pytest.mark.parametrize(
+    "header, text, words",
+    [
+        ("timestamp", "20260402T1244{:02d}", "no time can be read in timestamp"),
+        ("timestamp", "1234{:02d}00", "no time can be read in timestamp"),
+        ("time_ms", "{:d}500", "name the column time(s) or time(ms)"),
+        ("time", "{:d}500", "the rows are 1000 s apart"),
+    ],
+)
+def test_times_that_nobody_understands_are_refused(header, text, words):
+    """Taken as 10 rows a second, which they are not, they lay a map 13 m off without a word."""
+    rows = [f"{text.format(k)},41.90,{12.6 + 1e-5 * k}" for k in range(20)]
+    with pytest.raises(InputError, match=re.escape(words)):
+        flight_table.read("\n".join([f"{header},lat,lon", *rows, ""]).encode(), "a.csv")
 
 
 def test_a_date_without_its_zone_is_reported():

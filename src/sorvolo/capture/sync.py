@@ -16,6 +16,7 @@ from sorvolo.geometry.pose import (
     site_from_gimbal_rotation,
 )
 from sorvolo.geometry.summary import median_or_nan
+from sorvolo.geometry.units import DAY_NS
 from sorvolo.survey.flight import CameraPrior, Notice, Telemetry
 from sorvolo.survey.wording import span_words
 
@@ -90,12 +91,19 @@ def tie_clocks(
     """Put telemetry's samples on the clock of the frames, which were taken at `frames_s` (N,) after the first one.
 
     How a fix belongs to a frame follows from where it comes from. A photo's own fix is that photo's. A video's subtitles
-    count from its first frame. Of a log, UTC decides where frames and log have a date; where one has none, its first
-    sample is tied to the first frame. `offset_s` is telemetry's time less the frames'.
+    count from its first frame. Of a log, UTC decides where frames and log have a date, or the log a time of day at
+    which the frames were taken; else its first sample is tied to the first frame. `offset_s` is telemetry's time less
+    the frames'.
     Raises InputError where frames and fixes have no time in common, with the offset that would tie them.
     """
     first_ns, given_s = int(telemetry.time_ns[0]), offset_s or 0.0
-    since_start_s, given_ns = (telemetry.time_ns - start_ns) / 1e9, round(given_s * 1e9)
+    given_ns, has_fix = round(given_s * 1e9), np.isfinite(telemetry["latitude_deg"])
+    # a log whose clock has no date is stamped from 1970: the pictures' day may be its own
+    days_ns = (
+        round((start_ns - first_ns) / DAY_NS) * DAY_NS if first_ns < DATED_NS < start_ns else 0
+    )
+    since_start_s = (telemetry.time_ns + days_ns - start_ns) / 1e9
+    is_of_day = days_ns > 0 and _covered(since_start_s[has_fix] - given_s, frames_s).mean() > 0.5
     if telemetry.is_per_photo:
         if abs(given_s) > _LONGEST_DELAY_S:
             raise InputError(
@@ -113,14 +121,14 @@ def tie_clocks(
         zero_ns = start_ns if zero_ns < DATED_NS else zero_ns  # without a date, as below
         words = "telemetry counts from the video's first frame"
         clock = Clock(telemetry.video_time_ns / 1e9 - given_s, words, 0.5, zero_ns)
-    elif min(first_ns, start_ns) > DATED_NS:
+    elif min(first_ns, start_ns) > DATED_NS or is_of_day:
         clock = Clock(since_start_s - given_s, UTC_TIE, 2.0, start_ns + given_ns)
     else:
-        # a log without a date is stamped from 1970: then the video's own start dates it
+        # then the video's own start dates it
         zero_ns = start_ns if first_ns < DATED_NS else first_ns + given_ns
         since_first_s = (telemetry.time_ns - first_ns) / 1e9
         clock = Clock(since_first_s - given_s, STARTS_TIED, 3.0, zero_ns)
-    fix_s = clock.sample_s[np.isfinite(telemetry["latitude_deg"])]
+    fix_s = clock.sample_s[has_fix]
     covered = _covered(fix_s if len(fix_s) else clock.sample_s, frames_s)
     if not covered.any():
         raise InputError(f"{name}: {_no_time_in_common(fix_s, frames_s, given_s)}")

@@ -24,6 +24,7 @@ from sorvolo.capture.telemetry.cleaning import (
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, Mask, TimesNs
 from sorvolo.geometry.pose import body_angles_deg
+from sorvolo.geometry.summary import median_or_nan
 from sorvolo.geometry.units import SECOND_NS
 from sorvolo.survey.flight import Notice, Telemetry
 
@@ -66,6 +67,8 @@ _EPOCH_S = (3e8, 7e9)  # 1979 to 2191: what a number must be to count as a time 
 _LINE = re.compile(r"[^\r\n]+")
 _DAY = re.compile(r"(\d{1,4})[/.-](\d{1,2})[/.-](\d{1,4})")
 _CLOCK = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})([.,]\d{1,9})?\s*([AP]M)?", re.IGNORECASE)
+_CLOCK_NAME = re.compile(r"time|date|utc|stamp|clock|second|tick", re.IGNORECASE)
+_SLOWEST_S = 20.0  # between the rows of a log: counts of more are of milliseconds
 _UNKNOWN_WORDS = {"", "nan", "na", "n/a", "null", "none", "-", "--"}
 
 _DIRECT_COLUMNS = {
@@ -83,9 +86,11 @@ _DIRECT_COLUMNS = {
 class _Table:
     """The table as texts: which cell of a row holds each quantity, its factor to our unit, and the rows.
 
-    Rows hold the wanted columns only: a log has up to 230.
+    Rows hold the wanted columns only: a log has up to 230. `clocks` are the names of all columns that may hold times.
     """
 
+    name: str
+    clocks: list[str]
     cells: Mapping[str, int]
     factors: Mapping[str, float]
     is_utc: bool
@@ -189,9 +194,9 @@ def _table(text: str, name: str) -> _Table:
         )
     is_utc = "utc" in places and bool(re.search("utc|gps", " ".join(header.columns[places["utc"]])))
     rows, found = _rows(text, header, places, name)
-    return _Table(
-        {key: index for index, key in enumerate(places)}, factors, is_utc, rows, notices + found
-    )
+    clocks = [cell.strip() for cell in header.cells if _CLOCK_NAME.search(cell)]
+    cells = {key: index for index, key in enumerate(places)}
+    return _Table(name, clocks, cells, factors, is_utc, rows, notices + found)
 
 
 def _known_columns(header: _Header) -> tuple[dict[str, int], dict[str, float], list[Notice]]:
@@ -347,20 +352,29 @@ def _times(
     # zone
     zoned = 0
     stamps_ns = np.full(len(table.rows), NO_TIME_NS)
+    of_day_ns = stamps_ns.copy()
     for key in ("utc", "time"):
         if key not in table.cells or (stamps_ns != NO_TIME_NS).any():
             continue
         texts = _texts(table, key)
-        if key == "utc" and "date" in table.cells:
-            texts = [_joined(day, clock) for day, clock in zip(_texts(table, "date"), texts)]
+        days = _texts(table, "date") if "date" in table.cells else None
+        clock_s = np.full(rows, np.nan)
         for row, text in enumerate(texts):
-            if stamp := time_ns_from_text(text):
+            day, _, clock = text.partition(" ") if days is None else (days[row], "", text)
+            clock_s[row] = _of_day_s(text)
+            if dated_ns := _dated_ns(day, clock):
+                stamps_ns[row] = dated_ns
+            elif stamp := time_ns_from_text(text):
                 stamps_ns[row] = stamp[0]
                 zoned += stamp[1]
             elif epoch_ns := _epoch_ns(text, table.factors[key]):
                 stamps_ns[row] = epoch_ns
                 zoned += 1
-    counter_ns = _counter(counters, rows)
+        known = np.isfinite(clock_s)
+        if known.any():  # it goes on past midnight
+            clock_s[known] = np.unwrap(clock_s[known], period=86_400)
+            of_day_ns[known] = np.round(clock_s[known] * 1e6).astype(np.int64) * 1000
+    counter_ns = _counter(counters, rows, table.name)
     stamped = int((stamps_ns != NO_TIME_NS).sum())
     if stamped:
         times_ns, refined = refine_clock(fill_stamps(stamps_ns, counter_ns), counter_ns)
@@ -396,6 +410,13 @@ def _times(
             known, counter_ns - counter_ns[increasing(counter_ns)][0], NO_TIME_NS
         )
         notices += notice("no_time", int((~known).sum()), "{} rows dropped: no readable time")
+    elif (of_day_ns != NO_TIME_NS).any():
+        return of_day_ns, None, notices
+    elif table.clocks and rows:
+        raise InputError(
+            f"{table.name}: no time can be read in {', '.join(table.clocks[:5])}; name the column time(s) or time(ms), or "
+            "datetime with texts such as 2026-04-02 12:44:00.5"
+        )
     else:
         relative_ns = np.round(np.arange(rows) * (SECOND_NS / _DATASET_RATE_HZ)).astype(np.int64)
         notices += notice(
@@ -406,17 +427,29 @@ def _times(
     return relative_ns, relative_ns, notices
 
 
-def _joined(day: str, clock: str) -> str:
-    """A date and a clock of columns of their own, "7/4/2018" (month first) and "9:19:31.7 PM", as one text."""
-    date, time = _DAY.fullmatch(day), _CLOCK.fullmatch(clock)
-    if date is None or time is None:
-        return clock
+def _of_day_s(clock: str) -> float:
+    """Seconds since midnight of "9:19:31.7 PM", NaN for another text."""
+    match = _CLOCK.fullmatch(clock)
+    if match is None:
+        return float("nan")
+    hour, half = int(match[1]), (match[5] or "").upper()
+    if half:
+        hour = hour % 12 + (12 if half == "PM" else 0)
+    return hour * 3600 + int(match[2]) * 60 + float(match[3] + (match[4] or ""))
+
+
+def _dated_ns(day: str, clock: str) -> int:
+    """A date and a clock, "7/4/2018" (month first) or "4.7.2018" and "9:19:31.7 PM"; 0 where they are none."""
+    date, clock_s = _DAY.fullmatch(day), _of_day_s(clock)
+    if date is None or np.isnan(clock_s):
+        return 0
     first, second, third = date.groups()
-    year, month, of_month = (first, second, third) if len(first) == 4 else (third, first, second)
-    hour = int(time[1])
-    if time[5]:
-        hour = hour % 12 + (12 if time[5].upper() == "PM" else 0)
-    return f"{year}-{month}-{of_month} {hour:02d}:{time[2]}:{time[3]}{(time[4] or '').replace(',', '.')}"
+    if len(first) == 4:
+        year, month, of_month = first, second, third
+    else:
+        year, month, of_month = (third, second, first) if "." in day else (third, first, second)
+    midnight = time_ns_from_text(f"{year}-{month}-{of_month} 00:00:00")
+    return midnight[0] + round(clock_s * 1e6) * 1000 if midnight else 0
 
 
 def _epoch_ns(text: str, factor: float) -> int:
@@ -431,12 +464,17 @@ def _epoch_ns(text: str, factor: float) -> int:
     return 0
 
 
-def _counter(counters: Mapping[str, Floats], rows: int) -> TimesNs:
+def _counter(counters: Mapping[str, Floats], rows: int, name: str) -> TimesNs:
     """The counter with most distinct times in order, in ns."""
     best, most = np.full(rows, NO_TIME_NS), 0
     for key, values in counters.items():
         seconds = values / _tick_rate_hz(values) if key == "tick" else values
         known = np.isfinite(seconds) & (np.abs(seconds) < _LARGEST_S)
+        if key == "time" and (step_s := median_or_nan(np.diff(seconds[known]))) > _SLOWEST_S:
+            raise InputError(
+                f"{name}: the rows are {step_s:g} s apart by their column of times; if it counts milliseconds, name it "
+                "time(ms)"
+            )
         counter_ns = np.full(rows, NO_TIME_NS)
         counter_ns[known] = np.round(seconds[known] * 1e6).astype(np.int64) * 1000
         rising = int(increasing(counter_ns).sum())
