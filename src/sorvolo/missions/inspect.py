@@ -19,7 +19,7 @@ from sorvolo.geometry.units import SECOND_NS
 from sorvolo.missions.flight.sample_frames import sample_frames
 from sorvolo.paths import AnyPath, Inputs, as_text, listed
 from sorvolo.store.exports.plain import plain_json
-from sorvolo.survey.flight import CameraModel, Notice
+from sorvolo.survey.flight import CameraModel
 
 _BLURRED = (
     1.5  # registration.features.sharpness at 960 px falls below this when blurred by two pixels
@@ -136,7 +136,14 @@ def _inspect(source: Source) -> Inspection:
         *_telemetry_findings(source, frames, telemetry),
         *_movement_findings(source.kind, frames, telemetry, flight),
         *_flight_findings(source.kind, frames, telemetry, flight),
-        *(_finding_of(notice) for notice in (*source.notices(), *source.telemetry.notices)),
+        *(
+            Finding(
+                Level.INFO if each.code in _INFORMATION else Level.WARNING,
+                each.text,
+                _ADVICE.get(each.code, ""),
+            )
+            for each in (*source.notices(), *source.telemetry.notices)
+        ),
     ]
     order = [Level.PROBLEM, Level.WARNING, Level.INFO]
     model = source.camera
@@ -349,8 +356,3 @@ def _overlap_findings(kind: str, frames: FrameFacts, flight: FlightFacts) -> lis
             )
         )
     return found
-
-
-def _finding_of(notice: Notice) -> Finding:
-    level = Level.INFO if notice.code in _INFORMATION else Level.WARNING
-    return Finding(level, notice.text, _ADVICE.get(notice.code, ""))

@@ -215,7 +215,8 @@ def _demand_allowed(host: str, found: Sequence[str], allowed: Sequence[Network])
     for text in found:
         address = _plain(ipaddress.ip_address(text.partition("%")[0]))
         named = any(address.version == each.version and address in each for each in allowed)
-        if not (named or _is_public(address)):
+        is_ours = address.is_multicast or address.is_reserved or address.is_unspecified
+        if not named and (is_ours or not address.is_global):
             raise _refused(
                 f"{host[:100]} lies in this machine's own or a private network; whoever runs the station may allow it "
                 f"with --stream-from {ipaddress.ip_network(address)}"
@@ -248,12 +249,6 @@ def _plain(address: Address) -> Address:
     if isinstance(address, ipaddress.IPv6Address):
         return address.ipv4_mapped or address.sixtofour or address
     return address
-
-
-def _is_public(address: Address) -> bool:
-    return address.is_global and not (
-        address.is_multicast or address.is_reserved or address.is_unspecified
-    )
 
 
 def _netloc(netloc: str, address: str, port: int | None) -> str:

@@ -20,7 +20,7 @@ from sorvolo.capture.telemetry.cleaning import (
 )
 from sorvolo.errors import InputError
 from sorvolo.geometry.units import SECOND_NS
-from sorvolo.survey.flight import Notice, Telemetry
+from sorvolo.survey.flight import Telemetry
 
 SMALLEST_SIGMA_M = 1.5
 """Horizontal sigma of a consumer drone's GPS in hover, which no number of printed decimals improves."""
@@ -113,7 +113,7 @@ def read(data: bytes, name: str) -> Telemetry:
     video_ns = np.array([cue.video_time_ns for cue in cues], dtype=np.int64)
     stamps_ns = np.array([cue.stamp_ns for cue in cues], dtype=np.int64)
     times_ns, refined = refine_clock(fill_stamps(stamps_ns, video_ns), video_ns)
-    counts["refined"] = len(cues) if refined else 0
+    dated = int((stamps_ns != NO_TIME_NS).sum())
     names = sorted({key for cue in cues for key in cue.values})
     columns = {key: np.array([cue.values.get(key, np.nan) for cue in cues]) for key in names}
     if "latitude_deg" in columns:
@@ -125,7 +125,30 @@ def read(data: bytes, name: str) -> Telemetry:
         times_ns,
         columns,
         video_ns,
-        notices=_notices(counts, int((stamps_ns != NO_TIME_NS).sum()), len(cues)),
+        notices=[
+            *notice("truncated", counts["truncated"], "the last cue is cut off"),
+            *notice(
+                "time_zone_unknown",
+                dated - counts["zoned"],
+                "{} cues print a time without its zone; it is taken as UTC and may be hours off",
+            ),
+            *notice(
+                "no_date",
+                len(cues) - dated,
+                "{} cues print no date; they are stamped by their place in the video"
+                + ("" if dated else ", which dates them, else they count from 1970-01-01"),
+            ),
+            *notice(
+                "clock_refined",
+                len(cues) if refined else 0,
+                "times are printed in whole seconds; the {} samples are timed by their cues instead",
+            ),
+            *notice(
+                "latitude_first",
+                counts["latitude_first"],
+                "{} positions are followed by a height: such files put latitude before longitude",
+            ),
+        ],
         position_decimals=max(decimals) or None,
     )
 
@@ -136,34 +159,6 @@ def _subtitles(data: bytes) -> str:
     if "Dialogue:" not in text:
         return text
     return _DIALOGUE.sub(r"\1 -->\n", text).replace("\\N", "\n")
-
-
-def _notices(counts: Counter[str], dated: int, cues: int) -> list[Notice]:
-    """What was found in a file of so many cues, of which `dated` print a date."""
-    return [
-        *notice("truncated", counts["truncated"], "the last cue is cut off"),
-        *notice(
-            "time_zone_unknown",
-            dated - counts["zoned"],
-            "{} cues print a time without its zone; it is taken as UTC and may be hours off",
-        ),
-        *notice(
-            "no_date",
-            cues - dated,
-            "{} cues print no date; they are stamped by their place in the video"
-            + ("" if dated else ", which dates them, else they count from 1970-01-01"),
-        ),
-        *notice(
-            "clock_refined",
-            counts["refined"],
-            "times are printed in whole seconds; the {} samples are timed by their cues instead",
-        ),
-        *notice(
-            "latitude_first",
-            counts["latitude_first"],
-            "{} positions are followed by a height: such files put latitude before longitude",
-        ),
-    ]
 
 
 def _cues_in(text: str, name: str) -> Iterator[tuple[re.Match[str], str]]:

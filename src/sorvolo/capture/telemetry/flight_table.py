@@ -347,22 +347,17 @@ def _times(
     table: _Table, counters: Mapping[str, Floats]
 ) -> tuple[TimesNs, TimesNs | None, list[Notice]]:
     """Each row's time, its time in the video where the table is tied to one, and the notices."""
-    rows = len(table.rows)
-    # the rows' dates as UTC, NO_TIME_NS where there is none, and how many name their time
-    # zone
-    zoned = 0
-    stamps_ns = np.full(len(table.rows), NO_TIME_NS)
-    of_day_ns = stamps_ns.copy()
+    rows, zoned = len(table.rows), 0
+    unknown_ns = np.full(rows, NO_TIME_NS)
+    stamps_ns, of_day_ns = unknown_ns.copy(), unknown_ns
     for key in ("utc", "time"):
         if key not in table.cells or (stamps_ns != NO_TIME_NS).any():
             continue
-        texts = _texts(table, key)
-        days = _texts(table, "date") if "date" in table.cells else None
+        days = _texts(table, "date") if "date" in table.cells else [""] * rows
         clock_s = np.full(rows, np.nan)
-        for row, text in enumerate(texts):
-            day, _, clock = text.partition(" ") if days is None else (days[row], "", text)
+        for row, (day, text) in enumerate(zip(days, _texts(table, key))):
             clock_s[row] = _of_day_s(text)
-            if dated_ns := _dated_ns(day, clock):
+            if dated_ns := _dated_ns(f"{day} {text}".strip()):
                 stamps_ns[row] = dated_ns
             elif stamp := time_ns_from_text(text):
                 stamps_ns[row] = stamp[0]
@@ -372,9 +367,15 @@ def _times(
                 zoned += 1
         known = np.isfinite(clock_s)
         if known.any():  # it goes on past midnight
-            clock_s[known] = np.unwrap(clock_s[known], period=86_400)
-            of_day_ns[known] = np.round(clock_s[known] * 1e6).astype(np.int64) * 1000
-    counter_ns = _counter(counters, rows, table.name)
+            of_day_ns = unknown_ns.copy()
+            of_day_ns[known] = np.round(np.unwrap(clock_s[known], period=86_400) * SECOND_NS)
+    counter_ns = _counter(counters, rows)
+    known = counter_ns != NO_TIME_NS
+    if median_or_nan(np.diff(counter_ns[known])) > _SLOWEST_S * SECOND_NS:
+        raise InputError(
+            f"{table.name}: its times are more than {_SLOWEST_S:g} s apart; if a column counts milliseconds, name it "
+            "time(ms)"
+        )
     stamped = int((stamps_ns != NO_TIME_NS).sum())
     if stamped:
         times_ns, refined = refine_clock(fill_stamps(stamps_ns, counter_ns), counter_ns)
@@ -392,26 +393,20 @@ def _times(
                     rows if refined else 0,
                     "times are printed in whole seconds; the {} rows are timed by the finer counter instead",
                 ),
-                *notice(
-                    "no_time",
-                    int((times_ns == NO_TIME_NS).sum()),
-                    "{} rows dropped: no readable time",
-                ),
+                *_untimed(times_ns),
             ],
         )
-    known = counter_ns != NO_TIME_NS
     notices = notice(
         "no_date",
         rows,
         "the table has no date: its {} rows take the video's if it has one, else 1970",
     )
     if known.any():
-        relative_ns = np.where(
-            known, counter_ns - counter_ns[increasing(counter_ns)][0], NO_TIME_NS
-        )
-        notices += notice("no_time", int((~known).sum()), "{} rows dropped: no readable time")
-    elif (of_day_ns != NO_TIME_NS).any():
-        return of_day_ns, None, notices
+        first_ns = counter_ns[increasing(counter_ns)][0]
+        relative_ns = np.where(known, counter_ns - first_ns, NO_TIME_NS)
+        notices += _untimed(relative_ns)
+    elif of_day_ns is not unknown_ns:
+        return of_day_ns, None, notices + _untimed(of_day_ns)
     elif table.clocks and rows:
         raise InputError(
             f"{table.name}: no time can be read in {', '.join(table.clocks[:5])}; name the column time(s) or time(ms), or "
@@ -427,6 +422,11 @@ def _times(
     return relative_ns, relative_ns, notices
 
 
+def _untimed(times_ns: TimesNs) -> list[Notice]:
+    lost = int((times_ns == NO_TIME_NS).sum())
+    return notice("no_time", lost, "{} rows dropped: no readable time")
+
+
 def _of_day_s(clock: str) -> float:
     """Seconds since midnight of "9:19:31.7 PM", NaN for another text."""
     match = _CLOCK.fullmatch(clock)
@@ -438,18 +438,19 @@ def _of_day_s(clock: str) -> float:
     return hour * 3600 + int(match[2]) * 60 + float(match[3] + (match[4] or ""))
 
 
-def _dated_ns(day: str, clock: str) -> int:
-    """A date and a clock, "7/4/2018" (month first) or "4.7.2018" and "9:19:31.7 PM"; 0 where they are none."""
+def _dated_ns(text: str) -> int:
+    """The moment of a date and a clock, "7/4/2018" (month first) or "4.7.2018" and "9:19:31.7 PM"; 0 for another text."""
+    day, _, clock = text.partition(" ")
     date, clock_s = _DAY.fullmatch(day), _of_day_s(clock)
     if date is None or np.isnan(clock_s):
         return 0
-    first, second, third = date.groups()
-    if len(first) == 4:
-        year, month, of_month = first, second, third
-    else:
-        year, month, of_month = (third, second, first) if "." in day else (third, first, second)
+    year, month, of_month = (
+        (date[3], date[2], date[1]) if "." in day else (date[3], date[1], date[2])
+    )
+    if len(date[1]) == 4:
+        year, month, of_month = date.groups()
     midnight = time_ns_from_text(f"{year}-{month}-{of_month} 00:00:00")
-    return midnight[0] + round(clock_s * 1e6) * 1000 if midnight else 0
+    return midnight[0] + round(clock_s * SECOND_NS) if midnight else 0
 
 
 def _epoch_ns(text: str, factor: float) -> int:
@@ -464,17 +465,12 @@ def _epoch_ns(text: str, factor: float) -> int:
     return 0
 
 
-def _counter(counters: Mapping[str, Floats], rows: int, name: str) -> TimesNs:
+def _counter(counters: Mapping[str, Floats], rows: int) -> TimesNs:
     """The counter with most distinct times in order, in ns."""
     best, most = np.full(rows, NO_TIME_NS), 0
     for key, values in counters.items():
         seconds = values / _tick_rate_hz(values) if key == "tick" else values
         known = np.isfinite(seconds) & (np.abs(seconds) < _LARGEST_S)
-        if key == "time" and (step_s := median_or_nan(np.diff(seconds[known]))) > _SLOWEST_S:
-            raise InputError(
-                f"{name}: the rows are {step_s:g} s apart by their column of times; if it counts milliseconds, name it "
-                "time(ms)"
-            )
         counter_ns = np.full(rows, NO_TIME_NS)
         counter_ns[known] = np.round(seconds[known] * 1e6).astype(np.int64) * 1000
         rising = int(increasing(counter_ns).sum())

@@ -105,7 +105,8 @@ def compare_flights(
                 heights_stamp(archive, but=source.name),
                 own_heights_stamp(archive, source.name),
             )
-            return settings, wanted, looks, base, _reviews(archive), stamps, steps
+            reviews = [(each.change_id, each.verdict.value) for each in archive.reviews()]
+            return settings, wanted, looks, base, reviews, stamps, steps
 
         def prepared(source: Source) -> FlightSetup:
             return prepare(
@@ -129,10 +130,6 @@ def compare_flights(
             yield from _compare_one(flight, archive, own, wanted, steps, looks, base)
             outcomes.append(outcome_of(archive, flight.setup.source.name))
         return tuple(outcomes)
-
-
-def _reviews(archive: Archive) -> list[tuple[str, str]]:
-    return [(each.change_id, each.verdict.value) for each in archive.reviews()]
 
 
 def _check_steps(steps: Path, site: Path, settings: CompareSettings) -> None:

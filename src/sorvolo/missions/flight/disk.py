@@ -100,12 +100,8 @@ def _frame_bytes(setup: FlightSetup, m_per_px: float | None) -> tuple[float, flo
 
 
 def _free(folder: Path) -> int:
-    return shutil.disk_usage(_existing(folder)).free
-
-
-def _existing(folder: Path) -> Path:
-    """The folder, or the nearest above it that is there."""
-    return next(each for each in (folder.absolute(), *folder.absolute().parents) if each.exists())
+    there = folder.absolute()
+    return shutil.disk_usage(next(each for each in (there, *there.parents) if each.exists())).free
 
 
 def _words(size: float) -> str:

@@ -14,7 +14,6 @@ from sorvolo.capture.source import demand_inputs
 from sorvolo.detection.fusing import is_from_above
 from sorvolo.detection.models import installed_models
 from sorvolo.errors import SettingsError
-from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.camera import Camera
 from sorvolo.missions.flight.detector_protocol import (
     FindsObjects,
@@ -265,7 +264,10 @@ class ObjectFinder:
             least_score=least_seen(least),
         )
         surest = found.surest(_MOST_CROPS)
-        crops = tuple(_crop(frame.image, box) for box in surest.boxes_px)
+        crops = tuple(
+            jpeg_from_image(at_most(crop_around(frame.image, box), _CROP_PX))
+            for box in surest.boxes_px
+        )
         seconds = time.monotonic() - started_s
         seen = FrameDetections(frame.index, surest, crops, seconds, dict(least))
         self._memo.keep(frame, "seen", seen)
@@ -339,7 +341,3 @@ def _row(each: MapObject) -> dict[str, Any]:
         "possible_views": each.possible_views,
         "moving": each.moving,
     }
-
-
-def _crop(image: ImageRGB, box_px: Any) -> bytes:
-    return jpeg_from_image(at_most(crop_around(image, box_px), _CROP_PX))

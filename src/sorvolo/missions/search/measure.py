@@ -453,7 +453,10 @@ class GrowingMeasure:
         light = self._looks.lights[-1]
         self._cut_outs = _of_light(self._cut_outs, light, self._name)
         numbers = self._field.near(outline_m, _REACH_M)
-        self._grow(self._field)
+        for number in range(len(self._things), len(self._field.places)):
+            self._things.append(
+                _planted(number, self._field.places[number], self._settings.seed, self._cut_outs)
+            )
         things = [self._things[each] for each in numbers]
         seed = self._settings.seed + frame.placed.index
         seen = search_planted(frame, image, light, things, sun, seed, self._detector, self._wanted)
@@ -512,10 +515,3 @@ class GrowingMeasure:
         self._pictures.clear()
         self._fresh.clear()
         self._reported.clear()
-
-    def _grow(self, field: PlantField) -> None:
-        """Make the things that stand at the field's new places."""
-        for number in range(len(self._things), len(field.places)):
-            self._things.append(
-                _planted(number, field.places[number], self._settings.seed, self._cut_outs)
-            )

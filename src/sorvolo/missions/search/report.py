@@ -8,7 +8,7 @@ from typing import Any
 
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.tiling import coarsest_m_per_px
-from sorvolo.geometry.arrays import Floats, ImageRGBA, PointsM
+from sorvolo.geometry.arrays import ImageRGBA, PointsM
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.geometry.summary import calibration_bins, median_of_known, wilson
@@ -111,7 +111,9 @@ class Searched:
     @property
     def height_m(self) -> float:
         """The last flight's usual height above the ground."""
-        return median_of_known(self._heights_m()) or 0.0
+        poses = [pose_of(each.placed) for each in self.frames[self.flights[-1].name]]
+        known_m = [float(pose.translation_m[2]) for pose in poses if pose is not None]
+        return median_of_known(known_m) or 0.0
 
     @property
     def path_m(self) -> float:
@@ -145,10 +147,6 @@ class Searched:
         """What each flight measured of a class."""
         return [each for flight in self.flights for each in flight.classes if each.label == label]
 
-    def _heights_m(self) -> list[float]:
-        poses = [pose_of(each.placed) for each in self.frames[self.flights[-1].name]]
-        return [float(pose.translation_m[2]) for pose in poses if pose is not None]
-
 
 def total_of(searched: Searched, label: str) -> Chances:
     """The chances of a class by all flights together."""
@@ -168,7 +166,7 @@ def hole_numbers(
             each.recall,
             enough=settings.enough,
             needed_m_per_px=coarsest_m_per_px(label, info),
-            length_m=_length_m(label),
+            length_m=max(TYPICAL_SIZE_M.get(label, (1.0,))),
         )
         for each in own
     ]
@@ -366,10 +364,6 @@ def _warnings(searched: Searched, settings: SearchSettings, *, is_over: bool) ->
     return warnings
 
 
-def _length_m(label: str) -> float:
-    return max(TYPICAL_SIZE_M[label]) if label in TYPICAL_SIZE_M else 1.0
-
-
 @dataclass(frozen=True)
 class Refly:
     """A second flight: how many holes of which area, how high, how long, and the files."""
@@ -398,7 +392,8 @@ def write_refly(
     large = [each for each in again if each.area_m2 >= REFLY_LEAST_M2][:REFLY_MOST_HOLES]
     if not large:
         return None
-    area = Area(tuple(_rings(large, grid)), "holes of the search")
+    rings = swollen_polygons(large, grid, grid.cell_m / 2)
+    area = Area(tuple(rings), "holes of the search")
     camera, height_m = searched.camera, searched.height_m
     if is_coarse(searched, settings, info):
         needed = coarsest_m_per_px(searched.labels[0], info)
@@ -411,10 +406,6 @@ def write_refly(
         plan.duration_s,
         tuple(map(str, files)),
     )
-
-
-def _rings(regions: Sequence[Region], grid: CellGrid) -> list[tuple[Floats, ...]]:
-    return swollen_polygons(regions, grid, grid.cell_m / 2)
 
 
 def write_search(

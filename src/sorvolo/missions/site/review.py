@@ -32,7 +32,11 @@ def review_changes(
     with Archive.open(site, write=True, makes=False) as archive:
         _require_flight(archive, flight)
         if flight is None:
-            _demand_whole_ids(archive, ids)
+            if bare := next((each for each in ids if each.isdecimal()), ""):
+                raise InputError(
+                    f"{site} has no change {bare}: a number is one flight's; give --flight as well, or the whole id as "
+                    f"`sorvolo review {site}` lists it"
+                )
         by_number = (
             {str(each.number): each.id for each in archive.changes(flight)}
             if flight is not None
@@ -57,13 +61,4 @@ def _require_flight(archive: Archive, flight: str | None) -> None:
     if flight is not None and flight not in known:
         raise InputError(
             f"{archive.folder} has no flight {flight}; it has {', '.join(known) or 'none'}"
-        )
-
-
-def _demand_whole_ids(archive: Archive, ids: Sequence[str]) -> None:
-    """Raise InputError for a number: it is one flight's."""
-    if bare := next((each for each in ids if each.isdecimal()), ""):
-        raise InputError(
-            f"{archive.folder} has no change {bare}: a number is one flight's; give --flight as well, or the whole "
-            f"id as `sorvolo review {archive.folder}` lists it"
         )

@@ -94,7 +94,11 @@ class Notifier:
             outbox.close(alerts_s)
         if self._cot is not None and self._sender is not None:
             if self._cot.close(events_s):
-                self._finish(self._sender)
+                try:
+                    self._sender.finish()
+                except OSError as error:
+                    text = f"{self._outputs.cot} broke the connection at the end: {error}"
+                    self._broken_end = (Notice("cot_broken_end", 1, text),)
             self._sender.close()
 
     def notices(self) -> tuple[Notice, ...]:
@@ -106,14 +110,6 @@ class Notifier:
         for outbox in self._alerts.values():
             found += outbox.notices()
         return (*found, *(self._cot.notices() if self._cot is not None else ()), *self._broken_end)
-
-    def _finish(self, sender: CotSender) -> None:
-        """End the TAK server's connection; one that it breaks is a notice."""
-        try:
-            sender.finish()
-        except OSError as error:
-            text = f"{self._outputs.cot} broke the connection at the end: {error}"
-            self._broken_end = (Notice("cot_broken_end", 1, text),)
 
     def _alert(self, track: Track, crop: str | None, segment: int) -> None:
         """Send the alert of a track to those who have not got it."""

@@ -137,17 +137,13 @@ def _control(report: Mapping[str, Any]) -> dict[str, Any] | None:
             known(each.get("label")),
             _ROLE_WORDS.get(str(each.get("role")), known(each.get("role"))),
             each.get("marks"),
-            *(_signed_m(each.get(name)) for name in ("east_m", "north_m")),
+            *(with_unit(each.get(name), "{:+.3f}") or "" for name in ("east_m", "north_m")),
             with_unit(each.get("distance_m"), "{:.3f}") or "",
         )
         for each in control.get("points") or []
     ]
     source = f"From {known(control.get('file'))}, {known(control.get('crs'))}"
     return {"words": ". ".join([source, *sentences]) + ".", "rows": rows}
-
-
-def _signed_m(value: Any) -> str:
-    return with_unit(value, "{:+.3f}") or ""
 
 
 def _plots(report: Mapping[str, Any]) -> dict[str, str]:

@@ -160,7 +160,7 @@ def _environment(package: str) -> Environment:
         lstrip_blocks=True,
     )
     environment.filters |= {
-        "px": _px,
+        "px": "{:.1f}".format,
         "percent": _percent,
         "known": known,
         "unit": with_unit,
@@ -172,11 +172,6 @@ def _environment(package: str) -> Environment:
     }
     environment.globals |= {"plural": plural, "join_words": join_words}
     return environment
-
-
-def _px(value: float) -> str:
-    """A length in a drawing."""
-    return f"{value:.1f}"
 
 
 def _percent(share: float) -> str:
