@@ -98,11 +98,10 @@ class ControlFile:
         else:
             yield "x, y and z are in metres: the CRS counts in feet", replace(own, units=1 / unit_m)
         yield "the CRS is that of web maps (EPSG:3857)", _Reading("EPSG:3857")
-        utm = _utm_zone(crs)
-        for zone in range(1, 61) if utm else ():
-            for side in "NS":
-                if (zone, side) != utm:
-                    yield f"the CRS is UTM zone {zone}{side}", _Reading(f"WGS84 UTM {zone}{side}")
+        own_zone = re.fullmatch(r"\d+[NS]", crs.utm_zone or "")
+        for zone in (f"{k}{side}" for k in range(1, 61) for side in "NS") if own_zone else ():
+            if zone != crs.utm_zone:
+                yield f"the CRS is UTM zone {zone}", _Reading(f"WGS84 UTM {zone}")
 
     def _control(self, reading: _Reading) -> GroundControl:
         crs_words = reading.crs_words
@@ -275,11 +274,6 @@ def _parsed_crs(words: str, path: Path) -> CRS:
         return crs_from_words(words)
     except GeometryError as error:
         raise InputError(f"{path}: its first line: {error}") from error
-
-
-def _utm_zone(crs: CRS) -> tuple[int, str] | None:
-    zone = re.fullmatch(r"(\d+)([NS])", crs.utm_zone or "")
-    return (int(zone[1]), zone[2]) if zone else None
 
 
 def _height_unit_m(crs: CRS) -> float:

@@ -179,7 +179,8 @@ def corrected_poses(
         np.array([each.position_m for each in priors]) + shifts_m,
         _moving(key_s, solved_m, times_s),
     )
-    return [Pose(_orthonormal(rotation), place_m) for rotation, place_m in zip(rotations, places_m)]
+    left, _, right = np.linalg.svd(rotations)  # orthonormal again
+    return [Pose(rotation, place_m) for rotation, place_m in zip(left @ right, places_m)]
 
 
 def headings_deg(
@@ -384,8 +385,3 @@ def _bias(values: Floats) -> Bias:
     middle = float(np.median(values))
     scatter = SIGMA_PER_MEDIAN_DEVIATION * float(np.median(np.abs(values - middle)))
     return Bias(middle, 1.2533 * scatter / float(np.sqrt(len(values))), scatter)
-
-
-def _orthonormal(rotation: Floats) -> Floats:
-    left, _, right = np.linalg.svd(rotation)
-    return np.asarray(left @ right, np.float64)

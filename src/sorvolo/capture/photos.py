@@ -236,36 +236,32 @@ def read_album(
             *place_notices,
             *time_notices,
             *gps_notices,
-            *[
-                *notice(
-                    "duplicate_photo",
-                    sum(photo.fault is PhotoFault.DUPLICATE for photo in photos),
-                    "photos that are exact copies of others, not used twice: {}",
-                ),
-                *notice(
-                    "unreadable_photo",
-                    sum(not photo.metadata.width_px for photo in photos),
-                    "files named like pictures that cannot be read: {}",
-                ),
-                *_size_notices(photos, used, (width_px, height_px)),
-                *notice(
-                    "unreadable_metadata",
-                    sum(bool(metadata.unreadable) for metadata in used),
-                    "photos with damaged EXIF or XMP, which is not used: {}",
-                ),
-                *[
-                    *notice(
-                        "mixed_cameras",
-                        len(cameras) if len(cameras) > 1 else 0,
-                        "different cameras, mapped as if they were one: {}",
-                    ),
-                    *notice(
-                        "zoom",
-                        len(focal_mm) if len(focal_mm) > 1 else 0,
-                        "different focal lengths, mapped as if they were one: {}",
-                    ),
-                ],
-            ],
+            *notice(
+                "duplicate_photo",
+                sum(photo.fault is PhotoFault.DUPLICATE for photo in photos),
+                "photos that are exact copies of others, not used twice: {}",
+            ),
+            *notice(
+                "unreadable_photo",
+                sum(not photo.metadata.width_px for photo in photos),
+                "files named like pictures that cannot be read: {}",
+            ),
+            *_size_notices(photos, used, (width_px, height_px)),
+            *notice(
+                "unreadable_metadata",
+                sum(bool(metadata.unreadable) for metadata in used),
+                "photos with damaged EXIF or XMP, which is not used: {}",
+            ),
+            *notice(
+                "mixed_cameras",
+                len(cameras) if len(cameras) > 1 else 0,
+                "different cameras, mapped as if they were one: {}",
+            ),
+            *notice(
+                "zoom",
+                len(focal_mm) if len(focal_mm) > 1 else 0,
+                "different focal lengths, mapped as if they were one: {}",
+            ),
         ),
     )
 

@@ -520,7 +520,8 @@ def _open_photos(
 ) -> PhotoSource:
     folder = source.place if source.place.is_dir() else source.place.parent
     if telemetry is None:
-        positions, log = _positions_beside(folder), None
+        beside = [each for each in sorted(folder.iterdir()) if is_position_file(each)]
+        positions, log = sorted(beside, key=lambda each: each.suffix.lower() == ".mrk"), None
     else:
         positions, log = ([telemetry], None) if is_position_file(telemetry) else ([], telemetry)
     album = read_album(source.photos, positions, strict=telemetry is not None)
@@ -542,12 +543,6 @@ def _open_photos(
     )
     fingerprint = _fingerprint(min(photo.path for photo in album.photos))
     return PhotoSource(name, fingerprint, album, model, found, notices)
-
-
-def _positions_beside(folder: Path) -> list[Path]:
-    """The files of positions in a folder of photos, ODM's geo.txt first."""
-    found = [each for each in sorted(folder.iterdir()) if is_position_file(each)]
-    return sorted(found, key=lambda each: each.suffix.lower() == ".mrk")
 
 
 def _photo_telemetry(

@@ -47,7 +47,6 @@ from sorvolo.paths import Json, JsonView
 from sorvolo.survey.wording import area_text, counted, plural
 
 if TYPE_CHECKING:
-    from sorvolo.change.compare import PairMethod
     from sorvolo.missions.mission import FlightOutcome, Mission
     from sorvolo.survey.findings import CompareUpdate
 
@@ -133,8 +132,13 @@ def compare(
 
     if masks is not None:
         make_folder(masks)
+    thesis = None
+    if method != "robust":
+        from sorvolo.lab.thesis.changes import ThesisComparison
+
+        thesis = ThesisComparison()
     settings = CompareSettings(
-        None if method == "robust" else _thesis(),
+        thesis,
         votes=votes,
         voters=votes + 2,
         offset_s=offset,
@@ -178,12 +182,6 @@ def compare(
             write_pdfs((each / name for each in folders for name in names), Console(stderr=as_json))
     if not all(is_good(result["comparison"]["headline"]) for result in results):
         raise typer.Exit(TO_CHECK)
-
-
-def _thesis() -> "PairMethod":
-    from sorvolo.lab.thesis.changes import ThesisComparison
-
-    return ThesisComparison()
 
 
 def read_results(

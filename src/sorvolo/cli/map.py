@@ -46,7 +46,6 @@ from sorvolo.paths import JsonView
 from sorvolo.survey.wording import counted, counted_list
 
 if TYPE_CHECKING:
-    from sorvolo.missions.flight.settings import MapMethod
     from sorvolo.store.site.catalogue_place import Catalogues
 
 _MAX_REASONS = 6  # of frames that are not on the map, the commonest first
@@ -129,8 +128,13 @@ def map_command(
     from sorvolo.missions.site.copy import folder_of
     from sorvolo.store.site.catalogue_place import chosen_catalogues
 
+    thesis = None
+    if method != "planar":
+        from sorvolo.lab.thesis.mapping import ThesisMapping
+
+        thesis = ThesisMapping()
     settings = MapSettings(
-        None if method == "planar" else _thesis(),
+        thesis,
         gsd,
         offset_s=offset,
         ground_elevation_m=ground_elevation,
@@ -209,12 +213,6 @@ def _print(
 
 def _is_flat(report: JsonView) -> bool:
     return bool(report.get("shape", {}).get("is_flat", True))
-
-
-def _thesis() -> "MapMethod":
-    from sorvolo.lab.thesis.mapping import ThesisMapping
-
-    return ThesisMapping()
 
 
 def show_reports(reports: Sequence[JsonView], site: Path, console: Console) -> None:

@@ -32,11 +32,14 @@ def _browser() -> str:
     return found
 
 
-def _checked(is_wanted: bool) -> bool:
-    return is_wanted and bool(_browser())  # refused before the work begins
-
-
-Pdf = Annotated[bool, option("Print the pages as PDFs beside them.", "--pdf", callback=_checked)]
+Pdf = Annotated[
+    bool,
+    option(
+        "Print the pages as PDFs beside them.",
+        "--pdf",
+        callback=lambda wanted: wanted and bool(_browser()),  # refused before the work begins
+    ),
+]
 
 
 def write_pdfs(pages: Iterable[Path], console: Console) -> None:

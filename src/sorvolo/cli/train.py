@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Generator, Iterator
 from dataclasses import asdict
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
@@ -158,13 +159,10 @@ def _losses(update: "TrainingUpdate") -> str:
     losses = update.losses
     assert losses is not None
     parts = ", ".join(f"{name} {value:.2f}" for name, value in losses.losses.items())
-    left = f", {_duration(update.left_s)} left" if math.isfinite(update.left_s) else ""
+    left = (
+        f", {timedelta(seconds=round(update.left_s))} left" if math.isfinite(update.left_s) else ""
+    )
     return f"loss {losses.loss:.3f} ({parts}), {update.steps_per_s:.2f} it/s{left}"
-
-
-def _duration(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes // 60}:{minutes % 60:02}:{rest:02}"
 
 
 def _number(value: float) -> str:

@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from math import atan2, cos, degrees, hypot, isfinite, nan, radians, sin
 from pathlib import Path
-from typing import Any
 
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.units import M_PER_DEG_LATITUDE
@@ -191,13 +190,15 @@ class CotRelay(ThreadOwner):
             name = str(properties.get("class", "object"))
             uid, type_ = f"sorvolo.{site}.{event.get('run')}.{thing}", cot_type(name)
         self._sent_types[uid] = type_
+        score = properties.get("score")
+        scored = "" if score is None else f", score {float(score):.2f}"
         self._sender.send(
             cot_spot(
                 *place,
                 uid=uid,
                 kind=type_,
                 callsign=f"{name} {thing}",
-                words=_remarks(name, properties.get("score"), event),
+                words=f"{name}{scored}, found by Sorvolo at {event['at'][:19]}Z",
                 error_m=float(properties.get("sigma_m") or nan),
                 now_ns=time.time_ns(),
                 stale_s=_SPOT_STALE_S,
@@ -296,11 +297,6 @@ def view_of_frame(data: JsonView) -> DroneView | None:
         down_deg=_angle_deg(_mean(top_left, top_right), _mean(low_left, low_right), height_m),
         range_m=hypot(*middle, height_m),
     )
-
-
-def _remarks(name: str, score: Any, event: JsonView) -> str:
-    scored = "" if score is None else f", score {float(score):.2f}"
-    return f"{name}{scored}, found by Sorvolo at {event['at'][:19]}Z"
 
 
 def _mean(*points: tuple[float, float]) -> tuple[float, float]:

@@ -408,7 +408,10 @@ class Runs(ThreadOwner):
         with self._lock:
             lines, end = _new_lines(folder / JOURNAL_FILE, offset)
             run, events = self._advanced(self.get(run.id), lines)
-            if has_ended and end == offset and self._is_gone(run):
+            # whether a run that counts as running, and whose lock is free, has no process any more
+            process = self._processes.get(run.id)
+            is_gone = run.state == RUNNING and (process is None or process.poll() is not None)
+            if has_ended and end == offset and is_gone:
                 run, event = self._mark_lost(run, folder)
                 events.append(event)
             if events or end > offset:
@@ -435,11 +438,6 @@ class Runs(ThreadOwner):
             run, event = _taken(run, {"type": line["type"], "data": data})
             events.append(event)
         return run, events
-
-    def _is_gone(self, run: Run) -> bool:
-        """Whether a run that counts as running, and whose lock is free, has no process any more; never waits."""
-        process = self._processes.get(run.id)
-        return run.state == RUNNING and (process is None or process.poll() is not None)
 
     def _mark_lost(self, run: Run, folder: Path) -> tuple[Run, NewEvent]:
         """A run whose process ended without its last line: killed, crashed, or switched off with the machine."""

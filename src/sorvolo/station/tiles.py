@@ -490,16 +490,17 @@ class FloorTiles:
             keyframes = [by_name[view.name] for view in solved.views]
             first = solved.views[0].camera
             share = min(1.0, _FLOOR_PX / max(first.width_px, first.height_px))
-            views = [_smaller(view, share) for view in solved.views]
+            views = [
+                replace(
+                    each,
+                    camera=each.camera.resized(
+                        round(each.camera.width_px * share), round(each.camera.height_px * share)
+                    ),
+                )
+                for each in solved.views
+            ]
             self._views = key, views, FlightPictures(archive, keyframes, solved.radial)
         return self._views[1:]
-
-
-def _smaller(view: View, share: float) -> View:
-    width_px, height_px = (
-        round(each * share) for each in (view.camera.width_px, view.camera.height_px)
-    )
-    return replace(view, camera=view.camera.resized(width_px, height_px))
 
 
 def _levels(pictures: FlightPictures, number: int, camera: Camera) -> NDArray[np.int16]:

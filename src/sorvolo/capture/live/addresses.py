@@ -72,7 +72,9 @@ class FollowedPath:
 
 def is_live_address(text: str) -> bool:
     """Whether an input is a live source rather than a file or folder."""
-    return _scheme(text) in (*STREAM_SCHEMES, "webcam", "follow") or text.startswith("/dev/video")
+    scheme, colon, _ = text.partition(":")
+    has_scheme = bool(colon) and scheme.lower() in (*STREAM_SCHEMES, "webcam", "follow")
+    return has_scheme or text.startswith("/dev/video")
 
 
 def live_address(text: str) -> StreamAddress | FollowedPath:
@@ -174,7 +176,3 @@ def _has_protocol(name: str) -> bool:
     except (av.FFmpegError, OSError):
         pass
     return True
-
-
-def _scheme(text: str) -> str:
-    return text.partition(":")[0].lower() if ":" in text else ""

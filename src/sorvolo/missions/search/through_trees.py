@@ -205,7 +205,10 @@ def _solved(
         if before is None:
             tracks = find_tracks(views, pictures.gray)
         free = before or solve_tracks(views, tracks)
-        swing_deg, stretch = _swing_deg(free), abs(np.log(free.focal_scale))
+        # how far cameras tilt from their usual tilt: a gimbal's hardly do, those that crowns leave free do
+        ups = np.array([view.site_from_camera.rotation[2] for view in free.views])
+        swings = np.linalg.norm(ups - np.median(ups, axis=0), axis=1)
+        swing_deg, stretch = np.degrees(np.median(swings)), abs(np.log(free.focal_scale))
         is_held = len(free.lost) <= 0.1 * len(views) and stretch < _MOST_STRETCH
         if is_held and swing_deg < _MOST_SWING_DEG:
             return free, ""
@@ -230,12 +233,6 @@ def _solved(
     return None, (
         f"cameras are as mapped, not solved in space ({why}): 0.5 m or 1 degree of error hides people"
     )
-
-
-def _swing_deg(solved: Cameras3D) -> float:
-    """How far cameras tilt from their usual tilt, median: a gimbal's hardly do, those that crowns leave free do."""
-    ups = np.array([view.site_from_camera.rotation[2] for view in solved.views])
-    return float(np.degrees(np.median(np.linalg.norm(ups - np.median(ups, axis=0), axis=1))))
 
 
 def _by_given_lens(views: Sequence[View], before: Cameras3D) -> Sequence[View]:

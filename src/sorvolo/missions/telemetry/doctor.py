@@ -130,7 +130,7 @@ def correct_telemetry(
         if source is None:
             name = _flight(archive, flight)
             _check_folder(folder, name, site)
-            if (earlier := _diagnosis(folder)) is not None:
+            if (earlier := _earlier(folder)).get("faults"):
                 return _sent_again(earlier, folder, cot)
             return _written(
                 site, name, folder, _solved(archive, name, 0), None, archive.report(name), cot
@@ -216,12 +216,6 @@ def _check_folder(folder: Path, name: str, site: Site) -> None:
         )
 
 
-def _diagnosis(folder: Path) -> dict[str, Any] | None:
-    """The report of the diagnosis whose files the folder has; None where it has none."""
-    report = _earlier(folder)
-    return report if report.get("faults") else None
-
-
 def _sent_again(earlier: dict[str, Any], folder: Path, cot: CotReceiver | None) -> dict[str, Any]:
     """Send the events of the diagnosis that a folder has; its report.
 
@@ -291,9 +285,12 @@ def _compared(
             "position: check that the log is of this flight, or give another one with --telemetry"
         )
     sigma_s = clock.sigma if isfinite(clock.sigma) else track.clock.sigma_s
+    # a base map or control points may hold the map's scale and direction
+    points = (report.get("control") or {}).get("points", [])
+    held = sum(each["role"] == ControlRole.CONTROL for each in points) >= _HOLDING
     path = (
         AS_THE_MAP
-        if _is_tied(report)
+        if held or report.get("base")
         else path_fit(priors, [solved[k].pose for k in seen], sigma_s)
     )
     poses = fitted([each.pose for each in solved], path)
@@ -335,15 +332,6 @@ def _between(
         compared.track.priors(each, compared.applied_s, smooth_s) for each in (times_s, key_s)
     )
     return corrected_poses(times_s, priors, key_s, key_priors, [each.pose for each in solved])
-
-
-def _is_tied(report: Mapping[str, Any]) -> bool:
-    """Whether a base map or control points hold the map's scale and direction."""
-    points = (report.get("control") or {}).get("points", [])
-    return (
-        bool(report.get("base"))
-        or sum(each["role"] == ControlRole.CONTROL for each in points) >= _HOLDING
-    )
 
 
 def _clock(report: Mapping[str, Any]) -> tuple[Bias, float | None, float]:

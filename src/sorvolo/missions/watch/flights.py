@@ -150,17 +150,15 @@ def _journal(folder: Path, request: str) -> RunJournal:
 def _folder_of(source: Source, outputs: WatchOutputs, *, is_only: bool) -> Path:
     """Where a watch's files go: each of several sources has a folder of its own, and each flight of a live one."""
     if outputs.folder is None and outputs.below is not None:
-        folder = outputs.below / source.name
-        return _free_folder(folder) if isinstance(source, LiveSource) else folder
+        folder = first = outputs.below / source.name
+        number = 1
+        while isinstance(source, LiveSource) and folder.exists():
+            number += 1
+            folder = first.with_name(f"{first.name}-{number}")
+        return folder
     if outputs.folder is None:
         return Path(f"{source.name}-watch")
     return outputs.folder if is_only else outputs.folder / source.name
-
-
-def _free_folder(folder: Path) -> Path:
-    """The folder, with a number where there is one of this name."""
-    names = (folder, *(folder.with_name(f"{folder.name}-{number}") for number in range(2, 10_000)))
-    return next(each for each in names if not each.exists())
 
 
 def _checked_detector(

@@ -177,7 +177,11 @@ class GroundPlaces(Places):
         prior = self._prior(frame)
         if self._headings is not None:
             if self._taken is None and not isinstance(self._setup.source, LiveSource):
-                self._see_next(frame, self._headings)
+                follows = frame.index + 1  # its heading is held against the photo after it
+                for after in self._setup.source.frames(lambda index, _: index == follows):
+                    if isinstance(after, Frame):
+                        self._headings.see(after.image, self._prior(after))
+                    break
             prior = self._headings.take(frame.image, prior)
         self._taken = frame.index, prior
         return self.follower.take(frame, time_ns, found, prior)
@@ -218,13 +222,6 @@ class GroundPlaces(Places):
             text = f"{counted(follower.impossible_size, 'detection')} left out: {IMPOSSIBLE_SIZE}"
             found.append(Notice("too_short", follower.impossible_size, text))
         return (*self._setup.notices, *found)
-
-    def _see_next(self, first: Frame, headings: PhotoHeadings) -> None:
-        """Hold the first photo's heading against the photo after it."""
-        for frame in self._setup.source.frames(lambda index, _: index == first.index + 1):
-            if isinstance(frame, Frame):
-                headings.see(frame.image, self._prior(frame))
-            return
 
     def _prior(self, frame: Frame) -> CameraPrior:
         prior, track = self._setup.prior(frame, first=False), self._setup.track

@@ -373,13 +373,6 @@ class WatchRun:
             if not track.confirmed and track.score >= self._detector.info.thresholds[track.label]
         }
 
-    def _look(self, frame: Frame) -> None:
-        """Note the ground of a frame that was searched."""
-        outline_m = self._outline_m(frame)
-        if outline_m is not None and self._ground is not None:
-            m_per_px = self._places.m_per_px(frame)
-            self._ground.look(outline_m, math.inf if m_per_px is None else m_per_px, self._classes)
-
     def looked_at(self) -> LookedAt:
         """How much of what the flight showed was looked at so far."""
         seen = max(self.log.asked, self.log.detected + self.log.lost.total())
@@ -405,7 +398,10 @@ class WatchRun:
         time_ns = utc_ns(self._setup, frame.time_ns) if located is None else located.time_ns
         with log.stage("track"):
             taken = self._places.take(frame, time_ns, found, located)
-        self._look(frame)
+        outline_m = self._outline_m(frame)
+        if outline_m is not None and self._ground is not None:
+            m_per_px = self._places.m_per_px(frame)
+            self._ground.look(outline_m, math.inf if m_per_px is None else m_per_px, self._classes)
         if not is_resumed:
             if memo.is_of_stream:
                 memo.keep(frame, "located", taken.located)

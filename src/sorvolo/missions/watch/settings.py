@@ -86,18 +86,12 @@ class WatchOutputs:
     def __post_init__(self) -> None:
         for name in ("folder", "below"):
             object.__setattr__(self, name, as_path(getattr(self, name)))
-        self._check_files()
-        self._check_receivers()
-
-    def _check_files(self) -> None:
         if self.save not in ("none", "video", "pictures"):
             raise SettingsError(f"save must be none, video or pictures, got {self.save!r}")
         if unknown := sorted(set(self.labels) - set(_LABEL_FORMATS)):
             raise SettingsError(
                 f"labels are written as {' and '.join(_LABEL_FORMATS)}, not as {unknown[0]!r}"
             )
-
-    def _check_receivers(self) -> None:
         if not (self.cot_every_s >= 0 and self.cot_stale_s > 0):
             raise SettingsError(
                 "events are sent every 0 s or more, and are stale after more than 0 s"

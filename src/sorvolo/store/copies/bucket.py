@@ -364,8 +364,13 @@ class BucketEnd:
         try:
             while done != manifest.id:
                 for name in SHOWN:
-                    if manifest.files.get(name) != shown.get(name) or done:
-                        self._show_as(name, manifest.files.get(name))
+                    file = manifest.files.get(name)
+                    if file == shown.get(name) and not done:
+                        continue
+                    if file is None:
+                        self._objects.remove([name])
+                    else:
+                        self._objects.copy(key_of(file), name)
                 done, manifest = manifest.id, self.manifest()
         except StoreError as error:
             warnings.warn(
@@ -373,12 +378,6 @@ class BucketEnd:
                 SorvoloWarning,
                 stacklevel=2,
             )
-
-    def _show_as(self, name: str, file: SiteFile | None) -> None:
-        if file is None:
-            self._objects.remove([name])
-        else:
-            self._objects.copy(key_of(file), name)
 
     def _conflict(self) -> OvertakenError:
         return OvertakenError(

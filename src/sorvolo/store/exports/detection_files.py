@@ -472,7 +472,8 @@ def write_yolo_names(folder: Path, classes: Iterable[str]) -> None:
     atomic_write_bytes(
         folder / "classes.txt", "".join(f"{name}\n" for name in names).encode(), durable=False
     )
-    numbered = [f"  {number}: {_quoted(name)}" for number, name in enumerate(names)]
+    quoted = [name.replace("'", "''") for name in names]  # as YAML's scalars in single quotes
+    numbered = [f"  {number}: '{name}'" for number, name in enumerate(quoted)]
     lines = ["path: .", "train: images", "val: images", "names:", *numbered]
     atomic_write_bytes(folder / "data.yaml", ("\n".join(lines) + "\n").encode(), durable=False)
 
@@ -518,8 +519,3 @@ def _place_in_images(picture: LabelledPicture, folder: Path) -> PurePath:
         if path.is_relative_to(images):
             return path.relative_to(images)
     return PurePath(path.name)
-
-
-def _quoted(name: str) -> str:
-    """A name as a YAML scalar in single quotes."""
-    return "'" + name.replace("'", "''") + "'"

@@ -97,7 +97,9 @@ def _write_layer(file: sqlite3.Connection, name: str, features: Sequence[Feature
         f"INSERT INTO {_quoted(name)} ({names}) VALUES ({marks})",
         [
             (
-                _blob(geometry),
+                # magic, version, flags (little-endian, no envelope), EPSG code, ISO WKB
+                struct.pack("<2sBBi", b"GP", 0, 1, _WGS84)
+                + bytes(shapely.to_wkb(geometry, byte_order=1, flavor="iso")),
                 *(_plain(each["properties"].get(name), sql) for name, sql in columns.items()),
             )
             for geometry, each in zip(shapes, features, strict=True)
@@ -179,13 +181,6 @@ def _plain(value: object, sql: str) -> object:
     if sql == "DATETIME" and isinstance(value, str):
         return _moment(value)
     return json.dumps(value) if isinstance(value, list | dict | tuple) else value
-
-
-def _blob(geometry: BaseGeometry) -> bytes:
-    """A geometry as GeoPackages hold it: magic, version, flags (little-endian, no envelope), EPSG code, ISO WKB."""
-    return struct.pack("<2sBBi", b"GP", 0, 1, _WGS84) + bytes(
-        shapely.to_wkb(geometry, byte_order=1, flavor="iso")
-    )
 
 
 def _quoted(name: str) -> str:

@@ -99,7 +99,11 @@ def find(connection: Connection, place: Place) -> list[FoundFlight]:
     for longitude in _turns(place.longitude_deg, 0.0):
         found += _seen(connection, place, longitude, things)
     if missing := sorted(things.keys() - {number for number, _ in found}):
-        found += [(row.id, _unseen(row, things[row.id])) for row in _flights(connection, missing)]
+        for row in _flights(connection, missing):
+            of = things[row.id]
+            times = min(each.first_ns for each in of), max(each.last_ns for each in of)
+            about = row.path, row.name, row.flight, row.kind
+            found.append((row.id, FoundFlight(*about, 0, *times, "", False, tuple(of))))
     kept = [each for number, each in found if not place.classes or number in things]
     return sorted(kept, key=lambda each: (each.first_ns, each.site, each.flight))
 
@@ -318,10 +322,3 @@ def _flights(connection: Connection, ids: Sequence[int]) -> list[Any]:
             query.where(tables.flights.c.id.in_(ids[start : start + _MOST_VALUES]))
         ).all()
     return found
-
-
-def _unseen(row: Any, things: Sequence[FoundThing]) -> FoundFlight:
-    times = min(each.first_ns for each in things), max(each.last_ns for each in things)
-    return FoundFlight(
-        row.path, row.name, row.flight, row.kind, 0, *times, "", False, tuple(things)
-    )

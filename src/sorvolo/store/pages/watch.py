@@ -49,7 +49,12 @@ def watch_page(
         "watch.html",
         report,
         title=f"{report.get('flight')} - watch",
-        maps=_maps(tracks, drone_m, is_local=is_local),
+        # one map, or one for each segment of a flight that was followed in the picture: their pixels are not the same
+        maps=[
+            {"title": title, "classes": _classes(of_one), "colours": _COLOURS, "drawing": drawing}
+            for title, of_one in _by_segment(tracks)
+            if (drawing := _drawing(of_one, drone_m, is_local=is_local))
+        ],
         rows=[
             (each, _place(each, is_local, has_cuts), math.hypot(*each.get("velocity_m_s") or ()))
             for each in tracks
@@ -81,15 +86,6 @@ class _Spot:
     name: str
     label_x: float
     label_y: float
-
-
-def _maps(tracks: Sequence[_Track], drone_m: Floats, *, is_local: bool) -> list[dict[str, Any]]:
-    """One map, or one for each segment of a flight that was followed in the picture: their pixels are not the same."""
-    return [
-        {"title": title, "classes": _classes(of_one), "colours": _COLOURS, "drawing": drawing}
-        for title, of_one in _by_segment(tracks)
-        if (drawing := _drawing(of_one, drone_m, is_local=is_local))
-    ]
 
 
 def _by_segment(tracks: Sequence[_Track]) -> list[tuple[str, list[_Track]]]:
