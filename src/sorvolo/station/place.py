@@ -75,7 +75,11 @@ class PlaceIndex:
             marks = {site_id: archive.change_mark() for site_id, archive in archives.items()}
             old = [site_id for site_id, mark in marks.items() if self._marks.get(site_id) != mark]
             if old:
-                self._update({site_id: archives[site_id] for site_id in old})
+                with ArchiveIndex.open(self._shelf.root, write=True) as index:
+                    known = index.sites()
+                    for site_id in old:
+                        path = self._path(site_id)
+                        update_site(index, path, known.get(path), archives[site_id])
                 self._marks |= {site_id: marks[site_id] for site_id in old}
             # the index to read from, kept open; another one where it was made anew
             root = self._shelf.root
@@ -91,13 +95,6 @@ class PlaceIndex:
         if self._open is not None:
             self._open[1].close()
             self._open = None
-
-    def _update(self, archives: dict[str, Archive]) -> None:
-        with ArchiveIndex.open(self._shelf.root, write=True) as index:
-            known = index.sites()
-            for site_id, archive in archives.items():
-                path = self._path(site_id)
-                update_site(index, path, known.get(path), archive)
 
     def _path(self, site_id: str) -> str:
         return self._shelf.folder(site_id).relative_to(self._shelf.root).as_posix()

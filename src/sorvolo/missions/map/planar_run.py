@@ -179,6 +179,12 @@ class FlightRun(ABC):
     def _detector_notices(self) -> tuple[Notice, ...]:
         return () if self._finder is None else self._finder.notices
 
+    def _make_site(self, m_per_px: float, ground_up_m: float) -> None:
+        """Make the site if there is none; see `new_site`."""
+        if not self._archive.has_site:
+            name = self._archive.folder.resolve().name or "site"
+            self._archive.create_site(new_site(self._setup, name, m_per_px, ground_up_m))
+
     def _begin_flight(self) -> FlightWriter:
         """Return the writer, begun when it is first asked for."""
         if self._writer is None:
@@ -273,10 +279,8 @@ class PlanarRun(FlightRun):
         if not self._archive.has_site:
             if not self._times_ns:
                 raise self._nothing_placed()
-            name = self._archive.folder.resolve().name or "site"
-            m_per_px = self._settings.m_per_px or self._native_m_per_px()
-            self._archive.create_site(
-                new_site(self._setup, name, m_per_px, self._mapper.altitude_offset_m)
+            self._make_site(
+                self._settings.m_per_px or self._native_m_per_px(), self._mapper.altitude_offset_m
             )
         return self._begin_flight()
 

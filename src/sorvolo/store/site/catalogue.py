@@ -157,7 +157,13 @@ class Catalogue:
         )
         try:
             database.check()
-            self._check_format(site)
+            with self.reading() as connection:
+                version = schema.format_of(connection)
+            if version != schema.FORMAT:
+                raise StoreError(
+                    f"the site {site} has format version {version}, this Sorvolo works with "
+                    f"version {schema.FORMAT}; use the Sorvolo that made it, or map into a new folder"
+                )
         except BaseException:
             database.close()
             raise
@@ -197,15 +203,6 @@ class Catalogue:
                 f"{self._database.place} is damaged: {error}; restore it from a copy of the site, or map into a new "
                 "folder"
             ) from error
-
-    def _check_format(self, site: Path) -> None:
-        with self.reading() as connection:
-            version = schema.format_of(connection)
-        if version != schema.FORMAT:
-            raise StoreError(
-                f"the site {site} has format version {version}, this Sorvolo works with "
-                f"version {schema.FORMAT}; use the Sorvolo that made it, or map into a new folder"
-            )
 
 
 def utc_now() -> str:
