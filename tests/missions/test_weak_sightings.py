@@ -54,9 +54,9 @@ def searched(scores: list[float]) -> ObjectFinder:
 def test_weak_sightings_decide_and_are_not_counted() -> None:
     """Of four views two report a person: with 0.65 in the others it stands there, with 0.06 it does not."""
     for others, count in ((0.65, 1), (0.06, 0)):
-        finder = searched([0.9, others, 0.9, others])
+        finder = searched([0.7, others, 0.7, others])
         search = finder.conclude([placed(k) for k in range(4)], "flight1", has_metres=True)
         assert len(search.objects) == count
         assert search.sightings == 2 and search.dropped == 2 - 2 * count
-        assert [each.score for each in finder.sightings] == [0.9, 0.9]
+        assert [each.score for each in finder.sightings] == [0.7, 0.7]
         finder.close()

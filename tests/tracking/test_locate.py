@@ -76,9 +76,9 @@ def test_a_length_that_cars_seldom_have_counts_against_one():
     high = replace(PRIOR, position_sigma_m=np.array([0.5, 0.5, 20.0]))
     scores = [
         place(one([400.0, 300.0], label, length_m * m_px), prior)[0].score
-        for label, length_m, prior in (("car", 4.5, PRIOR), ("car", 2.6, high), ("car", 2.6, PRIOR))
+        for label, length_m, prior in (("car", 4.3, PRIOR), ("car", 2.6, high), ("car", 2.6, PRIOR))
     ]
-    assert scores[0] == 0.9 and 0.7 < scores[1] < 0.9 and scores[2] < 0.4
+    assert 0.89 < scores[0] < 0.9 and 0.7 < scores[1] < 0.9 and scores[2] < 0.4
     assert place(one([400.0, 300.0], "person", 0.4 * m_px))[0].score == 0.9
     cut = one([1.3 * m_px - 0.5, 300.0], "car", 2.6 * m_px)
     assert place(cut)[0].score == 0.9

@@ -19,9 +19,9 @@ from sorvolo.tracking.sizes import (
     beyond_edges,
     cut_edges,
     impossible_size,
-    length_log_odds,
-    with_log_odds,
+    size_log_odds,
 )
+from sorvolo.tracking.view_evidence import score_from_views
 
 _BOX_SIGMA = 0.06  # of a box's middle, in shares of its side
 _LEAST_SIGMA_PX = 1.0  # of a box's middle, however small the box
@@ -309,8 +309,8 @@ def locate(
             continue
         score = float(found.scores[row])
         if not cut_short[row].any():
-            length_m = float(sizes_m[row].max())
-            score = with_log_odds(score, length_log_odds(name, length_m, float(scale_sigmas[row])))
+            if of_size := size_log_odds(name, sizes_m[row], float(scale_sigmas[row])):
+                score = score_from_views([score], 1, name, of_size)
         sightings.append(
             Sighting(
                 frame_index,

@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import exp, hypot, log
+from math import exp, hypot, inf, log
 
 import numpy as np
 
@@ -20,13 +20,11 @@ _LEAST_LENGTH = 0.4  # of its usual length: what is shorter is none, however sur
 _MOST_WIDTH = 2.5
 _SCALE_SIGMAS = 2.0  # by which heights may be off before something is called too short or too wide
 
-_SHORTER_SIGMA = {"car": 0.11}
+_SHORTER_SIGMA = {"car": 0.11, "person": inf}  # people sit and crouch
+_LARGER_SIGMA = 0.2  # vans, pickups; arms and legs apart
+# of a car's area: of labelled cars that a window's edge cut, half are found where so much is left
+_HALF_FOUND = 0.23
 _PARTLY_SEEN = 0.05  # of a class's members, of which a tree or a roof hides a part; by choice
-
-
-def usual_length_m(name: str) -> float:
-    """How long a class's members usually are; 0 for classes that are not ours."""
-    return TYPICAL_SIZE_M[name][0] if name in TYPICAL_SIZE_M else 0.0
 
 
 def impossible_size(
@@ -42,7 +40,7 @@ def impossible_size(
     wide. Seen aslant, a standing person's box is long on the ground, but not wide: the shorter side is compared.
     """
     longest_m = sides_m.max(axis=1, initial=0.0) * (1.0 + _SCALE_SIGMAS * scale_sigma)
-    usual_m = np.array([usual_length_m(name) for name in names])
+    usual_m = np.array([TYPICAL_SIZE_M.get(name, (0.0,))[0] for name in names])
     short = ~cut.any(axis=1) & (longest_m < _LEAST_LENGTH * usual_m)
     shortest_m = sides_m.min(axis=1, initial=np.inf) * np.maximum(
         0.0, 1.0 - _SCALE_SIGMAS * scale_sigma
@@ -52,26 +50,25 @@ def impossible_size(
     return np.asarray(short | wide, bool)
 
 
-def length_log_odds(name: str, length_m: float, scale_sigma: float) -> float:
-    """What a length on the ground counts for a thing's being of a class: below 0 where it is shorter than usual.
+def size_log_odds(name: str, sides_m: Floats, scale_sigma: float, *, is_cut: bool = False) -> float:
+    """What a box's sides on the ground (2,) count for a thing's being of a class: below 0 where they are unusual.
 
-    The logarithm of how likely members of the class look so short, beside those of usual length; the length is known to
-    the relative error `scale_sigma`. 0 where nothing is known of the class's lengths, or of the thing's (NaN): what is
-    longer is not judged, since vans and what is seen aslant are.
+    The logarithm of how likely members of the class look so short or so wide, beside those of usual size; the sides are
+    known to the relative error `scale_sigma`. A piece that the picture's edge leaves is as likely as so little of a car
+    is found. 0 where nothing is known of the class's sizes. As in `impossible_size`, the shorter side is the width.
     """
-    sigma = _SHORTER_SIGMA.get(name, 0.0)
-    if not sigma or not length_m < usual_length_m(name):
+    if name not in _SHORTER_SIGMA:
         return 0.0
-    off = log(max(length_m, 1e-3) / usual_length_m(name)) / hypot(sigma, scale_sigma)
-    return log((1.0 - _PARTLY_SEEN) * exp(-off * off / 2) + _PARTLY_SEEN)
-
-
-def with_log_odds(score: float, more: float) -> float:
-    """A score, 0 to 1, with what else is known, in log-odds."""
-    if not more:
-        return score
-    inside = min(max(score, 1e-3), 1.0 - 1e-3)
-    return 1.0 / (1.0 + exp(-log(inside / (1.0 - inside)) - more))
+    usual_m = TYPICAL_SIZE_M[name]
+    width_m, length_m = np.sort(sides_m).clip(1e-3)
+    # around what lies slanting
+    off = log(width_m / sum(sorted(usual_m)[1:]) * 2**0.5) / hypot(_LARGER_SIGMA, scale_sigma)
+    found = 1.0
+    if is_cut:
+        found /= 1.0 + (_HALF_FOUND * usual_m[0] * usual_m[1] / (width_m * length_m)) ** 3
+    else:
+        off = max(off, -log(length_m / usual_m[0]) / hypot(_SHORTER_SIGMA[name], scale_sigma))
+    return log(found * ((1.0 - _PARTLY_SEEN) * exp(-(max(off, 0.0) ** 2) / 2) + _PARTLY_SEEN))
 
 
 CUT_PX = 1.5
