@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,14 +13,6 @@ from sorvolo.tracking.sizes import impossible_beside_cars
 from sorvolo.tracking.standing import Standing, fuse
 
 
-@dataclass(frozen=True)
-class ObjectsOnMap:
-    """The objects, and how many sightings belong to none of them."""
-
-    objects: tuple[MapObject, ...]
-    dropped: int
-
-
 def objects_on_map(
     laid: Sequence[LaidSighting],
     crops: Sequence[bytes],
@@ -30,9 +21,11 @@ def objects_on_map(
     *,
     has_metres: bool,
     least: Mapping[str, float] | None = None,
-) -> ObjectsOnMap:
-    """Each object once. `crops` are the pictures, JPEG, around each sighting; `least` is the score from which on each
-    class is reported: weaker sightings are evidence only.
+) -> tuple[tuple[MapObject, ...], int]:
+    """Each object once, and how many sightings belong to none of them.
+
+    `crops` are the pictures, JPEG, around each sighting; `least` is the score from which on a frame reports each class:
+    weaker sightings are evidence only.
 
     Without metres sizes are left out, and so are sightings of a size that their class cannot have beside the cars.
     """
@@ -59,7 +52,7 @@ def objects_on_map(
         _map_object(each, f"{flight_id}-o{number}", laid, crops, sigmas_m, has_metres=has_metres)
         for number, each in enumerate(fused.objects, start=1)
     )
-    return ObjectsOnMap(tuple(objects), fused.dropped)
+    return tuple(objects), fused.dropped
 
 
 def _map_object(

@@ -257,9 +257,7 @@ def impossible_beside_cars(names: Sequence[str], sides: Floats, is_cut: Mask) ->
         longest[(np.array(names, object) == _CAR) & ~is_cut & (longest > 0)]
         / TYPICAL_SIZE_M[_CAR][0]
     )
-    if len(cars) < _LEAST_BOXES:
-        return np.zeros(len(names), bool)
-    spread = _spread(cars - np.median(cars))
+    spread = _spread(cars - np.median(cars)) if len(cars) >= _LEAST_BOXES else inf
     if spread > _MOST_SPREAD:
         return np.zeros(len(names), bool)
     sigma = float(np.hypot(_FLEET_SIGMA, spread / len(cars) ** 0.5))

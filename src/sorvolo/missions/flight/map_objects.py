@@ -201,18 +201,20 @@ class ObjectFinder:
         least = self._least(frames)
         sightings = (each.sighting for each in laid)
         self._sightings = tuple(each for each in sightings if each.score >= least[each.label])
-        found = objects_on_map(laid, crops, frames, flight_id, has_metres=has_metres, least=least)
+        objects, dropped = objects_on_map(
+            laid, crops, frames, flight_id, has_metres=has_metres, least=least
+        )
         searched = SearchedFrames.of(
             frames, [self._seen[each.index].least.keys() for each in frames], self._classes
         )
         return ObjectSearch(
             self._detector.info.name,
             self._classes,
-            found.objects,
+            objects,
             searched,
             len(self._seen),
             len(self._sightings),
-            found.dropped,
+            dropped,
         )
 
     def looked_at(
