@@ -192,7 +192,7 @@ def test_a_receiver_that_had_stopped_gives_no_scale(film: Path, tmp_path: Path) 
     report = mapped(tmp_path / "site", film, "--telemetry", telemetry, code=3)
     assert report["headline"]["quality"] == "contradictory"
     assert (
-        "80 positions are all one place, while the pictures moved on" in report["headline"]["text"]
+        "its positions are all one place, while the pictures moved on" in report["headline"]["text"]
     )
 
 

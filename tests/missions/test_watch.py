@@ -23,12 +23,14 @@ from toy_models import rectangle_model
 from truth_detector import TruthDetector
 
 from small_flights import simulate_into, small_flight
+from sorvolo.capture.source import open_sources
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.detector import Detector
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.lab.datasets import read_dataset
 from sorvolo.lab.simulation.settings import OutputSettings, SensorSettings
+from sorvolo.missions.flight.sample_frames import pictures_move
 from sorvolo.missions.watch.flights import watch
 from sorvolo.missions.watch.run import WatchUpdate
 from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
@@ -95,6 +97,31 @@ def _seen_objects(flown: Path) -> dict[int, tuple[str, np.ndarray]]:
 
 def _metres(degrees: np.ndarray, latitude_deg: float) -> np.ndarray:
     return degrees * np.array([np.cos(np.radians(latitude_deg)), 1.0]) * 111_200
+
+
+def test_a_receiver_that_had_stopped_places_nothing_unless_the_drone_hovered(
+    flown: Path, detector: TruthDetector, tmp_path: Path
+) -> None:
+    """All fixes are one place: where the pictures move on, things lie tens of metres off, stated to a metre."""
+    log, hover = tmp_path / "still.csv", tmp_path / "hover.mp4"
+    rows = [f"{0.2 * k:.1f},41.8923377,12.6032935,25.0" for k in range(150)]
+    log.write_text("\n".join(["offsetTime,latitude,longitude,relativeHeight", *rows]) + "\n")
+    with av.open(str(_video(flown))) as source, av.open(str(hover), "w") as target:
+        stream = target.add_stream("libx264", rate=5)
+        stream.width, stream.height = 480, 270
+        picture = next(source.decode(video=0)).to_ndarray(format="rgb24")
+        for _ in range(20):
+            target.mux(stream.encode(av.VideoFrame.from_ndarray(picture)))
+        target.mux(stream.encode())
+    assert not pictures_move(open_sources([hover])[0])
+    written = WatchOutputs(folder=tmp_path / "watch")
+    camera = flown / "camera.xml"
+    list(watch(_video(flown), outputs=written, telemetry=log, camera=camera, detector=detector))
+    texts = [each["text"] for each in _read(tmp_path / "watch" / "report.json")["notices"]]
+    assert any(
+        "all one place, and the pictures move: no object is placed" in each for each in texts
+    )
+    assert not (tmp_path / "watch" / "tracks.geojson").exists()
 
 
 def test_each_object_once_at_its_place(

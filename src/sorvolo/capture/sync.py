@@ -16,6 +16,7 @@ from sorvolo.geometry.pose import (
     site_from_gimbal_rotation,
 )
 from sorvolo.geometry.summary import median_or_nan
+from sorvolo.geometry.track import known_points
 from sorvolo.geometry.units import DAY_NS
 from sorvolo.survey.flight import CameraPrior, Notice, Telemetry
 from sorvolo.survey.wording import span_words
@@ -37,6 +38,7 @@ _ZONES_S = (
     900,
 )
 _FARTHEST_ZONE_S = 14 * 3600  # ... and by how much at most
+_STILL_M = 0.01  # fixes no farther apart are the same again and again
 DATED_NS = 3650 * 86_400 * 10**9
 """Ten years after 1970: an earlier clock was never set."""
 
@@ -198,6 +200,12 @@ class CameraTrack:
     stated_sigma_deg: tuple[float, float]  # of tilt and heading, NaN where the source states none
     interval_s: float
     longest_gap_s: float = field(default=3.0)
+
+    @property
+    def is_still(self) -> bool:
+        """Whether all fixes are one place: the drone hovered, or its receiver had stopped."""
+        known_m = known_points(self.east_north_m)
+        return len(known_m) > 0 and bool(np.ptp(known_m, axis=0).max() < _STILL_M)
 
     @property
     def counts_from_takeoff(self) -> bool:

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-import numpy as np
-
 from sorvolo.capture.clock_offset import OffsetEstimate
 from sorvolo.missions.flight.log import FlightLog
 from sorvolo.missions.flight.setup import FlightSetup
@@ -24,8 +22,7 @@ _BAD_FIT_PX = 3.0  # median residual of a map's matches from which on it is warn
 _TURNED_DEG = 6.0  # by which all stated angles may be off without a word
 _MOST_RIVALS = 4  # clock offsets in a sentence
 _FAR_BETTER = 0.7  # of the misfit at the clock's own tie
-_STILL_M = 0.01  # fixes no farther apart are the same again and again ...
-_MOVED = 0.3  # ... and pictures that spread so many diagonals of a frame are not those of a hovering drone
+_MOVED = 0.3  # pictures that spread so many diagonals of a frame are not those of a hovering drone
 _GUESSED = 0.1  # relative: a focal length that is hardly known
 
 
@@ -159,13 +156,10 @@ def still_fixes(figures: FlightFigures, setup: FlightSetup) -> list[str]:
     telemetry = setup.telemetry
     if telemetry is None or telemetry.knows_ground or setup.known_ground is not None:
         return []
-    places_m = telemetry.track.east_north_m
-    known_m = places_m[np.isfinite(places_m[:, 0])]
-    is_still = len(known_m) > 0 and np.ptp(known_m, axis=0).max() < _STILL_M
-    if not is_still or figures.reach_m < _MOVED * figures.diagonal_m:
+    if not telemetry.track.is_still or figures.reach_m < _MOVED * figures.diagonal_m:
         return []
     return [
-        f"its {len(known_m)} positions are all one place, while the pictures moved on (a receiver that had stopped): "
+        "its positions are all one place, while the pictures moved on (a receiver that had stopped): "
         "nothing gives its scale and north; give another log with --telemetry"
     ]
 

@@ -3,6 +3,9 @@
 from collections.abc import Iterator
 from itertools import islice
 
+import cv2
+import numpy as np
+
 from sorvolo.capture.source import LiveSource, Source
 from sorvolo.capture.video import VideoSource
 from sorvolo.errors import InputError
@@ -10,6 +13,8 @@ from sorvolo.mosaic.selection import evenly, every, has_texture
 from sorvolo.survey.flight import Frame
 
 _SAMPLES = 5  # frames of a flight; by choice
+_THUMBNAIL_PX = (64, 36)
+_LIKE = 0.5  # correlation of two thumbnails of a hovering drone, at least; by choice
 _LIVE_STEP_S = 0.5  # between the frames of a live flight
 
 
@@ -23,6 +28,13 @@ def sample_frames(source: Source) -> list[Frame]:
         )
         return [frame for frame in coming if isinstance(frame, Frame)]
     return list(_spread_photos(source))
+
+
+def pictures_move(source: Source) -> bool:
+    """Whether a few pictures of a recorded flight show other ground, one after the other; it takes a second."""
+    frames = [] if isinstance(source, LiveSource) else sample_frames(source)
+    small = np.array([cv2.resize(each.image, _THUMBNAIL_PX).ravel() for each in frames], float)
+    return len(small) > 1 and bool(np.diag(np.corrcoef(small), 1).min() < _LIKE)
 
 
 def _spread_photos(source: Source) -> Iterator[Frame]:

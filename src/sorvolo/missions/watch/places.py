@@ -14,6 +14,7 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, PointsM
 from sorvolo.geometry.pose import Pose
 from sorvolo.geometry.track import corners_around, known_points
+from sorvolo.missions.flight.sample_frames import pictures_move
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup, new_site
 from sorvolo.store.rasters.height_model import read_height_model
@@ -274,4 +275,6 @@ def _why_not_on_ground(setup: FlightSetup) -> str | None:
         return (
             f"heights are {track.height_kind} and the ground's is unknown (give --ground-elevation)"
         )
+    if track.is_still and pictures_move(setup.source):
+        return "the telemetry's positions are all one place, and the pictures move"
     return None
