@@ -1,5 +1,6 @@
 """Bad input through the command: each fault has its own clear error or counted value, and no site is spoilt."""
 
+import csv
 import json
 import os
 import resource
@@ -194,6 +195,30 @@ def test_a_receiver_that_had_stopped_gives_no_scale(film: Path, tmp_path: Path) 
     assert (
         "its positions are all one place, while the pictures moved on" in report["headline"]["text"]
     )
+
+
+@pytest.mark.parametrize(
+    "above_m, code, is_coarse", [(0.0, 0, False), (40.0, 0, True), (300.0, 3, True)]
+)
+def test_heights_that_count_from_elsewhere(
+    film: Path, filmed: Path, tmp_path: Path, above_m: float, code: int, is_coarse: bool
+) -> None:
+    """Heights above the sea, say, where those above the take-off belong: they decide the grid, and pull at the scale."""
+    telemetry = tmp_path / "log.csv"
+    with (filmed / "flight1" / "flight1.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    for row in rows:
+        row["relativeHeight"] = f"{float(row['relativeHeight']) + above_m:.2f}"
+    with telemetry.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0].keys())
+        writer.writeheader()
+        writer.writerows(rows)
+    site = tmp_path / "site"
+    camera = filmed / "camera.xml"
+    report = mapped(site, film, "--telemetry", telemetry, "--camera", camera, code=code)
+    native_m = report["native_ground_sampling_distance_m"]
+    assert (f"cm: --gsd {native_m:.2g} maps" in " ".join(report["warnings"])) is is_coarse
+    assert ("telemetry's heights give" in report["headline"]["text"]) is (code == 3)
 
 
 def test_half_written_telemetry_with_lost_jumping_and_backward_fixes(

@@ -4,7 +4,7 @@ import resource
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from math import isfinite
+from math import isfinite, nan
 from typing import Any
 
 from sorvolo.build import build
@@ -25,6 +25,7 @@ from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.mosaic.base_ties import BaseReport
 from sorvolo.mosaic.consistency import Stated, consistency
 from sorvolo.mosaic.flight_figures import (
+    FlightFigures,
     delay_figures,
     flight_figures,
     stated_height_m,
@@ -46,6 +47,11 @@ class MapShape:
     is_flat: bool
     why: str
 
+
+_WRONG_HEIGHT = (
+    5.0  # times the height that pictures show: a stated one so far off pulls at the map's scale
+)
+_COARSE = 1.5  # times the pixel of the pictures
 
 LEVEL = MapShape(True, "the map is flat: a level plane explains the pictures")
 
@@ -86,8 +92,12 @@ def build_report(
     figures = flight_figures(placed, result.camera.fx_px)
     # what the plane of a flat map shows of itself is no witness of a map that stands on heights
     plane = graph if result.shape.is_flat else None
-    agreement = consistency(placed, result.pieces, figures, _stated(setup, result), plane)
+    stated = _stated(setup, result)
+    agreement = consistency(placed, result.pieces, figures, stated, plane)
     agreement = replace(agreement, faults=(*still_fixes(figures, setup), *agreement.faults))
+    times = stated.height_m / (figures.height_m or nan)
+    if agreement.remarks and not 1 / _WRONG_HEIGHT < times < _WRONG_HEIGHT:
+        agreement = replace(agreement, steps=(*agreement.steps, *agreement.remarks), remarks=())
     headline = {}
     others = clock_doubts(setup, result.offset, settings.offset_s)
     if result.makes_map:
@@ -147,12 +157,24 @@ def build_report(
         "notices": [asdict(each) for each in (*source.telemetry.notices, *setup.notices, *notices)],
         "warnings": [
             *flight_warnings(placed, figures, setup, log, agreement, plane, others),
+            *(_coarse_grid(site, figures, settings) if result.makes_map else ()),
             *(result.control.remarks if result.control else ()),
         ],
         "settings": asdict(settings),
         "versions": software(),
         "track": [track_row(each) for each in placed],
     }
+
+
+def _coarse_grid(site: Site, figures: FlightFigures, settings: MapSettings) -> list[str]:
+    """Why the map shows less than its pictures do: the first of them, or another flight, decided its resolution."""
+    native_m = figures.native_m_per_px
+    if site.is_local or settings.m_per_px or not native_m or site.m_per_px < _COARSE * native_m:
+        return []
+    return [
+        f"the map has {100 * site.m_per_px:.1f} cm a pixel, and the pictures show {100 * native_m:.1f} cm: --gsd "
+        f"{native_m:.2g} maps them so into a new folder"
+    ]
 
 
 def _stated(setup: FlightSetup, result: FlightResult) -> Stated:
