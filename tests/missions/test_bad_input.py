@@ -185,6 +185,18 @@ def test_telemetry_of_another_day(
     assert "no time in common: the log begins 2283 d 1 s before the pictures" in words
 
 
+def test_an_area_of_another_place_is_named(
+    film: Path, filmed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    area = tmp_path / "swapped.geojson"  # latitude before longitude
+    corners = [[41.892, 12.603], [41.893, 12.603], [41.893, 12.604], [41.892, 12.603]]
+    area.write_text(json.dumps({"type": "Polygon", "coordinates": [corners]}))
+    log = filmed / "flight1" / "flight1.csv"
+    site = tmp_path / "site"
+    words = refused(capsys, film, "--telemetry", log, "--area", area, "--site", site)
+    assert "begins 4,228 km from flight1; is it the right file, and does it have longitude" in words
+
+
 def test_a_receiver_that_had_stopped_gives_no_scale(film: Path, tmp_path: Path) -> None:
     """All fixes are one place: the pictures that are laid on them shrink to a point, without any misfit."""
     telemetry = tmp_path / "still.csv"

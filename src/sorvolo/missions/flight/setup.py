@@ -37,6 +37,7 @@ from sorvolo.survey.mosaic import FrameView
 KnownGround = FlightControl | FlightBase
 """What places a map beside GPS, or without any."""
 
+_OTHER_AREA_M = 20_000.0  # from a flight: no small drone flies so far
 _ANOTHER_PLACE_M = 2_000.0  # from known ground: a map's files hold all between, which takes minutes where it is far
 
 
@@ -118,6 +119,12 @@ class FlightSetup:
         """Whether a frame was taken within the area of interest; frames of unknown place count as inside."""
         if area is None or self.telemetry is None:
             return lambda _: True
+        far_m = min(area.distances_m(self.frame.origin))
+        if far_m > _OTHER_AREA_M:
+            raise InputError(
+                f"--area: it begins {far_m / 1000:,.0f} km from {self.source.name}; is it the right file, and does it have "
+                "longitude before latitude?"
+            )
         return lambda posed: (
             not posed.prior.knows_place or area.holds(self.frame, posed.prior.position_m)
         )
