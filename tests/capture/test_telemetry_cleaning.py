@@ -160,6 +160,12 @@ def test_backward_and_repeated_clocks():
     assert telemetry["latitude_deg"] == pytest.approx(latitude[[0, 1, 2, 3, 5, 6, 8, 9]])
 
 
+def test_samples_with_the_newest_first_are_all_kept():
+    times, latitude, longitude = track(50)
+    telemetry = cleaned(times[::-1], latitude[::-1], longitude[::-1])
+    assert codes(telemetry) == {} and (telemetry["latitude_deg"] == latitude).all()
+
+
 def test_one_clock_far_ahead_does_not_cost_the_rest():
     times, latitude, longitude = track(20)
     times[5] += 10_000 * SECOND_NS

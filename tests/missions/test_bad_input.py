@@ -185,6 +185,18 @@ def test_telemetry_of_another_day(
     assert "no time in common: the log begins 2283 d 1 s before the pictures" in words
 
 
+def test_a_log_that_is_in_two_places_is_doubted(film: Path, filmed: Path, tmp_path: Path) -> None:
+    def away(fix: int, fields: list[str]) -> None:
+        if fix < 9:
+            place = _latitude(fields)
+            fields[place] = f"{float(fields[place]) + 4:.7f}"
+
+    telemetry, site = tmp_path / "two.nmea", tmp_path / "site"
+    telemetry.write_text(_nmea(filmed, away))
+    report = mapped(site, film, "--telemetry", telemetry, "--camera", filmed / "camera.xml", code=3)
+    assert "positions are far from the others and were left out" in report["headline"]["text"]
+
+
 def test_an_area_of_another_place_is_named(
     film: Path, filmed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

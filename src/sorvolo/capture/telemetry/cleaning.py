@@ -89,6 +89,10 @@ def clean(
     )
 
     keep = increasing(times)
+    if 2 * keep.sum() < len(keep) and (flipped := increasing(times[::-1])).sum() > keep.sum():
+        # the newest sample first
+        times, video, keep = times[::-1], video[::-1], flipped
+        table = {key: value[::-1] for key, value in table.items()}
     found += _clock_notices(times, keep)
     times, video = times[keep], video[keep]
     table = {key: value[keep] for key, value in table.items()}

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
+import numpy as np
+
 from sorvolo.capture.clock_offset import OffsetEstimate
 from sorvolo.missions.flight.log import FlightLog
 from sorvolo.missions.flight.setup import FlightSetup
@@ -22,6 +24,7 @@ _BAD_FIT_PX = 3.0  # median residual of a map's matches from which on it is warn
 _TURNED_DEG = 6.0  # by which all stated angles may be off without a word
 _MOST_RIVALS = 4  # clock offsets in a sentence
 _FAR_BETTER = 0.7  # of the misfit at the clock's own tie
+_MANY_JUMPS = 0.2  # share of the fixes: a receiver that starts loses fewer
 _MOVED = 0.3  # pictures that spread so many diagonals of a frame are not those of a hovering drone
 _GUESSED = 0.1  # relative: a focal length that is hardly known
 
@@ -148,6 +151,19 @@ def unlevelled(
     return [
         "the camera looked to the side, and without telemetry nothing shows where level ground is: this is no view "
         "from straight above"
+    ]
+
+
+def place_doubts(setup: FlightSetup) -> list[str]:
+    """Why the flight may be elsewhere: much of its log is, and that the longer part is right is a guess."""
+    telemetry = setup.source.telemetry
+    left_out = sum(each.count for each in telemetry.notices if each.code == "jump")
+    fixes = left_out + int(np.isfinite(telemetry["latitude_deg"]).sum())
+    if left_out <= _MANY_JUMPS * fixes:
+        return []
+    return [
+        f"{left_out} of its {fixes} positions are far from the others and were left out: cut the wrong ones out of the "
+        "log, and check the place"
     ]
 
 

@@ -15,6 +15,7 @@ from sorvolo.missions.flight.headline import (
     clock_doubts,
     flight_warnings,
     map_headline,
+    place_doubts,
     still_fixes,
     unlevelled,
 )
@@ -99,7 +100,7 @@ def build_report(
     if agreement.remarks and not 1 / _WRONG_HEIGHT < times < _WRONG_HEIGHT:
         agreement = replace(agreement, steps=(*agreement.steps, *agreement.remarks), remarks=())
     headline = {}
-    others = clock_doubts(setup, result.offset, settings.offset_s)
+    others = [*clock_doubts(setup, result.offset, settings.offset_s), *place_doubts(setup)]
     if result.makes_map:
         headline["headline"] = asdict(
             map_headline(
