@@ -1,7 +1,7 @@
 """Control point files in OpenDroneMap's form (gcp_list.txt): a CRS, then `x y z px py image [label]` a line."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from math import isfinite
 from pathlib import Path
@@ -146,7 +146,12 @@ def read_control_points(path: Path) -> ControlFile:
         raise InputError(f"{path}: nothing but comments; {_NEEDED} is needed")
     crs_words = numbered[0][1]
     _parsed_crs(crs_words, path)
-    lines = _labelled([_line(path, number, line) for number, line in numbered[1:]])
+    lines = [_line(path, number, line) for number, line in numbered[1:]]
+    names: dict[tuple[float, float], str] = {}  # of points without a label, by their coordinates
+    for k, each in enumerate(lines):
+        if not each.label:
+            label = names.setdefault((each.x, each.y), f"point {len(names) + 1}")
+            lines[k] = replace(each, label=label)
     if not lines:
         raise InputError(f"{path}: no control point after its first line; {_NEEDED} is needed")
     first: dict[str, _Line] = {}
@@ -255,17 +260,6 @@ def _line(path: Path, number: int, text: str) -> _Line:
     x, y, z, x_px, y_px = numbers
     image = fields[5].replace("\\", "/").rpartition("/")[2]
     return _Line(number, x, y, z, x_px, y_px, image, fields[6] if len(fields) > 6 else "")
-
-
-def _labelled(lines: Sequence[_Line]) -> list[_Line]:
-    """The lines, those without a label named "point N" by their coordinates."""
-    names: dict[tuple[float, float], str] = {}
-    return [
-        line
-        if line.label
-        else replace(line, label=names.setdefault((line.x, line.y), f"point {len(names) + 1}"))
-        for line in lines
-    ]
 
 
 def _parsed_crs(words: str, path: Path) -> CRS:

@@ -426,7 +426,15 @@ def _open_video(
     camera: Path | str | None,
     same_flight: Sequence[Path],
 ) -> VideoSource:
-    info = _video_info(path)
+    try:
+        info = read_video_info(path)
+    except InputError as error:
+        if is_telemetry(path):
+            raise InputError(
+                f"{path}: a telemetry file, no video or photo; give the flight's video or photos, and this file as "
+                "--telemetry"
+            ) from error
+        raise
     inside = _metadata_inside(path, info.container)
     found, notices = _video_telemetry(path, telemetry, inside, same_flight)
     stated = (
@@ -463,18 +471,6 @@ def _metadata_inside(path: Path, container: str) -> FileMetadata | None:
         return read_klv_file(path)
     telemetry = read_gpmf_file(path) if container == "mov" else None
     return None if telemetry is None else FileMetadata(telemetry, None, float("nan"))
-
-
-def _video_info(path: Path) -> VideoInfo:
-    try:
-        return read_video_info(path)
-    except InputError as error:
-        if is_telemetry(path):
-            raise InputError(
-                f"{path}: a telemetry file, no video or photo; give the flight's video or photos, and this file as "
-                "--telemetry"
-            ) from error
-        raise
 
 
 def _telemetry_file(telemetry: Path | str | None, *, is_live: bool) -> Path | None:

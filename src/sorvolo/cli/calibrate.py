@@ -10,7 +10,7 @@ from sorvolo.cli.printing import Console, print_json
 from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
-    from sorvolo.capture.checkerboard import Calibration
+    pass
 
 
 def calibrate(
@@ -42,7 +42,23 @@ def calibrate(
         result = calibrate_camera(looked, chessboard)
     write_calibration(out, result)
     if as_json:
-        print_json(_as_json(result, out))
+        print_json(
+            {
+                "written": str(out),
+                "width_px": result.camera.width_px,
+                "height_px": result.camera.height_px,
+                "camera_matrix": result.camera.matrix.tolist(),
+                "distortion": dict(
+                    zip(("k1", "k2", "p1", "p2", "k3"), result.camera.distortion.tolist())
+                ),
+                "reprojection_error_px": result.reprojection_error_px,
+                "focal_sigma": result.focal_sigma,
+                "view_errors_px": result.view_errors_px,
+                "dropped": list(result.dropped),
+                "tilt_spread_deg": result.tilt_spread_deg,
+                "coverage": result.coverage,
+            }
+        )
     else:
         camera, table = result.camera, Table("view", "error, px", title="Reprojection error")
         for name, error_px in result.view_errors_px.items():
@@ -60,20 +76,3 @@ def calibrate(
             f"reprojection error {result.reprojection_error_px:.3f} px rms over {len(result.view_errors_px)} views; tilts "
             f"differ by up to {result.tilt_spread_deg:.0f} deg; {result.coverage:.0%} of the picture covered"
         )
-
-
-def _as_json(result: "Calibration", out: Path) -> dict[str, object]:
-    camera = result.camera
-    return {
-        "written": str(out),
-        "width_px": camera.width_px,
-        "height_px": camera.height_px,
-        "camera_matrix": camera.matrix.tolist(),
-        "distortion": dict(zip(("k1", "k2", "p1", "p2", "k3"), camera.distortion.tolist())),
-        "reprojection_error_px": result.reprojection_error_px,
-        "focal_sigma": result.focal_sigma,
-        "view_errors_px": result.view_errors_px,
-        "dropped": list(result.dropped),
-        "tilt_spread_deg": result.tilt_spread_deg,
-        "coverage": result.coverage,
-    }

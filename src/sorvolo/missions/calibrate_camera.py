@@ -13,7 +13,7 @@ from sorvolo.capture.checkerboard import (
     calibrate,
     find_board,
 )
-from sorvolo.capture.source import Source, open_sources
+from sorvolo.capture.source import open_sources
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.paths import AnyPath, Inputs, listed
 from sorvolo.store.atomic import atomic_write_bytes
@@ -50,7 +50,11 @@ def find_views(inputs: Inputs, board: Board) -> Iterator[Looked]:
     files = [Path(each) for each in listed(inputs)]
     size_px = (0, 0)
     for source in open_sources(files):
-        step = _step(source)
+        step = 1  # every photo is looked at
+        if source.kind != "photos":
+            step = max(
+                1, round(source.frame_rate_hz / _LOOKS_PER_S), source.frame_count // _MOST_LOOKED_AT
+            )
         for frame in source.frames(lambda index, _, step=step: index % step == 0):  # type: ignore[misc]
             if isinstance(frame, LostFrame):
                 continue
@@ -87,10 +91,3 @@ def write_calibration(path: AnyPath, calibration: Calibration) -> None:
         focal_sigma=calibration.focal_sigma,
     )
     atomic_write_bytes(path, text.encode())
-
-
-def _step(source: Source) -> int:
-    """Every how many frames a video is looked at; every photo is."""
-    if source.kind == "photos":
-        return 1
-    return max(1, round(source.frame_rate_hz / _LOOKS_PER_S), source.frame_count // _MOST_LOOKED_AT)

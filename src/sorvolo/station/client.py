@@ -259,7 +259,16 @@ class StreamClient:
     def _judge(self, error: Exception) -> None:
         """Note why there is no link. Raises InputError where trying again is no use."""
         if isinstance(error, InvalidStatus):
-            self._judge_status(error.response.status_code)
+            status = error.response.status_code
+            if status in (401, 403):
+                raise InputError(
+                    f"the station at {self._url} refuses the token (HTTP {status}); make one with the role operate "
+                    "there: sorvolo token, and give it as --token or SORVOLO_TOKEN"
+                )
+            if status in (404, 405, 421):
+                raise InputError(
+                    f"{self._url}: no station takes streams there (HTTP {status}); check --to"
+                )
         if isinstance(error, InvalidURI):
             raise InputError(f"{self._url}: no address of a station ({error})") from error
         close = error.rcvd if isinstance(error, ConnectionClosed) else None
@@ -273,18 +282,6 @@ class StreamClient:
         self.report.words = (
             (close.reason if close is not None else "") or str(error) or type(error).__name__
         )
-
-    def _judge_status(self, status: int) -> None:
-        """Raises InputError for an answer that stays the same."""
-        if status in (401, 403):
-            raise InputError(
-                f"the station at {self._url} refuses the token (HTTP {status}); make one with the role operate there: "
-                "sorvolo token, and give it as --token or SORVOLO_TOKEN"
-            )
-        if status in (404, 405, 421):
-            raise InputError(
-                f"{self._url}: no station takes streams there (HTTP {status}); check --to"
-            )
 
     def _came_back(self, outage_s: float, *, is_first: bool) -> None:
         """Whatever was taken without a link is sent, late as it is."""

@@ -194,7 +194,16 @@ def checked_stream(
     found = (resolve or _resolved)(host, port or 554)
     if not found:
         raise _refused(f"the host {host[:100]} is not known")
-    _demand_allowed(host, found, [ipaddress.ip_network(each, strict=False) for each in ranges])
+    allowed = [ipaddress.ip_network(each, strict=False) for each in ranges]
+    for text in found:
+        address = _plain(ipaddress.ip_address(text.partition("%")[0]))
+        named = any(address.version == each.version and address in each for each in allowed)
+        is_ours = address.is_multicast or address.is_reserved or address.is_unspecified
+        if not named and (is_ours or not address.is_global):
+            raise _refused(
+                f"{host[:100]} lies in this machine's own or a private network; whoever runs the station may allow it "
+                f"with --stream-from {ipaddress.ip_network(address)}"
+            )
     return urlunsplit(parts._replace(netloc=_netloc(parts.netloc, found[0], port)))
 
 
@@ -208,19 +217,6 @@ def _parts(url: str) -> tuple[SplitResult, int | None]:
     if any(each in url for each in "\r\n\t\\ \0") or not url.isascii():
         raise _refused("this is no address of a stream")
     return parts, port
-
-
-def _demand_allowed(host: str, found: Sequence[str], allowed: Sequence[Network]) -> None:
-    """Raise Problem (400) unless every address of a host is public, or in a network that the station may call."""
-    for text in found:
-        address = _plain(ipaddress.ip_address(text.partition("%")[0]))
-        named = any(address.version == each.version and address in each for each in allowed)
-        is_ours = address.is_multicast or address.is_reserved or address.is_unspecified
-        if not named and (is_ours or not address.is_global):
-            raise _refused(
-                f"{host[:100]} lies in this machine's own or a private network; whoever runs the station may allow it "
-                f"with --stream-from {ipaddress.ip_network(address)}"
-            )
 
 
 def _waited_for(url: str, scheme: str, port: int | None) -> str:

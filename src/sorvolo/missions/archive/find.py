@@ -28,7 +28,12 @@ def find_place(
     """
     if not root.is_dir():
         raise InputError(f"{root} is not a folder; give the one that holds the site folders")
-    latitude_deg, longitude_deg = _degrees(at)
+    try:
+        latitude_deg, longitude_deg = (float(each) for each in at.split(","))
+    except ValueError as error:
+        raise SettingsError(
+            f"--at {at!r}: give latitude and longitude in degrees, such as 46.5,13.25"
+        ) from error
     place = Place(
         latitude_deg,
         longitude_deg,
@@ -39,16 +44,6 @@ def find_place(
     )
     with ArchiveIndex.open(root, write=False) as index:
         return index.find(place)
-
-
-def _degrees(text: str) -> tuple[float, float]:
-    try:
-        latitude_deg, longitude_deg = (float(each) for each in text.split(","))
-    except ValueError as error:
-        raise SettingsError(
-            f"--at {text!r}: give latitude and longitude in degrees, such as 46.5,13.25"
-        ) from error
-    return latitude_deg, longitude_deg
 
 
 def _nanoseconds(text: str, of_day: time) -> int:

@@ -81,7 +81,12 @@ def compare_flights(
     area = as_path(area)
     steps = as_path(steps)
     if steps is not None:
-        _check_steps(steps, site, settings)
+        if settings.method is None:
+            raise SettingsError("the robust method shows no steps: choose another --method as well")
+        if steps.resolve().is_relative_to(site.resolve()):
+            raise SettingsError(
+                f"{steps} lies in the site folder {site}, which is sorvolo's own; name another folder"
+            )
     wanted = None if area is None else read_area(area)
     with Archive.open(site, write=False) as archive:
         _check_map(archive, site, settings)
@@ -130,16 +135,6 @@ def compare_flights(
             yield from _compare_one(flight, archive, own, wanted, steps, looks, base)
             outcomes.append(outcome_of(archive, flight.setup.source.name))
         return tuple(outcomes)
-
-
-def _check_steps(steps: Path, site: Path, settings: CompareSettings) -> None:
-    """Raise SettingsError where the intermediate pictures cannot be made, or not there."""
-    if settings.method is None:
-        raise SettingsError("the robust method shows no steps: choose another --method as well")
-    if steps.resolve().is_relative_to(site.resolve()):
-        raise SettingsError(
-            f"{steps} lies in the site folder {site}, which is sorvolo's own; name another folder"
-        )
 
 
 def _check_map(archive: Archive, site: Path, settings: CompareSettings) -> None:

@@ -1,7 +1,7 @@
 """A few pictures of a flight, spread over it."""
 
 from collections.abc import Iterator
-from itertools import islice
+from itertools import chain, islice
 
 import cv2
 import numpy as np
@@ -46,21 +46,14 @@ def _spread_photos(source: Source) -> Iterator[Frame]:
     )
 
 
-def _spread_frames(source: Source) -> Iterator[Frame]:
-    """Frames of a recorded flight, one at first: that is nearly always enough."""
-    if isinstance(source, VideoSource):
-        yield from source.sample_frames(1)
-        yield from source.sample_frames(_SAMPLES)
-    else:
-        yield from _spread_photos(source)
-
-
 def refuse_without_texture(source: Source) -> None:
     """Raise InputError for a recorded flight whose sample frames all show one gray, or noise alone."""
     if isinstance(source, LiveSource):
         return
-    seen = 0
-    for frame in _spread_frames(source):
+    seen, spread = 0, _spread_photos(source)
+    if isinstance(source, VideoSource):  # one at first: that is nearly always enough
+        spread = chain.from_iterable(map(source.sample_frames, (1, _SAMPLES)))
+    for frame in spread:
         if has_texture(frame.image):
             return
         seen += 1

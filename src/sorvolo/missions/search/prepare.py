@@ -186,7 +186,12 @@ def prepare_search(
     """
     if outputs.folder.exists() and not outputs.folder.is_dir():
         raise SettingsError(f"--out {outputs.folder} is a file, a folder was needed")
-    _check_writable(outputs.folder)
+    with writing(outputs.folder):
+        there = next(
+            each for each in (outputs.folder, *outputs.folder.absolute().parents) if each.exists()
+        )
+        with scratch_folder(there):
+            pass
     check_waypoint_files(outputs.refly, outputs.folder, outputs.dji_drone)
     _check_apart(outputs)
     area = None if outputs.area is None else read_area(outputs.area)
@@ -256,14 +261,6 @@ def _by_difference(source: Source, m_per_px: float | None) -> list[CutOut | None
         CutOut.of(frame.name, image, alpha, m_per_px * times, light)
         for frame, image, alpha, light in zip(frames, images, alphas, lights)
     ]
-
-
-def _check_writable(folder: Path) -> None:
-    """Raise StoreError where the folder, or those that it would lie in, cannot be written; nothing stays behind."""
-    with writing(folder):
-        there = next(each for each in (folder, *folder.absolute().parents) if each.exists())
-        with scratch_folder(there):
-            pass
 
 
 def _check_apart(outputs: SearchOutputs) -> None:

@@ -138,10 +138,18 @@ def correct_telemetry(
         with opened_sources([source], telemetry, camera) as sources:
             opened = sources[0]
             name = _flight(archive, flight or opened.name)
-            _check_same(archive, name, opened, source)
+            mapped = archive.report(name)
+            # a live source has no file that it could be recognised by
+            if _mapped(archive)[name] != opened.fingerprint and not mapped.get("delay_s"):
+                first = next(iter(mapped.get("inputs") or ()), "another file")
+                if first == opened.inputs[0]:
+                    first = "another file of that name"
+                raise InputError(
+                    f"{source} is of another flight: {name} of {archive.folder} was mapped from {first}. Give that, or leave "
+                    "--flight out for a flight of its own"
+                )
             _check_folder(folder, name, site)
             seen = None if watched is None else _detections(Path(watched), opened)
-            mapped = archive.report(name)
             asked = MapSettings(offset_s=_clock(mapped)[1])
             setup = prepare(opened, asked, site, telemetry_named=telemetry is not None)
             solved = _solved(archive, name, _first_ns(setup))
@@ -182,19 +190,6 @@ def _flight(archive: Archive, wanted: str) -> str:
             f"{archive.folder} has the flights {', '.join(known)}; choose one with --flight"
         )
     return wanted or known[0]
-
-
-def _check_same(archive: Archive, name: str, source: Source, given: Path) -> None:
-    """Raise InputError for the source of another flight. A live one has no file that it could be recognised by."""
-    report = archive.report(name)
-    if _mapped(archive)[name] != source.fingerprint and not report.get("delay_s"):
-        first = next(iter(report.get("inputs") or ()), "another file")
-        if first == source.inputs[0]:
-            first = "another file of that name"
-        raise InputError(
-            f"{given} is of another flight: {name} of {archive.folder} was mapped from {first}. Give that, or leave "
-            "--flight out for a flight of its own"
-        )
 
 
 def _earlier(folder: Path) -> dict[str, Any]:

@@ -375,7 +375,17 @@ class FolderEnd:
         if self._catalogues is not None and not is_site(self.folder):
             create_database(self.folder, self._catalogues)
         if catalogue.is_file():
-            _overwrite_catalogue(catalogue, state.catalogue)
+            try:
+                with (
+                    closing(sqlite3.connect(state.catalogue)) as new,
+                    closing(sqlite3.connect(catalogue, timeout=30)) as old,
+                ):
+                    new.backup(old)
+                    old.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+            except sqlite3.Error as error:
+                raise StoreError(
+                    f"cannot write {catalogue} ({error}); free some space and run the copy again"
+                ) from error
         elif is_site(self.folder):
             # The same for a catalogue in a PostgreSQL database.
             with (
@@ -474,21 +484,6 @@ def _copy_catalogue(catalogue: Catalogue, path: Path) -> None:
             raise StoreError(
                 f"cannot write {path} ({error}); free some space and run it again"
             ) from error
-
-
-def _overwrite_catalogue(path: Path, new: Path) -> None:
-    """Replace what a catalogue holds, in one transaction: readers see the old state or the new one."""
-    try:
-        with (
-            closing(sqlite3.connect(new)) as source,
-            closing(sqlite3.connect(path, timeout=30)) as target,
-        ):
-            source.backup(target)
-            target.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-    except sqlite3.Error as error:
-        raise StoreError(
-            f"cannot write {path} ({error}); free some space and run the copy again"
-        ) from error
 
 
 def copy_rows(source: Connection, target: Connection) -> None:

@@ -401,7 +401,16 @@ def coco_document(
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
     for index, picture in enumerate(labelled.pictures):
-        images.append(_image_row(picture, index + 1, folder))
+        image: dict[str, Any] = {
+            "id": index + 1,
+            "file_name": _relative(picture.path, folder),
+            "width": picture.width_px,
+            "height": picture.height_px,
+            "flight": picture.group,
+        }
+        if isfinite(picture.m_per_px):
+            image["m_per_px"] = round(picture.m_per_px, 6)
+        images.append(image)
         for row, (box, label) in enumerate(zip(picture.boxes_px, picture.labels)):
             annotation = _annotation(box, int(label), index + 1, 0)
             if scores is not None:
@@ -476,17 +485,6 @@ def write_yolo_names(folder: Path, classes: Iterable[str]) -> None:
     numbered = [f"  {number}: '{name}'" for number, name in enumerate(quoted)]
     lines = ["path: .", "train: images", "val: images", "names:", *numbered]
     atomic_write_bytes(folder / "data.yaml", ("\n".join(lines) + "\n").encode(), durable=False)
-
-
-def _image_row(picture: LabelledPicture, image_id: int, folder: Path) -> dict[str, Any]:
-    row: dict[str, Any] = {
-        "id": image_id,
-        "file_name": _relative(picture.path, folder),
-        "width": picture.width_px,
-        "height": picture.height_px,
-        "flight": picture.group,
-    }
-    return row | ({"m_per_px": round(picture.m_per_px, 6)} if isfinite(picture.m_per_px) else {})
 
 
 def _annotation(

@@ -463,22 +463,16 @@ def _insert(
     for start in range(0, len(rows), _AT_ONCE):
         connection.execute(insert(kept), rows[start : start + _AT_ONCE])
     if connection.dialect.name == "sqlite":
-        _add_boxes(
-            connection,
-            kept,
-            {first + k: place for k, place in enumerate(places) if place is not None},
-        )
+        boxes = [
+            (first + k, west, east, south, north)
+            for k, place in enumerate(places)
+            if place is not None
+            for west, south, east, north in [place.bounds]
+        ]
+        if boxes:
+            values = f"INSERT INTO {kept.name}_places VALUES (?, ?, ?, ?, ?)"
+            connection.exec_driver_sql(values, boxes)
     return first
-
-
-def _add_boxes(connection: Connection, kept: Table, places: Mapping[int, BaseGeometry]) -> None:
-    boxes = [
-        (number, west, east, south, north)
-        for number, place in places.items()
-        for west, south, east, north in [place.bounds]
-    ]
-    if boxes:
-        connection.exec_driver_sql(f"INSERT INTO {kept.name}_places VALUES (?, ?, ?, ?, ?)", boxes)
 
 
 def _drop_flights(connection: Connection, which: ColumnElement[bool]) -> None:

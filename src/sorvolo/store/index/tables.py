@@ -120,7 +120,18 @@ for _table in (objects, changes):
 def make_index(connection: Connection) -> None:
     """The empty tables, inside the caller's transaction. Raises StoreError for a PostgreSQL without PostGIS."""
     if connection.dialect.name != "sqlite":
-        _demand_postgis(connection)
+        place = connection.execute(
+            text(
+                "SELECT nspname FROM pg_extension JOIN pg_namespace ON pg_namespace.oid = extnamespace "
+                "WHERE extname = 'postgis'"
+            )
+        ).scalar()
+        if place != "public":
+            found = "no PostGIS" if place is None else f"PostGIS in the schema {place}"
+            raise StoreError(
+                f"the database has {found}; the archive index needs it in the schema public: install it (Debian: "
+                "postgresql-postgis) and have an administrator run CREATE EXTENSION postgis SCHEMA public there"
+            )
     metadata.create_all(connection)
     if (
         connection.dialect.name != "sqlite"
@@ -141,18 +152,3 @@ def make_index(connection: Connection) -> None:
 
 
 LAYOUT = DatabaseLayout(_APPLICATION_ID, make_index, beside="public", page_bytes=16_384)
-
-
-def _demand_postgis(connection: Connection) -> None:
-    place = connection.execute(
-        text(
-            "SELECT nspname FROM pg_extension JOIN pg_namespace ON pg_namespace.oid = extnamespace "
-            "WHERE extname = 'postgis'"
-        )
-    ).scalar()
-    if place != "public":
-        found = "no PostGIS" if place is None else f"PostGIS in the schema {place}"
-        raise StoreError(
-            f"the database has {found}; the archive index needs it in the schema public: install it (Debian: "
-            "postgresql-postgis) and have an administrator run CREATE EXTENSION postgis SCHEMA public there"
-        )

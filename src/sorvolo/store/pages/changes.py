@@ -93,7 +93,14 @@ def changes_page(
         is_many=len(changes) > _MANY,
         before_words=before_words,
         after_words=after_words,
-        map=_map(*shown) if shown else None,
+        map={
+            "before": picture_uri(shown[0].rgba),
+            "after": picture_uri(shown[1].rgba),
+            "width": shown[1].rgba.shape[1],
+            "height": shown[1].rgba.shape[0],
+        }
+        if shown
+        else None,
         coverage=coverage_shapes(coverage, site, shown[1]) if shown and not site.is_local else (),
         gap_rows=gap_rows(coverage),
         size_rows=() if site.is_local else size_rows(coverage),
@@ -174,16 +181,6 @@ def _listed(
             _crop(rgba, change, when, most_bytes) for when, rgba in zip(("before", "after"), crops)
         ),
     )
-
-
-def _map(before: Picture, after: Picture) -> dict[str, Any]:
-    height_px, width_px = after.rgba.shape[:2]
-    return {
-        "before": picture_uri(before.rgba),
-        "after": picture_uri(after.rgba),
-        "width": width_px,
-        "height": height_px,
-    }
 
 
 def _cells(change: StoredChange, site: Site) -> tuple[tuple[str, str], ...]:

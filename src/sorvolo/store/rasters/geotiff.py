@@ -221,7 +221,19 @@ def write_cog(
         with rasterio.open(_pyramid(plain, filled), driver="VRT") as source:
             rasterio.shutil.copy(source, temporary, **options)
         with rasterio.open(plain, driver="GTiff") as source:
-            _verify(temporary, source, is_jpeg=is_jpeg)
+            with rasterio.open(temporary, driver="GTiff") as written:
+                if (written.width, written.height, written.count) != (
+                    source.width,
+                    source.height,
+                    3 if is_jpeg else 4,
+                ):
+                    raise StoreError(_differs(temporary))
+                # the last block lies last in the file: a cut file cannot give it
+                windows = [window for _, window in written.block_windows(1)]
+                for window in _spread(windows, _VERIFIED_BLOCKS):
+                    read, wanted = written.read(window=window), source.read(window=window)
+                    if not (_is_close(read, wanted) if is_jpeg else np.array_equal(read, wanted)):
+                        raise StoreError(_differs(temporary))
 
 
 def write_mbtiles_or_pdf(
@@ -444,22 +456,6 @@ def _halved(larger: Path, path: Path, filled: set[TileIndex] | None) -> Path | N
                 halved = shrink(np.ascontiguousarray(rgba), small.width, small.height)
                 sink.write(_bands(halved), window=small)
     return path
-
-
-def _verify(path: Path, source: rasterio.DatasetReader, *, is_jpeg: bool) -> None:
-    with rasterio.open(path, driver="GTiff") as written:
-        if (written.width, written.height, written.count) != (
-            source.width,
-            source.height,
-            3 if is_jpeg else 4,
-        ):
-            raise StoreError(_differs(path))
-        # the last block lies last in the file: a cut file cannot give it
-        windows = [window for _, window in written.block_windows(1)]
-        for window in _spread(windows, _VERIFIED_BLOCKS):
-            read, wanted = written.read(window=window), source.read(window=window)
-            if not (_is_close(read, wanted) if is_jpeg else np.array_equal(read, wanted)):
-                raise StoreError(_differs(path))
 
 
 def _is_close(read: NDArray[np.uint8], wanted: NDArray[np.uint8]) -> bool:

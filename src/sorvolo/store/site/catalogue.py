@@ -537,7 +537,25 @@ def load_keyframes(connection: Connection, flight_id: str | None) -> list[Stored
     rows = schema.checked_rows(
         connection, schema.keyframes, query.order_by(schema.keyframes.c.frame_index)
     )
-    return [_keyframe_of(row) for row in rows]
+    return [
+        StoredKeyframe(
+            row.flight_id,
+            row.frame_index,
+            row.name,
+            row.time_ns,
+            Status(row.status),
+            checked_image_path(row.image_path, row.flight_id),
+            checked_sha256(row.sha256),
+            Camera(**row.camera),
+            np.array(row.site_from_image, np.float64).reshape(3, 3),
+            Pose(row.rotation, row.translation_m) if row.rotation else None,
+            np.array(row.gains, np.float64),
+            np.nan if row.sigma_m is None else row.sigma_m,
+            np.nan if row.residual_px is None else row.residual_px,
+            np.array(row.vignette, np.float64),
+        )
+        for row in rows
+    ]
 
 
 def file_hashes(connection: Connection) -> dict[str, str]:
@@ -645,22 +663,3 @@ def _row_of(keyframe: StoredKeyframe, run_id: int) -> dict[str, Any]:
         "rotation": [] if pose is None else pose.rotation.tolist(),
         "translation_m": [] if pose is None else pose.translation_m.tolist(),
     }
-
-
-def _keyframe_of(row: Row[Any]) -> StoredKeyframe:
-    return StoredKeyframe(
-        row.flight_id,
-        row.frame_index,
-        row.name,
-        row.time_ns,
-        Status(row.status),
-        checked_image_path(row.image_path, row.flight_id),
-        checked_sha256(row.sha256),
-        Camera(**row.camera),
-        np.array(row.site_from_image, np.float64).reshape(3, 3),
-        Pose(row.rotation, row.translation_m) if row.rotation else None,
-        np.array(row.gains, np.float64),
-        np.nan if row.sigma_m is None else row.sigma_m,
-        np.nan if row.residual_px is None else row.residual_px,
-        np.array(row.vignette, np.float64),
-    )

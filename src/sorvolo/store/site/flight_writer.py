@@ -260,7 +260,11 @@ class FlightWriter:
         """
         if crs is not None:
             parse_crs(crs, self._files.site_grid().grid)
-        keyframes = self._keyframes(placed, image_paths)
+        keyframes = [
+            self.keyframe(frame, image_paths[frame.index])
+            for frame in placed
+            if frame.index in image_paths and frame.status is not Status.REJECTED
+        ]
         site = self._files.site()
         found = change_records.stored_changes(self._flight_id, changes or ())
         texts = {
@@ -353,13 +357,3 @@ class FlightWriter:
 
     def _image_path(self, index: int) -> str:
         return f"flights/{self._flight_id}/keyframes/{self._run_id}/{index:06d}.jpg"
-
-    def _keyframes(
-        self, placed: Sequence[PlacedFrame], image_paths: Mapping[int, str]
-    ) -> list[StoredKeyframe]:
-        """The frames with a saved picture that the map did not reject."""
-        return [
-            self.keyframe(frame, image_paths[frame.index])
-            for frame in placed
-            if frame.index in image_paths and frame.status is not Status.REJECTED
-        ]

@@ -128,8 +128,16 @@ def remove_unused(files: "Archive") -> None:
     files.blobs.remove(files.blobs.stored() - used)
     for path in (files.live_preview_path, files.live_coverage_path):
         path.unlink(missing_ok=True)
-    for flight in over:
-        _remove_unused_pictures(flight, {str(run_id) for run_id in runs.get(flight.name, set())})
+    for flight in (
+        over
+    ):  # pictures of runs that are not known go, then folders of the flight that this empties
+        known = {str(run_id) for run_id in runs.get(flight.name, set())}
+        for images in (*(flight / "keyframes").glob("*"), *(flight / STAGED).glob("*")):
+            if images.name.isdigit() and images.name not in known:
+                shutil.rmtree(images, ignore_errors=True)
+        for emptied in (flight / STAGED, *(() if known else (flight / "keyframes", flight))):
+            if emptied.is_dir() and not any(emptied.iterdir()):
+                emptied.rmdir()
 
 
 def forget_journals(files: "Archive", kept: Path | None = None) -> None:
@@ -142,16 +150,6 @@ def forget_journals(files: "Archive", kept: Path | None = None) -> None:
 def stopped_flights(files: "Archive") -> list[str]:
     """The flights whose runs were stopped before they were complete."""
     return [each.name for each in files.flight_folders() if (each / JOURNAL).is_file()]
-
-
-def _remove_unused_pictures(flight: Path, known_runs: set[str]) -> None:
-    """Delete the pictures of runs that are not known, then folders of the flight that this emptied."""
-    for images in (*(flight / "keyframes").glob("*"), *(flight / STAGED).glob("*")):
-        if images.name.isdigit() and images.name not in known_runs:
-            shutil.rmtree(images, ignore_errors=True)
-    for emptied in (flight / STAGED, *(() if known_runs else (flight / "keyframes", flight))):
-        if emptied.is_dir() and not any(emptied.iterdir()):
-            emptied.rmdir()
 
 
 def _write_flight_files(files: "Archive", owed: OwedFiles) -> None:
