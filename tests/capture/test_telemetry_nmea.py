@@ -194,6 +194,15 @@ def test_no_fix_shows_nothing():
         nmea.read(gga("120002", 48.1, 11.5, quality=0).encode(), "a.log")
 
 
+@pytest.mark.parametrize("letter", ["N", "W"])
+def test_a_position_without_its_letter_is_none(letter):
+    """It would be north or east without a word."""
+    bodies = [gga(f"12000{k}.00", 41.9 + 1e-5 * k, -12.5) for k in range(4)]
+    without = [sentence(each[1:].partition("*")[0].replace(f",{letter},", ",,")) for each in bodies]
+    telemetry = nmea.read("".join(without).encode(), "a.nmea")
+    assert not telemetry.has_fixes and codes(telemetry)["no_fix"] == 4
+
+
 def test_null_island_is_no_place():
     telemetry = nmea.read((gga("115959", 0.0, 0.0) + flight(2)).encode(), "a.log")
     assert np.isnan(telemetry["latitude_deg"][0])

@@ -61,7 +61,7 @@ def _show_rows(rows: Sequence[JsonView]) -> None:
         table.add_row(
             escape(row["name"]),
             escape(row["preset"]),
-            escape(", ".join(_classes(row))),
+            escape(", ".join(f"{each}{_when(row, each)}" for each in row["classes"])),
             _light(row),
             row["precision"],
             f"{row['bytes'] / 1e6:.1f}",
@@ -255,13 +255,11 @@ def _row(model: "InstalledModel") -> Json:
         return row | {"error": f"{error}"}
 
 
-def _classes(facts: JsonView) -> list[str]:
-    """The classes of a model, with a word on those that are not reported in every picture."""
+def _when(facts: JsonView, name: str) -> str:
+    """A word on a class that is not reported in every picture."""
     if facts["second_only"]:
-        return [f"{name} (in other models' reports)" for name in facts["classes"]]
-    return [
-        f"{name} (on request)" if name in facts["on_request"] else name for name in facts["classes"]
-    ]
+        return " (in other models' reports)"
+    return " (on request)" if name in facts["on_request"] else ""
 
 
 def _meaning(info: "ModelInfo") -> str:

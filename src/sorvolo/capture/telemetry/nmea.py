@@ -134,8 +134,8 @@ def epochs_of(messages: list[Any]) -> tuple[list[Epoch], bool]:
             epoch.has_fix &= getattr(message, "quality", 0) != 0
             altitude_m, separation_m = _number(message, "alt"), _number(message, "sep")
             values = {
-                "latitude_deg": _number(message, "lat"),
-                "longitude_deg": _number(message, "lon"),
+                "latitude_deg": _degrees(message, "lat", "NS"),
+                "longitude_deg": _degrees(message, "lon", "EW"),
                 "orthometric_height_m": altitude_m,
                 "ellipsoidal_height_m": altitude_m + separation_m,
                 "horizontal_sigma_m": sigma_from_hdop_m(_number(message, "HDOP")),
@@ -148,8 +148,8 @@ def epochs_of(messages: list[Any]) -> tuple[list[Epoch], bool]:
             }
             if "GGA" not in epoch.kinds:
                 values |= {
-                    "latitude_deg": _number(message, "lat"),
-                    "longitude_deg": _number(message, "lon"),
+                    "latitude_deg": _degrees(message, "lat", "NS"),
+                    "longitude_deg": _degrees(message, "lon", "EW"),
                 }
         epoch.values |= values
     for epoch in epochs:
@@ -166,6 +166,11 @@ def _is_valid(message: Any) -> bool:
 def _number(message: Any, attribute: str) -> float:
     value = getattr(message, attribute, "")  # fields that are empty or not sent come as ""
     return float(value) if isinstance(value, int | float) else float("nan")
+
+
+def _degrees(message: Any, attribute: str, letter: str) -> float:
+    """A coordinate; NaN for one without its N, S, E or W, whose sign nobody knows."""
+    return _number(message, attribute) if getattr(message, letter, "") else float("nan")
 
 
 def _time_of_day_ns(message: Any) -> int:

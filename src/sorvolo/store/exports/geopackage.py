@@ -149,7 +149,12 @@ def _columns(features: Sequence[Feature]) -> dict[str, str]:
                 kinds = found.setdefault(spelled.setdefault(name.lower(), name), set())
                 if value is not None:
                     kinds.add(_sql_type(value))
-    return {name: _common_type(kinds) for name, kinds in found.items()}
+    mixed = {
+        name: "REAL" if kinds == {"INTEGER", "REAL"} else "TEXT" for name, kinds in found.items()
+    }
+    return mixed | {
+        name: kind for name, kinds in found.items() if len(kinds) == 1 for kind in kinds
+    }
 
 
 def _sql_type(value: object) -> str:
@@ -169,12 +174,6 @@ def _moment(text: str) -> str | None:
     except (ValueError, OverflowError):  # digits of no day or hour, as names may have them
         return None
     return moment.strftime("%Y-%m-%dT%H:%M:%S.") + f"{moment.microsecond // 1000:03d}Z"
-
-
-def _common_type(kinds: set[str]) -> str:
-    if len(kinds) == 1:
-        return next(iter(kinds))
-    return "REAL" if kinds == {"INTEGER", "REAL"} else "TEXT"
 
 
 def _plain(value: object, sql: str) -> object:

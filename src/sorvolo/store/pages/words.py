@@ -161,7 +161,7 @@ def _environment(package: str) -> Environment:
     )
     environment.filters |= {
         "px": "{:.1f}".format,
-        "percent": _percent,
+        "percent": lambda share: f"{100 * share if math.isfinite(share) else 0:.2f}%",
         "known": known,
         "unit": with_unit,
         "metres": length_words,
@@ -172,8 +172,3 @@ def _environment(package: str) -> Environment:
     }
     environment.globals |= {"plural": plural, "join_words": join_words}
     return environment
-
-
-def _percent(share: float) -> str:
-    """A width in a style; 0 for an unknown share."""
-    return f"{100 * share if math.isfinite(share) else 0:.2f}%"

@@ -6,7 +6,7 @@ from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, Row, delete, select
+from sqlalchemy import Connection, delete, select
 
 from sorvolo.findings.register import (
     GroundFinding,
@@ -67,7 +67,20 @@ def load_findings(
             table.c.east_m.between(float(low_m[0]), float(high_m[0])),
             table.c.north_m.between(float(low_m[1]), float(high_m[1])),
         )
-    return [_finding_of(row) for row in schema.checked_rows(connection, table, query)]
+    found = []
+    for row in schema.checked_rows(connection, table, query):
+        position_m, sigma_m, class_sums = row.properties["kept"]
+        finding = GroundFinding(
+            row.id,
+            tuple(_sighting_of(each) for each in row.properties["sightings"]),
+            frozen(position_m),
+            _number(sigma_m),
+            frozen([row.east_m, row.north_m]),
+            class_sums,
+            row.gone,
+        )
+        found.append(finding)
+    return found
 
 
 def register_flight(connection: Connection, flight_id: str) -> None:
@@ -216,19 +229,6 @@ def _row_of(found: GroundFinding) -> dict[str, Any]:
         "gone": found.gone,
         "properties": plain_json({"kept": kept, "sightings": seen}),
     }
-
-
-def _finding_of(row: Row[Any]) -> GroundFinding:
-    position_m, sigma_m, class_sums = row.properties["kept"]
-    return GroundFinding(
-        row.id,
-        tuple(_sighting_of(each) for each in row.properties["sightings"]),
-        frozen(position_m),
-        _number(sigma_m),
-        frozen([row.east_m, row.north_m]),
-        class_sums,
-        row.gone,
-    )
 
 
 def _sighting_of(values: Sequence[Any]) -> MissionSighting:
