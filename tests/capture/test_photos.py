@@ -178,6 +178,8 @@ def test_padded_texts_and_focal_lengths(tmp_path: Path) -> None:
         {GPS.GPSLatitude: (IFDRational(0, 0), IFDRational(0, 0), IFDRational(0, 0))},
         {GPS.GPSLatitude: (IFDRational(46, 1), IFDRational(30, 0), IFDRational(1, 1))},
         {GPS.GPSLatitude: (IFDRational(146, 1), IFDRational(0, 1), IFDRational(0, 1))},
+        {GPS.GPSLatitude: (IFDRational(46, 1), IFDRational(75, 1), IFDRational(0, 1))},
+        {GPS.GPSLatitude: (IFDRational(465, 10), IFDRational(30, 1), IFDRational(0, 1))},
     ],
 )
 def test_zero_denominators_and_impossible_places_are_no_place(

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
+from itertools import pairwise
 from math import copysign, cos, hypot, isfinite, nan, radians
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -395,7 +396,9 @@ def _size_deg(parts: Any) -> tuple[float, bool]:
     numbers = (
         [_number(part) for part in parts] if isinstance(parts, (tuple, list)) else [_number(parts)]
     )
-    if not 1 <= len(numbers) <= 3:
+    # 75 minutes, and 41.89 degrees with 53 minutes beside them, are no place that anyone meant
+    doubled = any(number % 1 and after for number, after in pairwise(numbers))
+    if not 1 <= len(numbers) <= 3 or doubled or any(abs(each) > 60 for each in numbers[1:]):
         return nan, False
     angle_deg = sum(abs(number) / 60**power for power, number in enumerate(numbers))
     return angle_deg, any(number < 0 for number in numbers)
