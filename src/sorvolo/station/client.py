@@ -204,7 +204,8 @@ class StreamClient:
 
     async def _send_all(self, show: Callable[[StreamReport], None]) -> None:
         backoff = Backoff()
-        context = self._context()
+        is_tls = self._url.startswith("wss:")
+        context = trusting(self._settings.authority, "--ca") if is_tls else None
         showing = asyncio.create_task(self._show(show))
         lost_s: float | None = time.monotonic()
         stopped_s: float | None = None
@@ -360,11 +361,6 @@ class StreamClient:
         taken = self._spool.acknowledge(seq)
         self.report.frames += len(taken)
         self.report.delays_s.extend((now_ns - each) / 1e9 for each in taken)
-
-    def _context(self) -> ssl.SSLContext | None:
-        if not self._url.startswith("wss:"):
-            return None
-        return trusting(self._settings.authority, "--ca")
 
     async def _show(self, show: Callable[[StreamReport], None]) -> None:
         while True:

@@ -652,13 +652,7 @@ class LiveStream:
                     if not (self._is_file and tie is ClockTie.ARRIVAL)
                     else ("when reading began: the file states no time")
                 )
-        self._deliver_held()
-
-    def _deliver_held(self) -> None:
-        with self._lock:
-            held, self._held = self._held or [], None
-            if not held:
-                return
+            held, self._held = self._held, None
             stated, self._held_metadata = self._held_metadata, []
             for stamp_ns, each in stated:
                 self._log_metadata(stamp_ns, each)

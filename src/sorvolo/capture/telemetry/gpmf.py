@@ -243,7 +243,16 @@ def _karma_samples(payload: Payload, streams: Sequence[_Stream], fused: _Stream)
     ATTD: ms since start, roll, pitch, yaw (rad). GPRI: us, latitude, longitude, height, eph, epv. SYST: us since start
     and UTC ms.
     """
-    utc_from_start_ns = _system_time_ns(streams)
+    # UTC when the drone's counter was zero; None where it does not know
+    clocks = (row for stream in streams for row in stream.values.get("SYST", []) if len(row) >= 2)
+    utc_from_start_ns = next(
+        (
+            round((row[1] - row[0]) * 1e6) * 1000
+            for row in clocks
+            if _DATED_S[0] < row[1] < _DATED_S[1]
+        ),
+        None,
+    )
     attitudes = [
         row for stream in streams for row in stream.values.get("ATTD", []) if len(row) >= 4
     ]
@@ -284,15 +293,6 @@ def _karma_samples(payload: Payload, streams: Sequence[_Stream], fused: _Stream)
         )
         samples.append(_Sample(when_ns, utc_ns, columns))
     return samples
-
-
-def _system_time_ns(streams: Sequence[_Stream]) -> int | None:
-    """UTC when the drone's counter was zero; None where it does not know."""
-    for stream in streams:
-        for row in stream.values.get("SYST", []):
-            if len(row) >= 2 and _DATED_S[0] < row[1] < _DATED_S[1]:
-                return round((row[1] - row[0]) * 1e6) * 1000
-    return None
 
 
 def _nearest(rows: Sequence[tuple[float, ...]], time_s: float) -> tuple[float, ...] | None:
