@@ -163,6 +163,18 @@ def test_the_only_log_in_the_photos_folder_is_used(photos: Path) -> None:
     assert log.name in source.notices()[0].text
 
 
+@pytest.mark.parametrize(
+    "text", ["0.jpg 12.6 41.9 55\n1.jpg 12.6 41.9 55\n", "EPSG:4326\n0.jpg 12,6 41,9 55\n"]
+)
+def test_a_geo_txt_that_cannot_be_read_is_named(photos: Path, text: str) -> None:
+    (photos / "geo.txt").write_text(text)
+    texts = {each.code: each.text for each in open_photos(photos).notices()}
+    assert (
+        texts["unusable_telemetry"].startswith("not used: ")
+        and "geo.txt" in texts["unusable_telemetry"]
+    )
+
+
 def test_photos_without_a_time_and_other_files_are_named(tmp_path: Path) -> None:
     for index in range(3):
         write_photo(tmp_path / f"{index}.jpg", None, seed=index)

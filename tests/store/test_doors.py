@@ -349,6 +349,19 @@ def test_a_small_raster_of_many_pixels_is_no_ground_to_simulate_over(tmp_path: P
         read_orthophoto(sparse)
 
 
+@pytest.mark.parametrize("rows", [(0.5, 0, 0.5), (0.4, 0.3, -0.4)])
+def test_a_base_map_that_is_upside_down_or_turned_is_refused(
+    tmp_path: Path, rows: tuple[float, float, float]
+) -> None:
+    across, turned, down = rows
+    place = rasterio.Affine(across, turned, 300_000, turned, down, 4_640_000)
+    about = {"width": 64, "height": 64, "count": 3, "dtype": "uint8", "crs": "EPSG:32633"}
+    with rasterio.open(tmp_path / "a.tif", "w", driver="GTiff", transform=place, **about) as sink:
+        sink.write(np.ones((3, 64, 64), np.uint8))
+    with pytest.raises(InputError, match="warp it with gdalwarp"):
+        BaseMap.open(tmp_path / "a.tif")
+
+
 def test_a_raster_in_coordinates_of_a_building_site_has_no_place_on_earth(tmp_path: Path) -> None:
     local = 'LOCAL_CS["site",LOCAL_DATUM["site",0],UNIT["metre",1],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
     for bands, dtype, reader in (

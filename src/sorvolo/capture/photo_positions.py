@@ -44,6 +44,8 @@ def is_position_file(path: Path) -> bool:
     except OSError:
         return False
     lines = list(_lines(text))
+    if lines and path.name.lower() == "geo.txt":  # if it cannot be read, that is said
+        return True
     return _MRK_LINE.search(text) is not None or (
         len(lines) > 1 and _CRS.match(lines[0][1]) is not None and _is_geo_row(lines[1][1])
     )

@@ -48,6 +48,10 @@ class BaseMap:
                         f"{path} has {source.count} bands of {'/'.join(sorted(set(source.dtypes)))}; a base map has "
                         "grey, RGB or RGBA of 8 bits: convert it with gdal_translate -ot Byte -scale"
                     )
+                if source.transform.e >= 0 or not source.transform.is_rectilinear:
+                    raise InputError(
+                        f"{path}: its rows do not run from west to east and from north to south: warp it with gdalwarp"
+                    )
                 to_wgs84 = transformer(source.crs.to_wkt())
                 west, south, east, north = to_wgs84.transform_bounds(*source.bounds)
                 middle = Geodetic(round((south + north) / 2, 7), round((west + east) / 2, 7))
