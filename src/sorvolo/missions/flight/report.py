@@ -26,7 +26,6 @@ from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.mosaic.base_ties import BaseReport
 from sorvolo.mosaic.consistency import Stated, consistency
 from sorvolo.mosaic.flight_figures import (
-    FlightFigures,
     delay_figures,
     flight_figures,
     stated_height_m,
@@ -100,6 +99,14 @@ def build_report(
     if agreement.remarks and not 1 / _WRONG_HEIGHT < times < _WRONG_HEIGHT:
         agreement = replace(agreement, steps=(*agreement.steps, *agreement.remarks), remarks=())
     headline = {}
+    # the first pictures, or another flight, decided the map's resolution
+    native_m = figures.native_m_per_px or 0.0
+    chose = site.is_local or settings.m_per_px or not result.makes_map
+    is_coarse = not chose and site.m_per_px > _COARSE * native_m > 0
+    coarse = (
+        f"the map has {100 * site.m_per_px:.1f} cm a pixel, and the pictures show {100 * native_m:.1f} cm: --gsd "
+        f"{native_m:.2g} maps them so into a new folder"
+    )
     others = [*clock_doubts(setup, result.offset, settings.offset_s), *place_doubts(setup)]
     if result.makes_map:
         headline["headline"] = asdict(
@@ -158,24 +165,13 @@ def build_report(
         "notices": [asdict(each) for each in (*source.telemetry.notices, *setup.notices, *notices)],
         "warnings": [
             *flight_warnings(placed, figures, setup, log, agreement, plane, others),
-            *(_coarse_grid(site, figures, settings) if result.makes_map else ()),
+            *([coarse] if is_coarse else ()),
             *(result.control.remarks if result.control else ()),
         ],
         "settings": asdict(settings),
         "versions": software(),
         "track": [track_row(each) for each in placed],
     }
-
-
-def _coarse_grid(site: Site, figures: FlightFigures, settings: MapSettings) -> list[str]:
-    """Why the map shows less than its pictures do: the first of them, or another flight, decided its resolution."""
-    native_m = figures.native_m_per_px
-    if site.is_local or settings.m_per_px or not native_m or site.m_per_px < _COARSE * native_m:
-        return []
-    return [
-        f"the map has {100 * site.m_per_px:.1f} cm a pixel, and the pictures show {100 * native_m:.1f} cm: --gsd "
-        f"{native_m:.2g} maps them so into a new folder"
-    ]
 
 
 def _stated(setup: FlightSetup, result: FlightResult) -> Stated:

@@ -3,6 +3,7 @@
 import json
 from collections import deque
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -177,7 +178,9 @@ class EarlierFlights:
         """Of the flights that count, by their names."""
         self._outlines_m: dict[str, list[PointsM]] = {}
         for name in flights_to_search(archive, ()):
-            frames = [] if name == but else _frames_of(archive, name)
+            frames: list[SearchFrame] = []
+            with suppress(InputError):  # one that would have to be mapped again has none
+                frames = [] if name == but else search_frames(archive, name)
             if not frames:
                 continue
             self._outlines_m[name] = [each.placed.outline_m for each in frames]
@@ -256,11 +259,3 @@ class _Flight:
         """Return what its plants state of its own cells."""
         seen = self._looks.of_cells(self.cells, self._labels)
         return self._looks.measured(self.name, seen, self._searched, is_earlier=True)
-
-
-def _frames_of(archive: Archive, name: str) -> list[SearchFrame]:
-    """The frames of a flight that have a place; none of one that would have to be mapped again."""
-    try:
-        return search_frames(archive, name)
-    except InputError:
-        return []
