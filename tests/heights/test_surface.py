@@ -24,7 +24,7 @@ from sorvolo.heights.orthophoto import choose_photos, paint_orthophoto, visible
 from sorvolo.heights.smooth_sigma import SmoothSigma
 from sorvolo.heights.surface import Surface, sizes_m, sweep_surface
 from sorvolo.heights.sweep import SweepSettings, choose_views
-from sorvolo.heights.terrain import filled, terrain
+from sorvolo.heights.terrain import closed, filled, terrain
 from sorvolo.heights.views import inside
 from sorvolo.kernels import path_costs
 from sorvolo.registration.features import gray_from_rgb
@@ -300,9 +300,12 @@ def test_the_orthophoto_shows_roofs_and_ground_in_their_place(survey, surface: S
     """Against the ground's own picture; laid on level ground the roof would lean outwards."""
     views, pictures, look = survey
     site_grid = SiteGrid.at(ORIGIN, 30 / views[0].camera.fx_px, CRS)
+    whole = closed(surface.lattice, surface.up_m, terrain(surface.lattice, surface.up_m)[0])
     tiles = {
         index: rgba
-        for index, rgba, _ in paint_orthophoto(surface, site_grid, views, lambda k: pictures[k])
+        for index, rgba, _ in paint_orthophoto(
+            surface.lattice, whole, site_grid, views, lambda k: pictures[k]
+        )
     }
     lattice = surface.lattice
     picture = np.zeros((*lattice.shape, 4), np.uint8)
@@ -484,3 +487,18 @@ def test_the_picture_of_heights_has_a_colour_for_each_height() -> None:
 def test_what_heights_a_tile_has_is_looked_for_in_coarser_pictures() -> None:
     coarse_m, fine_m = sizes_m(0.1)
     assert coarse_m > fine_m == 0.1
+
+
+def test_a_large_hole_is_closed_with_bare_ground_a_small_one_from_around() -> None:
+    """Between a wood's crowns the ground is not half as high as these."""
+    lattice = Lattice.over(np.array([[-20.0, -20], [20, 20]]), SiteGrid.at(ORIGIN, 0.2, CRS))
+    bare_m = np.full(lattice.shape, 3.0, np.float32)
+    up_m = bare_m + np.float32(8)
+    middle = lattice.height // 2, lattice.width // 2
+    up_m[middle[0] - 60 : middle[0] + 60, middle[1] - 60 : middle[1] + 60] = np.nan
+    up_m[10:12, 10:12] = np.nan
+    whole = closed(lattice, up_m, bare_m)
+    assert abs(whole[middle] - 3) < 0.1
+    assert np.abs(whole[10:12, 10:12] - 11).max() < 0.1
+    known = np.isfinite(up_m)
+    np.testing.assert_array_equal(whole[known], up_m[known])

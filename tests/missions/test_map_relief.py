@@ -1,6 +1,7 @@
 """`sorvolo map` over hills is a map over heights, and a flat one is reported as one to check; accuracy holds."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from small_flights import simulate_into, small_flight
 from sorvolo.cli.main import main
 from sorvolo.errors import DiskFullError
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
-from sorvolo.lab.simulation.settings import OutputSettings
+from sorvolo.lab.simulation.settings import LaterSettings, OutputSettings
 from sorvolo.missions.heights import run as heights_run
 from sorvolo.missions.map import planar_run
 
@@ -24,6 +25,8 @@ _LEVEL = small_flight(
     size_px=(400, 300),
     output=OutputSettings(photos=True, photo_overlap=0.7),
 )
+
+_SAME = LaterSettings(people=0, cars=0, small_objects=0, removed=0, moved=0)
 
 
 def _mapped(folder: Path, site: str, *asked: str) -> int:
@@ -37,22 +40,55 @@ def _mapped(folder: Path, site: str, *asked: str) -> int:
 def test_the_report_names_ground_that_is_not_level(
     relief_m: float, asked: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    simulate_into(
-        tmp_path / "made", replace(_LEVEL, scene=replace(_LEVEL.scene, relief_m=relief_m))
-    )
+    stands = relief_m > 0 and not asked
+    hills = replace(_LEVEL, scene=replace(_LEVEL.scene, relief_m=relief_m))
+    simulate_into(tmp_path / "made", replace(hills, flights=1 + stands, later=_SAME))
     exit_code = _mapped(tmp_path, "site", *asked)
     report = json.loads(next((tmp_path / "site").glob("flights/*/report.json")).read_text())
     is_doubted = bool(asked)
     assert any("the ground is not level" in each for each in report["warnings"]) == is_doubted
     assert exit_code == (3 if is_doubted else 0)
     assert ("the ground is not level" in report["headline"]["text"]) == is_doubted
-    stands = relief_m > 0 and not asked
     assert report.get("shape", {}).get("is_flat", True) != stands
     assert any((tmp_path / "site").glob("flights/*/heights.tif")) == stands
     off_m = _off_m(tmp_path)
     assert (off_m < 2 * report["sigma_m"] * np.sqrt(2)).mean() > 0.9, (off_m, report["sigma_m"])
     if stands:
+        _compares_over_heights(tmp_path)
         _goes_on_after_a_full_disk(tmp_path, monkeypatch)
+
+
+def _compares_over_heights(folder: Path) -> None:
+    """Nothing changed, and each later camera is placed in space: over a level plane hills would move in its picture."""
+    shutil.copytree(folder / "site", folder / "compared")
+    made = folder / "made" / "flight2"
+    command = ["compare", str(made / "photos"), "--site", str(folder / "compared")]
+    assert main([*command, "--model", "none", "--camera", str(folder / "made" / "camera.xml")]) == 0
+    later = folder / "compared" / "flights" / "photos-2"
+    assert json.loads((later / "changes.geojson").read_text())["features"] == []
+    truth = json.loads((folder / "made" / "truth" / "frames.geojson").read_text())
+    true = {
+        each["properties"]["frame"]: _camera_m(each["properties"])
+        for each in truth["features"]
+        if each["properties"]["flight"] == "flight2"
+    }
+    found = json.loads((later / "frames.geojson").read_text())["features"]
+    off_m = np.array(
+        [
+            _camera_m(each["properties"]) - true[each["properties"]["frame"]]
+            for each in found
+            if each["properties"]["status"] == "vision"
+        ]
+    )
+    off_m -= np.median(off_m, axis=0)  # the map's own shift
+    assert len(off_m) >= 6 and np.median(np.linalg.norm(off_m, axis=1)) < 0.3
+
+
+def _camera_m(properties: dict[str, Any]) -> np.ndarray:
+    """(3,) a camera's place, east, north and up, m, from a point nearby."""
+    names = ("camera_longitude_deg", "camera_latitude_deg", "camera_height_m")
+    place = np.array([properties[each] for each in names])
+    return (place - [12.6, 41.89, 0]) * [111_320 * np.cos(np.radians(41.89)), 111_200, 1]
 
 
 def _goes_on_after_a_full_disk(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

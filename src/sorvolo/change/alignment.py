@@ -11,9 +11,11 @@ import numpy as np
 from sorvolo.change.local_fit import LocalFit, fit_locally
 from sorvolo.change.map_search import MapSearch
 from sorvolo.change.reference import ReferenceMap, normalised
+from sorvolo.change.relief import OrthoSurface
 from sorvolo.errors import GeometryError
 from sorvolo.geometry.arrays import (
     Floats,
+    Floats32,
     ImageGray,
     ImageRGB,
     Mask,
@@ -55,6 +57,8 @@ _FAR_M = 0.6  # ... this or more
 _PLACE_SIGMA_M = 2.0  # by axis: what a local fit moves a camera by, ...
 _TURN_SIGMA_DEG = 2.0  # ... and turns it by
 _PREDICTS_S = 2.0  # a fit older than this predicts nothing
+_STANDING_ROUNDS = 3  # in which a camera is moved in space; what a round lays, the next one follows
+_FITTING_ROUNDS = 4  # of one camera's fit, each leaving out what the last one left far off
 _SHRINK = 4  # times smaller are the copies that are shifted onto each other
 
 
@@ -83,7 +87,8 @@ class Aligned:
     `residual_px` is the median distance that paired points keep, in the frame's own pixels. `followed`: the last fit
     predicted this one, no features were needed. `local` is what the frame is moved by on the map beyond that
     homography, None where nothing is; `local_m` how far a local fit moved it in all (median, m). `with_flight`: it was
-    not found for sure by itself and lies where its flight as a whole has it.
+    not found for sure by itself and lies where its flight as a whole has it. `stand` is its
+    camera in space over a true orthophoto's heights; None over level ground, and where none is found.
     """
 
     site_from_image: Matrix3
@@ -93,6 +98,7 @@ class Aligned:
     local: LocalFit | None = None
     local_m: float = 0.0
     with_flight: bool = False
+    stand: Pose | None = None
 
 
 class Caution(Enum):
@@ -175,8 +181,10 @@ class _Frame:
 class Aligner:
     """Lays the frames of one flight over a map, in order of time. Only `align` and `recall` change it."""
 
-    def __init__(self, reference: ReferenceMap, site_grid: SiteGrid) -> None:
-        self._reference, self._site_grid = reference, site_grid
+    def __init__(
+        self, reference: ReferenceMap, site_grid: SiteGrid, surface: OrthoSurface | None = None
+    ) -> None:
+        self._reference, self._site_grid, self._surface = reference, site_grid, surface
         self._fits: list[_Fit] = []
         self.search = MapSearch(reference, site_grid)
         """What looks for frames that no homography places."""
@@ -253,6 +261,7 @@ class Aligner:
             left,
             size_m,
             with_flight=place is not None,
+            stand=None if self._surface is None else self._stand(frame, moved, self._surface),
         )
 
     def recall(
@@ -330,6 +339,29 @@ class Aligner:
             if moved_m < _FAR_M:
                 break
         return place, left, size_m
+
+    def _stand(self, frame: _Frame, placed: MapPlace, surface: OrthoSurface) -> Pose | None:
+        """Where a frame's camera stands in space: its picture is laid over the heights as its place on level ground has
+        it, points are followed from there to the map, and the camera is moved to see them where they are."""
+        camera, site_from_image = frame.even.camera, placed.site_from_image
+        size = camera.width_px, camera.height_px
+        seen = self._seen(site_from_image, camera)
+        if seen is None:
+            return None
+        old, up_m = self._keyframe(camera, normalised(*seen)), surface.under(site_from_image, size)
+        raised_m = np.array([0.0, 0.0, float(np.median(up_m))])
+        pose = Pose(placed.pose.rotation, placed.pose.translation_m + raised_m)
+        for _ in range(_STANDING_ROUNDS):
+            x, y, _ = surface.lay(site_from_image, size, camera, pose)
+            new = self._keyframe(camera, normalise_contrast(_remapped(frame.gray, x, y)))
+            found = refine(new, old, np.eye(3), _LINKS, LinkCache(_LINKS.features, 2))
+            if not isinstance(found, Link):
+                return None
+            image_px = np.column_stack([_sampled(each, found.new_px) for each in (x, y)])
+            ground_m = apply_homography(site_from_image, found.old_px)
+            points_m = np.column_stack([ground_m, _sampled(up_m, found.old_px)])
+            pose = _seen_so(image_px, points_m, camera, pose)
+        return pose
 
     def _local(self, frame: "_Frame", placed: MapPlace) -> LocalFit | None:
         """The local fit of a frame at its place, in pixels of the `_fine` camera."""
@@ -576,6 +608,36 @@ class Aligner:
         if pose is None:
             return NotAligned("the fit is none that a camera above the ground could have", np.nan)
         return MapPlace(fit, pose, residual_px, followed, np.inf if is_held else 0.0)
+
+
+def _remapped(image: ImageGray, x: Floats32, y: Floats32) -> ImageGray:
+    """A picture (h, w) at these places; its edge goes on."""
+    laid = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(laid, np.uint8)
+
+
+def _sampled(values: Floats32, points_px: PointsPx) -> Floats:
+    """(N,) values (h, w) between pixels, at points (N, 2)."""
+    x, y = points_px.astype(np.float32).T[..., None]
+    return np.asarray(cv2.remap(values, x, y, cv2.INTER_LINEAR), np.float64).ravel()
+
+
+def _seen_so(image_px: PointsPx, points_m: Floats, camera: Camera, start: Pose) -> Pose:
+    """The pose from which a camera sees points in space (N, 3) where they are in its picture, (N, 2); what lies far
+    off most of the others counts for nothing."""
+    middle_m = points_m.mean(axis=0)
+    points = points_m - middle_m
+    rotation, _ = cv2.Rodrigues(start.rotation.T)
+    offset = (-start.rotation.T @ (start.translation_m - middle_m)).reshape(3, 1)
+    for _ in range(_FITTING_ROUNDS):
+        seen_px, _ = cv2.projectPoints(points, rotation, offset, camera.matrix, np.zeros(5))
+        miss_px = np.linalg.norm(seen_px.reshape(-1, 2) - image_px, axis=1)
+        near = miss_px < 3 * max(0.5, float(np.median(miss_px)))
+        rotation, offset = cv2.solvePnPRefineLM(
+            points[near], image_px[near], camera.matrix, np.zeros(5), rotation, offset
+        )
+    camera_from_site: Matrix3 = np.asarray(cv2.Rodrigues(rotation)[0], np.float64)
+    return Pose(camera_from_site.T, middle_m - camera_from_site.T @ offset.ravel())
 
 
 def _as_known(known: FlightPlace, full: Camera, camera: Camera) -> MapPlace | NotAligned:

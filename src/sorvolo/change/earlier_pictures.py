@@ -6,12 +6,13 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sorvolo.change.relief import ReliefMap
+from sorvolo.change.relief import OrthoSurface
 from sorvolo.geometry.arrays import ImageBGR, ImageRGB, ImageRGBA, Mask, Matrix3, PointsM, Vector3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import apply_homography, pose_from_homography
 from sorvolo.geometry.pose import Pose
 
+_LEVEL_M = 0.01  # a camera that stands as near to where level ground has it was placed over that
 _EDGE = 0.01  # of a stored picture: the lens's correction repeats pixels there
 
 
@@ -27,22 +28,26 @@ class EarlierPictures:
     """The pictures of earlier flights, seen from where a later frame was taken.
 
     The map shows each piece of ground as one of them saw it, often from quite another side: a tree or a wall then leans
-    another way, and looks changed. With `relief` what stands on the ground is rendered from where the later frame was
-    taken; what the earlier camera did not see is then not known. `load` gives a picture by its place in `pictures`,
-    (h, w, 4), with its alpha as `with_known_pixels` sets it.
+    another way, and looks changed. Over the `surface` of a true orthophoto the pictures of cameras in space are laid as
+    the map was; what the earlier camera did not see is then not known. `load` gives a picture by its place in
+    `pictures`, (h, w, 4), with its alpha as `with_known_pixels` sets it.
     """
 
     def __init__(
         self,
         pictures: Sequence[EarlierPicture],
         load: Callable[[int], ImageRGBA],
-        relief: ReliefMap | None = None,
+        surface: OrthoSurface | None = None,
     ) -> None:
-        self._pictures, self._load, self._relief = pictures, load, relief
-        places = []
+        self._pictures, self._load, self.surface = pictures, load, surface
+        places: list[Vector3] = []
+        self._in_space: list[bool] = []
         for each in pictures:
-            pose = each.site_from_camera or pose_from_homography(each.site_from_image, each.camera)
+            level = pose_from_homography(each.site_from_image, each.camera)
+            pose = each.site_from_camera or level
             places.append(np.full(3, np.inf) if pose is None else pose.translation_m)
+            off_m = 0.0 if level is None else np.abs(places[-1] - level.translation_m).max()
+            self._in_space.append(each.site_from_camera is not None and off_m > _LEVEL_M)
         self._cameras_m = np.array(places).reshape(-1, 3)
 
     def seen_from(
@@ -56,12 +61,7 @@ class EarlierPictures:
                 continue
             picture, site_from_picture = found
             seen = self._rendered(
-                picture,
-                site_from_picture,
-                self._cameras_m[index],
-                site_from_image,
-                camera_m,
-                (width_px, height_px),
+                index, picture, site_from_picture, site_from_image, (width_px, height_px)
             )
             bgr = np.asarray(cv2.cvtColor(seen, cv2.COLOR_RGBA2BGR), np.uint8)
             yield bgr, np.asarray(cv2.extractChannel(seen, 3) == 255)
@@ -89,30 +89,23 @@ class EarlierPictures:
 
     def _rendered(
         self,
+        index: int,
         picture: ImageRGBA,
         site_from_picture: Matrix3,
-        earlier_m: Vector3,
         site_from_image: Matrix3,
-        camera_m: Vector3,
         size: tuple[int, int],
     ) -> ImageRGBA:
-        """A picture in an image's pixels, (h, w, 4): over what stands on the ground where that is known."""
-        picture_from_site: Matrix3 = np.asarray(np.linalg.inv(site_from_picture), np.float64)
-        found = (
-            None
-            if self._relief is None
-            else self._relief.find_in_earlier(
-                site_from_image, camera_m, picture_from_site, earlier_m, size
-            )
-        )
-        if found is None:
+        """A picture in an image's pixels, (h, w, 4): over the map's heights where its camera stands in space."""
+        camera, pose = self._pictures[index].camera, self._pictures[index].site_from_camera
+        if self.surface is None or pose is None or not self._in_space[index]:
             image_from_picture = np.linalg.inv(site_from_image) @ site_from_picture
             return np.asarray(
                 cv2.warpPerspective(picture, image_from_picture, size, flags=cv2.INTER_LINEAR),
                 np.uint8,
             )
-        x, y, sees = found
-        seen = np.asarray(cv2.remap(picture, x, y, cv2.INTER_LINEAR), np.uint8)
+        x, y, sees = self.surface.lay(site_from_image, size, camera, pose)
+        share = np.float32(picture.shape[1] / camera.width_px)
+        seen = np.asarray(cv2.remap(picture, x * share, y * share, cv2.INTER_LINEAR), np.uint8)
         seen[~sees] = 0
         return seen
 

@@ -1,86 +1,111 @@
-"""What stands on the ground, so that an earlier picture is rendered as a later camera sees it."""
+"""The heights below a true orthophoto: where its ground lies in the pictures that cameras took of it."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, Floats32, Mask, Matrix3, PointsM, Vector3, frozen
+from sorvolo.geometry.arrays import Bytes, Floats, Floats32, Mask, Matrix3, PointsM, Vector3, frozen
+from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import apply_homography
+from sorvolo.geometry.pose import Pose
 
-# How finely rays are followed to what stands on the ground.
-_COARSER = 4  # pixels of a picture, either way, for which one ray is followed
-_MOST_STEPS = 60  # of a ray through the surface
-_LEAST_M = 0.3  # lower things move by less than the comparison's own reach
-_SAME_M = 0.5  # heights that differ by less are the same surface
+_COARSER = 4  # pixels of a raster, either way, for which one line of sight is followed
+_HIDES_M = 0.3  # what rises less above a line of sight hides nothing
+_STEEP_M, _WALL_M = 1.5, 0.6  # what rises so much within this is no ground that pictures share
+_LONGER = 1.15  # times: each step along a line of sight
 
 
 @dataclass(frozen=True, eq=False)
-class ReliefMap:
-    """`above_m` (H, W) float32, what stands on the bare ground, m above it (0 where that is not known), and the affine
-    map (3, 3) from site metres to its columns and rows.
+class OrthoSurface:
+    """The heights that a map is a true orthophoto over: `up_m` (H, W) float32, m above the site's zero, without holes,
+    and the affine map (3, 3) from site metres to its columns and rows."""
 
-    Places are those of level ground, as the homographies of pictures have them: a view fits the ground that it shows,
-    so what stands there counts by its height above it.
-    """
-
-    above_m: Floats32
+    up_m: Floats32
     cells_from_site: Matrix3
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "above_m", frozen(self.above_m))
+        object.__setattr__(self, "up_m", frozen(self.up_m))
         object.__setattr__(self, "cells_from_site", frozen(self.cells_from_site))
 
-    def meet_m(self, ground_m: PointsM, camera_m: Vector3) -> Floats32:
-        """(h, w) how high a camera's rays to ground places, (h, w, 2), first meet what stands there; 0: the ground."""
-        highest = min(float(self.above_m.max(initial=0)), 0.5 * float(camera_m[2]))
-        found = np.zeros(ground_m.shape[:2], np.float32)
-        if highest < _LEAST_M:
-            return found
-        cell_m = 1 / np.sqrt(abs(np.linalg.det(self.cells_from_site[:2, :2])))
-        step_m = max(float(cell_m), highest / _MOST_STEPS)
-        for up_m in np.arange(highest, 0, -step_m):
-            places_m = _raised(ground_m, camera_m, float(up_m))
-            affine = self.cells_from_site
-            x, y = ((places_m @ row[:2] + row[2]).astype(np.float32) for row in affine[:2])
-            stands = np.asarray(
-                cv2.remap(self.above_m, x, y, cv2.INTER_LINEAR, borderValue=0.0), np.float32
-            )
-            meets = (stands >= up_m) & (found == 0)
-            # between this step and the last the ray came to the surface
-            found[meets] = np.minimum(stands[meets], up_m + step_m)
-        return found
+    @property
+    def _cell_m(self) -> float:
+        return float(np.abs(np.linalg.det(self.cells_from_site[:2, :2])) ** -0.5)
 
-    def find_in_earlier(
-        self,
-        site_from_image: Matrix3,
-        camera_m: Vector3,
-        picture_from_site: Matrix3,
-        earlier_m: Vector3,
-        size: tuple[int, int],
-    ) -> tuple[Floats32, Floats32, Mask] | None:
-        """Where an image's pixels lie in an earlier picture, x and y (h, w), and whether the earlier camera saw there
-        what the later one sees. None where nothing stands: then homographies are enough.
+    @cached_property
+    def _steep(self) -> Bytes:
+        """(H, W) 1 by walls, eaves and the rims of crowns: heights are off there, and a wall has no place on a map."""
+        side = max(1, round(_WALL_M / self._cell_m)) | 1
+        window = np.ones((side, side), np.uint8)
+        rise_m = cv2.subtract(cv2.dilate(self.up_m, window), cv2.erode(self.up_m, window))
+        return (np.asarray(rise_m) >= _STEEP_M).view(np.uint8)
 
-        `site_from_image` and `picture_from_site` hold for level ground; `size` is the image's width and height.
-        """
-        small = max(2, size[0] // _COARSER), max(2, size[1] // _COARSER)
-        coarse_m = _grounds(site_from_image, size, small)
-        up_m = self.meet_m(coarse_m, camera_m)
-        earlier_ground_m = _lowered(_raised(coarse_m, camera_m, up_m), earlier_m, up_m)
-        hidden = self.meet_m(earlier_ground_m, earlier_m) > up_m + _SAME_M
-        if not hidden.any() and not up_m.any():
-            return None
-        fine_up_m = np.asarray(cv2.resize(up_m, size, interpolation=cv2.INTER_LINEAR), np.float32)
-        sees = cv2.resize(hidden.view(np.uint8), size, interpolation=cv2.INTER_NEAREST) == 0
-        places = _raised(_grounds(site_from_image, size, size), camera_m, fine_up_m)
-        places = _lowered(places, earlier_m, fine_up_m)
-        at = (
-            apply_homography(picture_from_site, places.reshape(-1, 2))
-            .reshape(places.shape)
-            .astype(np.float32)
+    def under(self, site_from_raster: Matrix3, size: tuple[int, int]) -> Floats32:
+        """(h, w) the heights below a raster's pixels; `size` is its width and height."""
+        raster_from_cells = np.linalg.inv(self.cells_from_site @ site_from_raster)
+        return np.asarray(
+            cv2.warpPerspective(
+                self.up_m, raster_from_cells, size, borderMode=cv2.BORDER_REPLICATE
+            ),
+            np.float32,
         )
-        return at[..., 0], at[..., 1], sees
+
+    def lay(
+        self, site_from_raster: Matrix3, size: tuple[int, int], camera: Camera, pose: Pose
+    ) -> tuple[Floats32, Floats32, Mask]:
+        """Where the ground of a raster's pixels lies in the picture of a camera without distortion, x and y (h, w), and
+        whether the camera sees it there: it is in the picture, no wall, and nothing stands between."""
+        turn = pose.rotation.T
+        project = camera.matrix @ np.column_stack([turn, -turn @ pose.translation_m])
+        level = project[:, [0, 1, 3]] @ site_from_raster
+        columns, rows = (np.arange(each, dtype=np.float32) for each in size)
+        weight = _form(site_from_raster[2], columns, rows) * self.under(site_from_raster, size)
+        x, y, z = (
+            _form(line, columns, rows) + np.float32(up) * weight
+            for line, up in zip(level, project[:, 2])
+        )
+        ahead = z * np.sign(site_from_raster[2, 2]) > 1e-6
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x, y = (np.where(ahead, each / z, np.float32(-1e6)) for each in (x, y))
+        inside = (
+            (x > -0.5) & (x < camera.width_px - 0.5) & (y > -0.5) & (y < camera.height_px - 0.5)
+        )
+        raster_from_cells = np.linalg.inv(self.cells_from_site @ site_from_raster)
+        steep = cv2.warpPerspective(self._steep, raster_from_cells, size, flags=cv2.INTER_NEAREST)
+        hidden = self._hidden(site_from_raster, size, pose.translation_m)
+        return x, y, inside & (steep == 0) & ~hidden
+
+    def _hidden(self, site_from_raster: Matrix3, size: tuple[int, int], eye_m: Vector3) -> Mask:
+        """(h, w) whether something stands between the ground of a raster's pixels and a camera."""
+        coarse = max(2, size[0] // _COARSER), max(2, size[1] // _COARSER)
+        ground_m = _grounds(site_from_raster, size, coarse)
+        up_m = self._at(ground_m)
+        away_m = eye_m[:2] - ground_m
+        far_m = np.maximum(np.linalg.norm(away_m, axis=2), 1e-3)
+        along, climb = away_m / far_m[..., None], (float(eye_m[2]) - up_m) / far_m
+        highest_m = float(self.up_m.max()) - float(up_m.min())
+        reach_m = min(highest_m / max(float(climb.min()), 1e-3), float(far_m.max()))
+        hidden, step_m = np.zeros(up_m.shape, bool), 2 * self._cell_m
+        while step_m < reach_m:
+            rises_m = self._at(ground_m + along * step_m) - (up_m + climb * step_m)
+            hidden |= (rises_m > _HIDES_M) & (step_m < far_m)
+            step_m *= _LONGER
+        whole = cv2.resize(hidden.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+        return np.asarray(whole > 0)
+
+    def _at(self, places_m: PointsM) -> Floats32:
+        """(h, w) heights at places (h, w, 2)."""
+        affine = self.cells_from_site
+        x, y = ((places_m @ row[:2] + row[2]).astype(np.float32) for row in affine[:2])
+        up_m = cv2.remap(self.up_m, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(up_m, np.float32)
+
+
+def _form(line: Floats, columns: Floats32, rows: Floats32) -> Floats32:
+    """(h, w) a linear form (3,) of a raster's columns (w,) and rows (h,)."""
+    a, b, c = (np.float32(each) for each in line)
+    return np.asarray(a * columns[None, :] + (b * rows[:, None] + c), np.float32)
 
 
 def _grounds(site_from_image: Matrix3, size: tuple[int, int], asked: tuple[int, int]) -> PointsM:
@@ -90,15 +115,3 @@ def _grounds(site_from_image: Matrix3, size: tuple[int, int], asked: tuple[int, 
     columns, rows = np.meshgrid(x, y)
     found = apply_homography(site_from_image, np.column_stack([columns.ravel(), rows.ravel()]))
     return np.nan_to_num(found, nan=1e9).reshape(*columns.shape, 2)
-
-
-def _raised(ground_m: PointsM, camera_m: Vector3, up_m: Floats | Floats32 | float) -> PointsM:
-    """(h, w, 2) where the rays to ground places are at a height."""
-    share = np.asarray(up_m)[..., None] / camera_m[2]
-    return ground_m + (camera_m[:2] - ground_m) * share
-
-
-def _lowered(places_m: PointsM, camera_m: Vector3, up_m: Floats | Floats32) -> PointsM:
-    """(h, w, 2) the ground that a camera sees behind places at heights: `_raised` turned round."""
-    share = np.asarray(up_m)[..., None] / camera_m[2]
-    return (places_m - camera_m[:2] * share) / np.maximum(1 - share, 0.05)

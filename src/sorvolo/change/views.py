@@ -144,14 +144,16 @@ class FramePixels:
         reason: str,
         residual_px: float,
         map_sigma_m: float,
+        stand: Pose | None = None,
     ) -> PlacedFrame:
-        """The frame's record: where it fits the map, by pixels of the full size, or rejected with the reason."""
+        """The frame's record: where it fits the map, by pixels of the full size, or rejected with the reason. `stand`
+        is its camera in space, None for the one over level ground."""
         frame = posed.frame
         if site_from_image is None:
             return PlacedFrame.rejected(
                 frame.index, frame.name, time_ns, reason, self.full, residual_px
             )
-        pose = self.pose(site_from_image)
+        pose = stand or self.pose(site_from_image)
         outline_m = self.outline_m(site_from_image)
         if pose is None or not np.isfinite(outline_m).all():
             return PlacedFrame.rejected(
@@ -323,7 +325,8 @@ class ViewMaker:
         seen = self._lens.valid(*size)
         self._lens_sees: Mask = np.ones(size[::-1], bool) if seen is None else seen
         self._pictures = pictures
-        self._aligner = Aligner(reference, site_grid)
+        self._surface = None if pictures is None else pictures.surface
+        self._aligner = Aligner(reference, site_grid, self._surface)
         self._method = method
         self._measures = FlightMeasures() if method is None else None
         self._planting = Planting()
@@ -365,7 +368,7 @@ class ViewMaker:
                 brightness=self.brightness,
                 traces=ViewTraces(self._aligner.step, aligned, None),
             )
-        image, valid = _laid(aligned, image, known)
+        image, valid = self._laid(aligned, image, known)
         query = as_bgr(image)
         found, measured = self._difference(reference, image, query, valid)
         outcome = ViewOutcome(
@@ -415,7 +418,7 @@ class ViewMaker:
         if self._measures is not None:
             self._planting.pass_over()
         reference, known = self._map_under(aligned)
-        image, valid = _laid(aligned, image, known)
+        image, valid = self._laid(aligned, image, known)
         found = Difference(np.where(record.changed, np.uint8(255), np.uint8(0)), boxes, scores)
         return replace(
             outcome, view=self._view(posed.frame, aligned, (image, reference, valid), found)
@@ -437,6 +440,7 @@ class ViewMaker:
 
     def placed(self, posed: PosedFrame, outcome: ViewOutcome, map_sigma_m: float) -> PlacedFrame:
         """The frame's record: placed by the map it fits, or rejected with the reason."""
+        aligned = None if outcome.traces is None else outcome.traces.aligned
         return self.pixels.placed(
             posed,
             self._flight.utc_ns(posed.frame.time_ns),
@@ -444,6 +448,7 @@ class ViewMaker:
             outcome.reason,
             outcome.residual_px,
             map_sigma_m,
+            stand=None if aligned is None else aligned.stand,
         )
 
     def turned_as_found(self, posed: PosedFrame, outcome: ViewOutcome) -> PosedFrame:
@@ -506,6 +511,24 @@ class ViewMaker:
         )
         return reference, known & self._lens_sees
 
+    def _laid(self, aligned: Aligned, image: ImageRGB, known: Mask) -> tuple[ImageRGB, Mask]:
+        """A frame (h, w, 3) laid on the map's picture, over its heights where it has any, and where (h, w) both are
+        known."""
+        if self._surface is None or aligned.stand is None:
+            return _laid_level(aligned, image, known)
+        x, y, sees = self._surface.lay(
+            aligned.site_from_image, known.shape[::-1], self._lens.camera, aligned.stand
+        )
+        laid = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(laid, np.uint8), known & sees
+
+    def _by_level_ground(self, compared: OneSided) -> tuple[Difference, Mask]:
+        """What differs from the map where the frame lies on it as over level ground, and where that is known."""
+        reference, known = self._map_under(compared.aligned)
+        image, known = _laid_level(compared.aligned, self.undistorted(compared.posed), known)
+        found = compare_robust(as_bgr(reference), as_bgr(image), known, LEAST_SCORE)
+        return Difference(found.mask, found.boxes, found.scores), known
+
     def _view(
         self,
         frame: Frame,
@@ -563,6 +586,9 @@ class ViewMaker:
             found = compare_robust(picture, compared.query, sees, LEAST_SCORE)
             earlier.append((Difference(found.mask, found.boxes, found.scores), sees))
             leans |= leaning(level, picture, sees & compared.valid)
+        if compared.aligned.stand is not None and len(compared.found.boxes):
+            # heights have errors of their own, by walls and crowns: what they alone show is no change
+            earlier.append(self._by_level_ground(compared))
         return believed((compared.found, compared.valid), earlier), leans
 
     def _plant(self, view: ComparedView, compared: OneSided) -> tuple[Planted, ...]:
@@ -591,8 +617,8 @@ class ViewMaker:
         return Difference(found.mask, found.boxes, found.scores), measured
 
 
-def _laid(aligned: Aligned, image: ImageRGB, known: Mask) -> tuple[ImageRGB, Mask]:
-    """A frame (h, w, 3) laid on the map's picture, and where (h, w) both are known."""
+def _laid_level(aligned: Aligned, image: ImageRGB, known: Mask) -> tuple[ImageRGB, Mask]:
+    """A frame (h, w, 3) laid on the map's picture as over level ground, and where (h, w) both are known."""
     return (image, known) if aligned.local is None else aligned.local.warped(image, known)
 
 

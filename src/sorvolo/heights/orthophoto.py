@@ -8,8 +8,6 @@ import numpy as np
 from sorvolo.geometry.arrays import Floats32, ImageRGB, ImageRGBA, Mask, Matrix3
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.heights.lattice import Lattice
-from sorvolo.heights.surface import Surface
-from sorvolo.heights.terrain import filled
 from sorvolo.heights.views import View, ground_outlines_m, laid_pixels
 from sorvolo.mosaic.blending import (
     ALIGN_PX,
@@ -27,21 +25,21 @@ _BLOCK_TILES = 2  # painted together, to a side: what is painted around them is 
 
 
 def paint_orthophoto(
-    surface: Surface,
+    lattice: Lattice,
+    up_m: Floats32,
     site_grid: SiteGrid,
     views: Sequence[View],
     pictures: Callable[[int], ImageRGB],
 ) -> Iterator[tuple[TileIndex, ImageRGBA, float]]:
     """The tiles of the true orthophoto, block by block, each with the share that is done; those unseen are left out.
 
-    `pictures(i)` is view i's picture without distortion, its exposure corrected; holes of the surface are closed from
-    the ground around.
+    `up_m` (H, W) are heights without holes; `pictures(i)` is view i's picture without distortion, its exposure
+    corrected.
     """
-    ground = filled(surface.up_m, np.isfinite(surface.up_m))
     painter = _Painter(
-        surface.lattice,
-        ground,
-        choose_photos(surface.lattice, ground, views),
+        lattice,
+        up_m,
+        choose_photos(lattice, up_m, views),
         site_grid,
         views,
         pictures,

@@ -17,6 +17,7 @@ _LEAST_HEIGHT_M = 0.3  # above the ground around: lower things are ground
 
 
 _WIDEST_M = 30.0  # of a building or a grove
+_GOES_ON_M = 2.0  # into a hole, of what stands at its rim
 
 
 def terrain(lattice: Lattice, up_m: Floats32) -> tuple[Floats32, Mask]:
@@ -40,15 +41,22 @@ def terrain(lattice: Lattice, up_m: Floats32) -> tuple[Floats32, Mask]:
     return np.where(shows, up_m, fine).astype(np.float32), shows
 
 
-def filled(up_m: Floats32, known: Mask) -> Floats32:
-    """(H, W) the heights with what is not known continued from around, coarse to fine."""
+def closed(lattice: Lattice, up_m: Floats32, bare_m: Floats32) -> Floats32:
+    """(H, W) a surface without its holes (NaN): what stands beside one goes on a little, then it is bare ground."""
+    levels = max(1, round(np.log2(_GOES_ON_M / lattice.cell_m)))
+    return np.asarray(bare_m + filled(up_m - bare_m, np.isfinite(up_m), levels), np.float32)
+
+
+def filled(up_m: Floats32, known: Mask, most_levels: int | None = None) -> Floats32:
+    """(H, W) the heights with what is not known continued from around, coarse to fine; 0 where nothing known lies
+    within so many halvings of the size."""
     values: Floats32 = np.where(known, up_m, 0).astype(np.float32)
     weights: Floats32 = known.astype(np.float32)
-    levels = []
-    while min(weights.shape) > 2 and weights.min() <= 0:
+    levels: list[tuple[Floats32, Floats32]] = []
+    while min(weights.shape) > 2 and weights.min() <= 0 and len(levels) != most_levels:
         levels.append((values, weights))
         values, weights = (np.asarray(cv2.pyrDown(each), np.float32) for each in (values, weights))
-    mean = float(up_m[known].mean()) if known.any() else 0.0
+    mean = float(up_m[known].mean()) if most_levels is None and known.any() else 0.0
     result = np.where(weights > 1e-6, values / np.maximum(weights, 1e-6), mean).astype(np.float32)
     for values, weights in reversed(levels):
         wider = cv2.pyrUp(result, dstsize=weights.shape[1::-1])

@@ -7,6 +7,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
+
 from sorvolo.change.alignment import Caution, FlightPlace
 from sorvolo.change.earlier_pictures import EarlierPicture, EarlierPictures, with_known_pixels
 from sorvolo.change.flight_on_map import FlightFit, FlightOnMap
@@ -14,12 +16,13 @@ from sorvolo.change.map_update import paint_changes
 from sorvolo.change.outlines import KnownPlace
 from sorvolo.change.reconcile import reported
 from sorvolo.change.reference import ReferenceMap
-from sorvolo.change.relief import ReliefMap
+from sorvolo.change.relief import OrthoSurface
 from sorvolo.change.views import FlightCamera, ViewMaker, ViewOutcome, ViewRecord
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Mask, PointsM
+from sorvolo.geometry.arrays import ImageRGBA, Mask, Matrix3, PointsM
+from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.summary import median_of_known
-from sorvolo.heights.field import standing
+from sorvolo.heights.terrain import closed
 from sorvolo.missions.compare.extension import MapExtension
 from sorvolo.missions.compare.flight_changes import ComparePlan, FlightChanges
 from sorvolo.missions.compare.objects import ComparisonObjects
@@ -41,7 +44,8 @@ from sorvolo.missions.flight.request import REQUEST
 from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup
-from sorvolo.missions.heights.measure import flight_with_heights, read_field
+from sorvolo.missions.heights.measure import flight_with_heights, radial_of, read_field
+from sorvolo.registration.lens import Undistorter, refined_camera
 from sorvolo.store.exports.change_files import write_pictures
 from sorvolo.store.exports.ground_files import COVERAGE, coverage_geojson
 from sorvolo.store.exports.map_pictures import picture
@@ -406,24 +410,39 @@ def _earlier_pictures(archive: Archive, superseded: str) -> EarlierPictures:
         if each.flight_id != superseded and each.status is Status.VISION
     ]
     tall = flight_with_heights(archive, but=superseded)
-    relief = (
-        None
-        if tall is None
-        else ReliefMap(
-            *standing(
-                read_field(archive, tall, HeightFile.SURFACE),
-                read_field(archive, tall, HeightFile.GROUND),
-            )
-        )
-    )
-    images = ImageCache(
-        lambda index: with_known_pixels(archive.image(keyframes[index])), _CACHE_BYTES
-    )
+    surface, lens = None, None
+    if tall is not None and not archive.report(tall).get("shape", {"is_flat": True})["is_flat"]:
+        camera = next(each.camera for each in keyframes if each.flight_id == tall)
+        surface, lens = _painted_over(archive, tall, camera)
+
+    def load(index: int) -> ImageRGBA:
+        image = archive.image(keyframes[index])
+        if lens is not None and keyframes[index].flight_id == tall:
+            image = lens.undistort(image)
+        return with_known_pixels(image)
+
+    images = ImageCache(load, _CACHE_BYTES)
     return EarlierPictures(
         [
             EarlierPicture(each.camera, each.site_from_image, each.site_from_camera)
             for each in keyframes
         ],
         images.get,
-        relief,
+        surface,
     )
+
+
+def _painted_over(
+    archive: Archive, flight_id: str, camera: Camera
+) -> tuple[OrthoSurface, Undistorter]:
+    """The heights that a flight's true orthophoto was painted over, and what takes the distortion off its pictures that
+    its heights found, by a camera."""
+    surface, ground = (
+        read_field(archive, flight_id, each) for each in (HeightFile.SURFACE, HeightFile.GROUND)
+    )
+    cells_from_site: Matrix3 = np.asarray(
+        np.linalg.inv(surface.lattice.site_from_cells), np.float64
+    )
+    up_m = closed(surface.lattice, surface.up_m, ground.up_m)
+    lens = Undistorter(refined_camera(camera, 1.0, *radial_of(archive, flight_id)))
+    return OrthoSurface(up_m, cells_from_site), lens

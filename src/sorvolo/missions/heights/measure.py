@@ -174,6 +174,13 @@ def _read(archive: Archive, flight_id: str, file: HeightFile, cell_m: float) -> 
     )
 
 
+def radial_of(archive: Archive, flight_id: str) -> tuple[float, float]:
+    """The distortion left in a flight's pictures that its heights found, as `refined_camera` takes it."""
+    cameras = _report(archive, flight_id).get("cameras", {})
+    radial, fifth = cameras.get("radial", (0.0, 0.0))
+    return float(radial), float(fifth)
+
+
 def own_surface(archive: Archive, flight_id: str) -> HeightField | None:
     """The surface that a flight has from whichever map was made of it; None without any that can be read.
 
@@ -252,7 +259,8 @@ def _read_report(archive: Archive, flight_id: str) -> Mapping[str, Any] | None:
         report = json.loads(
             archive.read_file(f"flights/{flight_id}/{HeightFile.REPORT}", _MOST_BYTES)
         )
-        known = {"run": report["run"], "cell_m": float(report["cell_m"])}
+        known = {**report, "cell_m": float(report["cell_m"])}
+        known["run"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError, DamagedError):
         return None
     files = (f"flights/{flight_id}/{file}" for file in (HeightFile.SURFACE, HeightFile.GROUND))

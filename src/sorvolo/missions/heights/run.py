@@ -25,7 +25,7 @@ from sorvolo.heights.figures import (
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.orthophoto import paint_orthophoto
 from sorvolo.heights.surface import Surface, sizes_m, sweep_surface
-from sorvolo.heights.terrain import terrain
+from sorvolo.heights.terrain import closed, terrain
 from sorvolo.heights.views import View, fix_from_residual, ground_outlines_m, pixels_wide
 from sorvolo.missions.flight.headline import contradicts_itself
 from sorvolo.missions.flight.report import peak_memory_mb
@@ -469,4 +469,6 @@ def ground_tiles(
     model: GroundModel, site_grid: SiteGrid
 ) -> Iterator[tuple[TileIndex, ImageRGBA, float]]:
     """The tiles of a ground's true orthophoto; see `paint_orthophoto`."""
-    return paint_orthophoto(model.surface, site_grid, model.solved.views, model.pictures.colour)
+    lattice = model.surface.lattice
+    up_m = closed(lattice, model.surface.up_m, model.bare_m)
+    return paint_orthophoto(lattice, up_m, site_grid, model.solved.views, model.pictures.colour)
