@@ -115,6 +115,6 @@ def test_a_frame_stands_where_it_was_taken_from() -> None:
     up = up_m[cells[:, 1].round().astype(int), cells[:, 0].round().astype(int)]
     seen_at = CAMERA.pixels_from_points((np.column_stack([points, up]) - LATER) @ pose.rotation)
     seen_at[:8] += 30  # false pairs
-    start = Pose(NADIR_CAMERA_NORTH_UP, LATER + [0.7, -0.4, 0.9])
+    start = Pose(NADIR_CAMERA_NORTH_UP, LATER + np.array([0.7, -0.4, 0.9]))
     found = alignment._seen_so(seen_at, np.column_stack([points, up]), CAMERA, start)
     assert np.abs(found.translation_m - LATER).max() < 0.05

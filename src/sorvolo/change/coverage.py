@@ -242,6 +242,8 @@ class GroundCoverage:
         if is_dark:
             marks[:] = mark(Gap.DARK)
         marks[~view.valid] = mark(Gap.NO_MAP)
+        if doubted is not None:
+            marks[doubted & ~view.valid] = mark(Gap.LEANING)
         return marks
 
     def _number_of(self, why: str) -> int:

@@ -270,7 +270,8 @@ class ViewRecord:
 
 @dataclass(frozen=True, eq=False)
 class OneSided:
-    """A frame compared with the map, before earlier pictures corroborate it; `image` is RGB, `query` the same as BGR.
+    """A frame compared with the map, before earlier pictures corroborate it; `image` is RGB, `query` the same as BGR,
+    `known` (h, w) the ground that the map shows, `valid` what of it was compared.
 
     `outcome` is what is known of its ending.
     """
@@ -280,6 +281,7 @@ class OneSided:
     image: ImageRGB
     reference: ImageRGB
     query: ImageBGR
+    known: Mask
     valid: Mask
     found: Difference
     outcome: ViewOutcome
@@ -382,7 +384,7 @@ class ViewMaker:
             with_flight=aligned.with_flight,
             traces=ViewTraces(self._aligner.step, aligned, measured),
         )
-        return OneSided(posed, aligned, image, reference, query, valid, found, outcome)
+        return OneSided(posed, aligned, image, reference, query, known, valid, found, outcome)
 
     def corroborate(self, compared: ViewOutcome | OneSided) -> ViewOutcome:
         """Keep the differences that earlier pictures of the ground confirm: how the frame's comparison ended."""
@@ -400,6 +402,8 @@ class ViewMaker:
             return replace(outcome, status=ViewStatus.ALL_CHANGED, reason=_ALL_CHANGED_REASON)
         view = self._view(frame, aligned, (compared.image, compared.reference, valid), found)
         doubted = _doubted(compared.found, found, SURE)
+        if aligned.stand is not None:
+            doubted |= compared.known & ~valid
         planted = self._plant(view, compared)
         return replace(outcome, view=view, doubted=doubted, leans=leans, planted=planted)
 
@@ -524,9 +528,9 @@ class ViewMaker:
 
     def _by_level_ground(self, compared: OneSided) -> tuple[Difference, Mask]:
         """What differs from the map where the frame lies on it as over level ground, and where that is known."""
-        reference, known = self._map_under(compared.aligned)
-        image, known = _laid_level(compared.aligned, self.undistorted(compared.posed), known)
-        found = compare_robust(as_bgr(reference), as_bgr(image), known, LEAST_SCORE)
+        image = self.undistorted(compared.posed)
+        image, known = _laid_level(compared.aligned, image, compared.known)
+        found = compare_robust(as_bgr(compared.reference), as_bgr(image), known, LEAST_SCORE)
         return Difference(found.mask, found.boxes, found.scores), known
 
     def _view(
