@@ -72,7 +72,11 @@ def plant_on_floor(
         near = seeing(views, window, up_m)
         laid = np.stack([lay(views[k], picture(k), window, up_m)[..., 0] for k in near])
         floor, shown, share = gaps(laid, window.cell_m)
-        body = _body(window, draw)
+        # a lying body in the middle of the window: its cover, (H, W), 0 to 1
+        side = window.width / 2 - 0.5
+        axes = tuple(each / window.cell_m for each in _BODY_M)
+        body = np.zeros(window.shape, np.float32)
+        cv2.ellipse(body, ((side, side), axes, float(draw.uniform(0, 180))), 1.0, -1)
         added = np.nan_to_num((floor + draw.uniform(*_WARMER) - laid) * shown * body)
         planted = [
             picture(k) + _in_picture(views[k], more, window, up_m) for k, more in zip(near, added)
@@ -141,15 +145,6 @@ def _mode(laid: Floats32) -> Floats32:
     shown = np.take_along_axis(near, best, 1)
     level = np.take_along_axis(total, best, 1) / np.maximum(shown, 1)
     return level.astype(np.float32).reshape(laid.shape[1:])
-
-
-def _body(window: Lattice, draw: np.random.Generator) -> Floats32:
-    """(H, W) the cover, 0 to 1, of a lying body in the middle of a window."""
-    side = window.width / 2 - 0.5
-    axes = tuple(each / window.cell_m for each in _BODY_M)
-    cover = np.zeros(window.shape, np.float32)
-    cv2.ellipse(cover, ((side, side), axes, float(draw.uniform(0, 180))), 1.0, -1)
-    return cover
 
 
 def _in_picture(view: View, laid: Floats32, window: Lattice, up_m: float) -> Floats32:

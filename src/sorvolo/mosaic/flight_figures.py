@@ -52,7 +52,13 @@ def flight_figures(placed: Sequence[PlacedFrame], focal_px: float) -> FlightFigu
         median_of_known(heights_m),
         float(np.median(heights_m) / focal_px) if heights_m else None,
         _reach_m(seen),
-        _diagonal_m(seen),
+        (
+            float(
+                np.median([np.linalg.norm(each.outline_m[2] - each.outline_m[0]) for each in seen])
+            )
+            if seen
+            else 0.0
+        ),
         _tilt_deg(poses),
     )
 
@@ -99,14 +105,6 @@ def _reach_m(seen: Sequence[PlacedFrame]) -> float:
         return 0.0
     centres: Floats = np.array([each.outline_m.mean(axis=0) for each in seen])
     return float(np.linalg.norm(centres.std(axis=0)))
-
-
-def _diagonal_m(seen: Sequence[PlacedFrame]) -> float:
-    if not seen:
-        return 0.0
-    return float(
-        np.median([np.linalg.norm(each.outline_m[2] - each.outline_m[0]) for each in seen])
-    )
 
 
 def _tilt_deg(poses: Sequence[Pose]) -> float:

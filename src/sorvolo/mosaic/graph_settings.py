@@ -65,15 +65,15 @@ class PoseGraphSettings:
         return cls(
             focal_sigma=0.0 if calibrated or not height_known else focal_sigma,
             radial_sigma=0.0 if calibrated else PRIOR_RADIAL,
-            altitude_offset_sigma_m=_altitude_prior_m(altitude_offset_sigma_m, PRIOR_FREE_M),
+            # 0 holds it
+            altitude_offset_sigma_m=(
+                0.0
+                if altitude_offset_sigma_m is None
+                else altitude_offset_sigma_m
+                if np.isfinite(altitude_offset_sigma_m)
+                else PRIOR_FREE_M
+            ),
             gps_offset_sigma_m=PRIOR_GPS_OFFSET_M if joins_map else 0.0,
             tilt_offset_sigma_deg=PRIOR_TILT_OFFSET_DEG if has_telemetry else 0.0,
             heading_offset_sigma_deg=PRIOR_HEADING_OFFSET_DEG if has_telemetry else 0.0,
         )
-
-
-def _altitude_prior_m(sigma_m: float | None, free_m: float) -> float:
-    """The prior sigma of the altitude's zero: 0 holds it (no telemetry), a wide one where `sigma_m` is infinite."""
-    if sigma_m is None:
-        return 0.0
-    return sigma_m if np.isfinite(sigma_m) else free_m

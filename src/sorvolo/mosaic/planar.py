@@ -505,9 +505,11 @@ class PlanarMapper:
         previous = self._own[::-1][:_PREVIOUS]
         tie = _Tie(new, self._guess_by_telemetry(new))
         if previous:
-            self._ask(
-                tie, previous[0], self._loose_prediction(new, previous[0], tie.guess), Effort.CHEAP
-            )
+            # where telemetry alone puts it, if it knows enough to be a help
+            loose = None
+            if tie.guess is not None and np.isfinite(new.prior.attitude_sigma_deg[2]):
+                loose = self._prediction(new, previous[0], tie.guess, tight=False)
+            self._ask(tie, previous[0], loose, Effort.CHEAP)
         self._ask_under(tie, previous)
         if len(tie.links) < _WANTED_LINKS:
             self._ask_dearly(tie)
@@ -595,14 +597,6 @@ class PlanarMapper:
             if not np.isfinite(prior.attitude_sigma_deg[2]):
                 rotation = recent.rotation
         return Pose(rotation, np.array([*prior.position_m[:2], max(up_m, 0.5)]))
-
-    def _loose_prediction(
-        self, new: Keyframe, old: int, guess: Pose | None
-    ) -> LinkPrediction | None:
-        """Where telemetry alone puts the previous keyframe; None when it knows too little to be a help."""
-        if guess is None or not np.isfinite(new.prior.attitude_sigma_deg[2]):
-            return None
-        return self._prediction(new, old, guess, tight=False)
 
     def _prediction(
         self, new: Keyframe, old: int, guess: Pose, *, tight: bool

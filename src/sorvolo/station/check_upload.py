@@ -68,7 +68,14 @@ def _video(part: Path, container: str) -> Json:
 
     with part.open("rb") as file:
         head = file.read(16)
-    if not _has_signature(head, container):
+    is_right = (
+        head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
+        if container == "mov"
+        else head[:4] == b"\x1aE\xdf\xa3"
+        if container == "matroska"
+        else b"G" in (head[:1], head[4:5])
+    )
+    if not is_right:
         raise UploadRefusal(f"its content is no {container} video, whatever its name is")
     try:
         # the demuxer is given: a playlist or a list of files in disguise would make FFmpeg open other things
@@ -104,16 +111,6 @@ def _video(part: Path, container: str) -> Json:
         raise UploadRefusal(
             f"it cannot be read as a video ({error.strerror}); was the file cut off?"
         ) from error
-
-
-def _has_signature(head: bytes, container: str) -> bool:
-    if container == "mov":
-        return head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
-    return (
-        head[:4] == b"\x1aE\xdf\xa3"
-        if container == "matroska"
-        else head[:1] == b"G" or head[4:5] == b"G"
-    )
 
 
 def _photos(part: Path, target: Path, most_bytes: int, keep_free_bytes: int) -> Json:
@@ -159,25 +156,22 @@ def _entries(archive: zipfile.ZipFile, most_bytes: int) -> Iterator[zipfile.ZipI
         )
     for each in entries:
         path = PurePosixPath(each.filename.replace("\\", "/"))
-        _demand_harmless(each, path)
+        name = repr(each.filename[:80])
+        if path.is_absolute() or ".." in path.parts or re.match(r"[A-Za-z]:", each.filename):
+            raise UploadRefusal(
+                f"the name {name} in it leads outside; pack the photos' folder itself"
+            )
+        if stat.S_IFMT(each.external_attr >> 16) not in _PLAIN_KINDS:
+            raise UploadRefusal(f"{name} in it is a link or no plain file")
+        if each.flag_bits & 1:
+            raise UploadRefusal("it is encrypted; pack it without a password")
+        if each.file_size > max(1_000_000, _MOST_RATIO * max(each.compress_size, 1)):
+            raise UploadRefusal(
+                f"{name} in it would unpack to {each.file_size / 1e6:.0f} MB: no photo does"
+            )
         is_wanted = path.suffix.lower() in (*_PHOTOS, *_TEXTS) and not path.name.startswith(".")
         if is_wanted and not each.is_dir() and "__MACOSX" not in path.parts:
             yield each
-
-
-def _demand_harmless(entry: zipfile.ZipInfo, path: PurePosixPath) -> None:
-    """Raise UploadRefusal for a file that leads outside, is a link, is encrypted, or unpacks to more than a photo does."""
-    name = repr(entry.filename[:80])
-    if path.is_absolute() or ".." in path.parts or re.match(r"[A-Za-z]:", entry.filename):
-        raise UploadRefusal(f"the name {name} in it leads outside; pack the photos' folder itself")
-    if stat.S_IFMT(entry.external_attr >> 16) not in _PLAIN_KINDS:
-        raise UploadRefusal(f"{name} in it is a link or no plain file")
-    if entry.flag_bits & 1:
-        raise UploadRefusal("it is encrypted; pack it without a password")
-    if entry.file_size > max(1_000_000, _MOST_RATIO * max(entry.compress_size, 1)):
-        raise UploadRefusal(
-            f"{name} in it would unpack to {entry.file_size / 1e6:.0f} MB: no photo does"
-        )
 
 
 def _free_name(name: str, taken: dict[str, Path]) -> str:

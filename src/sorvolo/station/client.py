@@ -216,9 +216,13 @@ class StreamClient:
                         await self._greet(link)
                         backoff.reset()
                         if lost_s is not None:
-                            self._came_back(
-                                time.monotonic() - lost_s, is_first=not self._was_linked
-                            )
+                            # whatever was taken without a link is sent, late as it is
+                            outage_s = time.monotonic() - lost_s
+                            self._allowance.add(outage_s)
+                            if self._was_linked:
+                                self.report.outages += 1
+                                self.report.outage_s += outage_s
+                            self._was_linked = True
                             lost_s = None
                         await self._talk(link)
                         return
@@ -283,14 +287,6 @@ class StreamClient:
         self.report.words = (
             (close.reason if close is not None else "") or str(error) or type(error).__name__
         )
-
-    def _came_back(self, outage_s: float, *, is_first: bool) -> None:
-        """Whatever was taken without a link is sent, late as it is."""
-        self._was_linked = True
-        self._allowance.add(outage_s)
-        if not is_first:
-            self.report.outages += 1
-            self.report.outage_s += outage_s
 
     async def _greet(self, link: ClientConnection) -> None:
         form = self._footage.format

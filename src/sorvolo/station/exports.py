@@ -262,7 +262,16 @@ def export_routes(shelf: SiteShelf, collections: SiteCollections) -> APIRouter:
         """One of them, to be kept; ranges are answered, so that GDAL reads of a GeoTIFF what it needs."""
         archive = shelf.open(site)
         if export_id == _GEOPACKAGE:
-            return _geopackage(site, archive, collections)
+            if not archive.has_site:
+                raise Problem(404, "this site has no map yet, so nothing for a GeoPackage")
+            layers = {name: collections.get(site, name).features for name in TITLES}
+            styles = {name: qml_of(style) for name, style in LAYER_STYLES.items()}
+            with tempfile.TemporaryDirectory(prefix="sorvolo-") as folder:
+                path = Path(folder) / _GEOPACKAGE
+                write_geopackage(path, layers, styles)
+                made = path.read_bytes()  # another time other bytes: whole, no ranges
+            headers = _as_file(f"{_plain_name(site)}.gpkg")
+            return Response(made, media_type="application/octet-stream", headers=headers)
         if export_id == _PROJECT:
             return _project(site, archive, collections)
         if export_id == _LINK:
@@ -289,7 +298,16 @@ def export_routes(shelf: SiteShelf, collections: SiteCollections) -> APIRouter:
         step_m: float = Query(0, ge=0, le=1000),
     ) -> Json:
         """Heights along a line, `LON,LAT;LON,LAT;...`; 404 where the site has no heights."""
-        return _profile(shelf.open(site).folder, line, step_m)
+        folder = shelf.open(site).folder
+        points = measure_profile(folder, _places(line), step_m=step_m)
+        points = points[:: max(1, math.ceil(len(points) / _MOST_PROFILE_POINTS))]
+        known = [each.sigma_m for each in points if math.isfinite(each.sigma_m)]
+        return {
+            "distance_m": [each.way_m for each in points],
+            "height_m": [rounded(each.surface_m, 3) for each in points],
+            "ground_m": [rounded(each.ground_m, 3) for each in points],
+            "sigma_m": sum(known) / len(known) if known else None,
+        }
 
     return router
 
@@ -337,19 +355,6 @@ def _as_file(name: str) -> dict[str, str]:
     }
 
 
-def _geopackage(site: str, archive: Archive, collections: SiteCollections) -> Response:
-    if not archive.has_site:
-        raise Problem(404, "this site has no map yet, so nothing for a GeoPackage")
-    layers = {name: collections.get(site, name).features for name in TITLES}
-    styles = {name: qml_of(style) for name, style in LAYER_STYLES.items()}
-    with tempfile.TemporaryDirectory(prefix="sorvolo-") as folder:
-        path = Path(folder) / _GEOPACKAGE
-        write_geopackage(path, layers, styles)
-        made = path.read_bytes()  # another time other bytes: whole, no ranges
-    headers = _as_file(f"{_plain_name(site)}.gpkg")
-    return Response(made, media_type="application/octet-stream", headers=headers)
-
-
 def _project(site: str, archive: Archive, collections: SiteCollections) -> Response:
     if not archive.has_site or archive.site().is_local or not archive.mosaic_path.is_file():
         raise Problem(
@@ -364,18 +369,6 @@ def _project(site: str, archive: Archive, collections: SiteCollections) -> Respo
     ):
         made = qgs_of(name, layers, map_)  # the other exports' names begin with it
     return Response(made, media_type="application/x-qgis", headers=_as_file(f"{name}.qgs"))
-
-
-def _profile(folder: Path, line: str, step_m: float) -> dict[str, Any]:
-    points = measure_profile(folder, _places(line), step_m=step_m)
-    points = points[:: max(1, math.ceil(len(points) / _MOST_PROFILE_POINTS))]
-    known = [each.sigma_m for each in points if math.isfinite(each.sigma_m)]
-    return {
-        "distance_m": [each.way_m for each in points],
-        "height_m": [rounded(each.surface_m, 3) for each in points],
-        "ground_m": [rounded(each.ground_m, 3) for each in points],
-        "sigma_m": sum(known) / len(known) if known else None,
-    }
 
 
 def _places(line: str) -> list[str]:

@@ -186,7 +186,13 @@ def checked_stream(
     parts, port = _parts(url)
     scheme, host = parts.scheme.lower(), parts.hostname
     if not host and scheme in _LISTENED:
-        return _waited_for(url, scheme, port)
+        if port is None or port < _LOWEST_PORT:
+            raise _refused(
+                "a stream without a host is waited for: udp, rtp, tcp or rtmp with a port from 1024 on"
+            )
+        if urlsplit(url).query:
+            raise _refused("options behind a ? are not taken")
+        return url
     if scheme not in CALLED:
         raise _refused(f"streams of {scheme[:20] or 'no scheme'} are not called from here")
     if not host:
@@ -217,16 +223,6 @@ def _parts(url: str) -> tuple[SplitResult, int | None]:
     if any(each in url for each in "\r\n\t\\ \0") or not url.isascii():
         raise _refused("this is no address of a stream")
     return parts, port
-
-
-def _waited_for(url: str, scheme: str, port: int | None) -> str:
-    if port is None or port < _LOWEST_PORT:
-        raise _refused(
-            "a stream without a host is waited for: udp, rtp, tcp or rtmp with a port from 1024 on"
-        )
-    if urlsplit(url).query:
-        raise _refused("options behind a ? are not taken")
-    return url
 
 
 def _resolved(host: str, port: int) -> list[str]:

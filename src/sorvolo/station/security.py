@@ -206,7 +206,13 @@ def check_host(host: str, settings: StationSettings) -> None:
     A page of another site may let its own name point to this address (DNS rebinding): names have to be known, while an
     address cannot be pointed anywhere. On loopback only loopback addresses are right.
     """
-    name = _host_name(host)
+    name = (
+        host[1:].partition("]")[0]
+        if host.startswith("[")
+        else host.rpartition(":")[0]
+        if ":" in host
+        else host
+    )
     if name.lower() == "localhost" or name.lower() in settings.host_names:
         return
     if not settings.is_loopback and (
@@ -248,12 +254,6 @@ def check_origin(connection: HTTPConnection, public_origin: str, *, is_websocket
         or not origin
     ):
         raise Problem(403, f"a page of {origin[:100]} asked; open the station's own page")
-
-
-def _host_name(host: str) -> str:
-    if host.startswith("["):
-        return host[1:].partition("]")[0]
-    return host.rpartition(":")[0] if ":" in host else host
 
 
 def _is_address(name: str) -> bool:

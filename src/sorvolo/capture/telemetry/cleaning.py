@@ -145,7 +145,8 @@ def _cleaned_fixes(
         ),
     ]
     if decimals is not None and decimals <= _COARSE_DECIMALS:
-        rounding = rounding_sigma_m(decimals)
+        # per axis: the step of the last decimal of a degree / sqrt 12
+        rounding = float(10.0**-decimals * M_PER_DEG_LATITUDE / np.sqrt(12))
         placed = np.isfinite(table["latitude_deg"])
         sigma = table.get("horizontal_sigma_m", np.full(len(placed), np.nan))
         widened = {**table, "horizontal_sigma_m": np.where(placed, np.fmax(sigma, rounding), sigma)}
@@ -274,11 +275,6 @@ def decimals_of(text: str) -> int:
 def sigma_from_hdop_m(hdop: float) -> float:
     """Horizontal standard deviation in m, per axis, for a dilution of precision; NaN where it is unknown."""
     return max(hdop * M_PER_HDOP, SMALLEST_HDOP_SIGMA_M) if hdop > 0 else float("nan")
-
-
-def rounding_sigma_m(decimals: int) -> float:
-    """Sigma in m, per axis, of a position rounded to this many decimals of a degree: its step / sqrt 12."""
-    return float(10.0**-decimals * M_PER_DEG_LATITUDE / np.sqrt(12))
 
 
 def notice(code: str, count: int, text: str) -> list[Notice]:

@@ -3,7 +3,7 @@
 import math
 import os
 import time
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
@@ -45,7 +45,7 @@ from sorvolo.lab.training.progress import (
     seconds_left,
     weights_bytes,
 )
-from sorvolo.lab.training.samples import TrainingSample, batches_from
+from sorvolo.lab.training.samples import batches_from
 from sorvolo.lab.training.sets import (
     DataOptions,
     TrainingSets,
@@ -145,39 +145,30 @@ def train_detector(
     out = Path(out)
     device = device_of(device)
     with _claimed(out, resume):
-        yield from _train(folders, out, settings, options, device, resume)
-
-
-def _train(
-    places: Sequence[Path],
-    out: Path,
-    settings: TrainSettings,
-    options: DataOptions,
-    device: str,
-    resume: bool,
-) -> Iterator[TrainingUpdate]:
-    start = load_start(settings)
-    steps = settings.steps
-    yield TrainingUpdate(0, steps, "reading the labels")
-    sets = training_sets(places, options, seed=settings.seed)
-    notices = sets.notices
-    if start is not None:
-        notices += tuple(begin_notices(start, sets.classes))
-    yield TrainingUpdate(0, steps, f"preparing the network ({settings.preset})", notices=notices)
-    reader = _Reader(sets)
-    with without_denormals():
-        learner = start_learner(settings, sets.classes, start, device)
-        run = _Run(out, settings, sets, learner, reader, device, start, notices)
-        if resume:
-            checkpoint = read_checkpoint((out / CHECKPOINT).read_bytes(), str(out / CHECKPOINT))
-            restore(run.learner, checkpoint, run.identity)
-            run.history = checkpoint.history
-        yield from _learn(run)
-        yield TrainingUpdate(run.learner.step, steps, "measuring and writing the model")
-        check, closing_notices = _finish(run)
-    yield TrainingUpdate(
-        run.learner.step, steps, f"{out / MODEL} is ready", check=check, notices=closing_notices
-    )
+        start = load_start(settings)
+        steps = settings.steps
+        yield TrainingUpdate(0, steps, "reading the labels")
+        sets = training_sets(folders, options, seed=settings.seed)
+        notices = sets.notices
+        if start is not None:
+            notices += tuple(begin_notices(start, sets.classes))
+        yield TrainingUpdate(
+            0, steps, f"preparing the network ({settings.preset})", notices=notices
+        )
+        reader = _Reader(sets)
+        with without_denormals():
+            learner = start_learner(settings, sets.classes, start, device)
+            run = _Run(out, settings, sets, learner, reader, device, start, notices)
+            if resume:
+                checkpoint = read_checkpoint((out / CHECKPOINT).read_bytes(), str(out / CHECKPOINT))
+                restore(run.learner, checkpoint, run.identity)
+                run.history = checkpoint.history
+            yield from _learn(run)
+            yield TrainingUpdate(run.learner.step, steps, "measuring and writing the model")
+            check, closing_notices = _finish(run)
+        yield TrainingUpdate(
+            run.learner.step, steps, f"{out / MODEL} is ready", check=check, notices=closing_notices
+        )
 
 
 @contextmanager
@@ -228,26 +219,19 @@ class _Reader:
             raise InputError(f"{path}: {error}") from error
 
 
-def _batches(
-    sets: TrainingSets, reader: _Reader, settings: TrainSettings, start: int = 0
-) -> Generator[list[TrainingSample], None, None]:
-    """What is learnt from, batch by batch, from number `start` on."""
-    return batches_from(
-        sets.shares,
-        sets.classes,
-        reader,
-        side=settings.side_px,
-        seed=settings.seed,
-        batch=settings.batch,
-        start=start,
-        threads=max(1, min(8, (os.cpu_count() or 1) - 1)),
-    )
-
-
 def _learn(run: _Run) -> Iterator[TrainingUpdate]:
     """All steps that are left, with checks and checkpoints; ends early where checks no longer get better."""
     settings, learner = run.settings, run.learner
-    batches = _batches(run.sets, run.reader, settings, learner.step)
+    batches = batches_from(
+        run.sets.shares,
+        run.sets.classes,
+        run.reader,
+        side=settings.side_px,
+        seed=settings.seed,
+        batch=settings.batch,
+        start=learner.step,
+        threads=max(1, min(8, (os.cpu_count() or 1) - 1)),
+    )
     first, before_s, started_s = learner.step, run.history.seconds, time.monotonic()
     saved_s = started_s
     try:

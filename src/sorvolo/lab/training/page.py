@@ -40,7 +40,17 @@ def training_page(report: Mapping[str, Any]) -> str:
         checks=_plot("AP50 over steps", lines, high=1.0),
         kept=f"The weights of step {best} were kept." if best is not None else "",
         classes=_classes(report),
-        sets=_sets(report),
+        sets=[
+            [
+                each["name"],
+                each["part"],
+                str(each["pictures"]),
+                str(each["videos"]),
+                ", ".join(f"{count} {name}" for name, count in each["boxes"].items()),
+                ", ".join(each["unlabelled"]) or "-",
+            ]
+            for each in report["sets"]
+        ],
         settings=_settings(report),
     )
     return str(page)
@@ -74,20 +84,6 @@ def _classes(report: Mapping[str, Any]) -> list[list[str]]:
             ]
         )
     return rows
-
-
-def _sets(report: Mapping[str, Any]) -> list[list[str]]:
-    return [
-        [
-            each["name"],
-            each["part"],
-            str(each["pictures"]),
-            str(each["videos"]),
-            ", ".join(f"{count} {name}" for name, count in each["boxes"].items()),
-            ", ".join(each["unlabelled"]) or "-",
-        ]
-        for each in report["sets"]
-    ]
 
 
 def _settings(report: Mapping[str, Any]) -> list[tuple[str, str]]:

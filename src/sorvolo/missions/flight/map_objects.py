@@ -32,7 +32,7 @@ from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.images import jpeg_from_image
 from sorvolo.store.site.spill import FrameOnDisk
 from sorvolo.survey.flight import Frame, Notice, PosedFrame, Site
-from sorvolo.survey.map_objects import MapObject, ObjectSearch, SearchedFrames
+from sorvolo.survey.map_objects import ObjectSearch, SearchedFrames
 from sorvolo.survey.mosaic import PlacedFrame, Status
 from sorvolo.survey.objects import Detections, Sighting
 from sorvolo.tracking.laying import LaidSighting, MeasuredGround, lay_on_ground, pose_of
@@ -302,7 +302,22 @@ def search_summary(
                 "count": len(search.objects),
                 "moving": sum(each.moving for each in search.objects),
                 "classes": {name: counts[name] for name in search.classes},
-                "list": [_row(each) for each in search.objects],
+                "list": [
+                    {
+                        "id": each.id,
+                        "class": each.label,
+                        "score": round(each.score, 3),
+                        "east_m": each.position_m[0],
+                        "north_m": each.position_m[1],
+                        "sigma_m": each.sigma_m,
+                        "length_m": each.length_m,
+                        "width_m": each.width_m,
+                        "views": each.views,
+                        "possible_views": each.possible_views,
+                        "moving": each.moving,
+                    }
+                    for each in search.objects
+                ],
             }
         )
     )
@@ -327,19 +342,3 @@ def why_not_searched(model: str) -> str:
 def crops_of(search: ObjectSearch | None) -> dict[str, bytes]:
     """The JPEG around each object's best view, by the object's id."""
     return {} if search is None else {each.id: each.crop_jpeg for each in search.objects}
-
-
-def _row(each: MapObject) -> dict[str, Any]:
-    return {
-        "id": each.id,
-        "class": each.label,
-        "score": round(each.score, 3),
-        "east_m": each.position_m[0],
-        "north_m": each.position_m[1],
-        "sigma_m": each.sigma_m,
-        "length_m": each.length_m,
-        "width_m": each.width_m,
-        "views": each.views,
-        "possible_views": each.possible_views,
-        "moving": each.moving,
-    }

@@ -198,7 +198,35 @@ def build_search_report(
         label: _class_row(searched, label, settings, detector.info) for label in searched.labels
     }
     first = searched.labels[0]
-    headline = _headline(first, rows[first], settings, so_far)
+    # the search in one line, and whether all of the area was searched well enough
+    row, area_m2 = rows[first], rows[first]["area_m2"]
+    shares = (
+        {reason: holes_m2 / area_m2 for reason, holes_m2 in row["holes_m2"].items()}
+        if area_m2
+        else {}
+    )
+    holes = ", ".join(f"{share:.0%} {reason}" for reason, share in shares.items() if share >= 0.005)
+    chance = f"{row['pod']:.2f} (90 % interval {row['pod_low']:.2f} to {row['pod_high']:.2f})"
+    by = (
+        ""
+        if so_far is None
+        else (
+            f"so far, by {so_far.measured} of {counted(so_far.placed, 'picture')} of the flight {so_far.flight} "
+            f"{'and ' + counted(len(so_far.earlier), 'flight') + ' before it' if so_far.earlier else 'alone'}: "
+        )
+    )
+    looked = f"; {row['seen_m2'] / area_m2:.0%} of the area looked at" if area_m2 else ""
+    text = f"{by}probability of detection of a {first} anywhere in the area: {chance}{looked}"
+    total = sum(shares.values())
+    is_complete = total <= _MOST_HOLES
+    text += (
+        "; no holes"
+        if is_complete
+        else (
+            f"; {total:.0%} of the area is below {settings.enough:g}: {holes or 'in small pieces'}"
+        )
+    )
+    headline = {"text": text, "complete": is_complete, "hole_share": total}
     if searched.unlooked:
         names = ", ".join(searched.unlooked)
         headline["text"] += (
@@ -275,40 +303,6 @@ def _segment_rows(searched: Searched, label: str) -> list[dict[str, Any]]:
         )
         for name, area, poa in searched.segments
     ]
-
-
-def _headline(
-    label: str, row: Mapping[str, Any], settings: SearchSettings, so_far: SoFar | None
-) -> dict[str, Any]:
-    """The search in one line, and whether all of the area was searched well enough."""
-    area_m2 = row["area_m2"]
-    shares = (
-        {reason: holes_m2 / area_m2 for reason, holes_m2 in row["holes_m2"].items()}
-        if area_m2
-        else {}
-    )
-    holes = ", ".join(f"{share:.0%} {reason}" for reason, share in shares.items() if share >= 0.005)
-    chance = f"{row['pod']:.2f} (90 % interval {row['pod_low']:.2f} to {row['pod_high']:.2f})"
-    by = (
-        ""
-        if so_far is None
-        else (
-            f"so far, by {so_far.measured} of {counted(so_far.placed, 'picture')} of the flight {so_far.flight} "
-            f"{'and ' + counted(len(so_far.earlier), 'flight') + ' before it' if so_far.earlier else 'alone'}: "
-        )
-    )
-    looked = f"; {row['seen_m2'] / area_m2:.0%} of the area looked at" if area_m2 else ""
-    text = f"{by}probability of detection of a {label} anywhere in the area: {chance}{looked}"
-    total = sum(shares.values())
-    is_complete = total <= _MOST_HOLES
-    text += (
-        "; no holes"
-        if is_complete
-        else (
-            f"; {total:.0%} of the area is below {settings.enough:g}: {holes or 'in small pieces'}"
-        )
-    )
-    return {"text": text, "complete": is_complete, "hole_share": total}
 
 
 def _warnings(searched: Searched, settings: SearchSettings, *, is_over: bool) -> list[str]:

@@ -453,8 +453,19 @@ def write_yolo(folder: Path, labelled: LabelledSet) -> int:
             picture.boxes_px, picture.labels, picture.width_px, picture.height_px
         )
     for place, text in texts.items():
-        write_yolo_text(folder / "labels" / place, text)
-    write_yolo_names(folder, labelled.classes)
+        path = folder / "labels" / place
+        make_folder(path.parent)
+        atomic_write_bytes(path, text.encode(), durable=False)
+    # the two places where tools look for YOLO's class names
+    make_folder(folder)
+    plain = "".join(f"{name}\n" for name in labelled.classes)
+    atomic_write_bytes(folder / "classes.txt", plain.encode(), durable=False)
+    quoted = [
+        name.replace("'", "''") for name in labelled.classes
+    ]  # as YAML's scalars in single quotes
+    numbered = [f"  {number}: '{name}'" for number, name in enumerate(quoted)]
+    lines = ["path: .", "train: images", "val: images", "names:", *numbered]
+    atomic_write_bytes(folder / "data.yaml", ("\n".join(lines) + "\n").encode(), durable=False)
     return sum(len(picture.ignored_px) for picture in labelled.pictures)
 
 
@@ -466,25 +477,6 @@ def yolo_text(boxes_px: BoxesPx, labels: Labels, width_px: int, height_px: int) 
         f"{int(label)} {x:.7f} {y:.7f} {width:.7f} {height:.7f}\n"
         for label, (x, y), (width, height) in zip(labels, centres, sides)
     )
-
-
-def write_yolo_text(path: Path, text: str) -> None:
-    """Write one label file and the folders above it. Raises StoreError on a full disk."""
-    make_folder(path.parent)
-    atomic_write_bytes(path, text.encode(), durable=False)
-
-
-def write_yolo_names(folder: Path, classes: Iterable[str]) -> None:
-    """Write `classes.txt` and `data.yaml`, the two places where tools look for YOLO's class names."""
-    names = list(classes)
-    make_folder(folder)
-    atomic_write_bytes(
-        folder / "classes.txt", "".join(f"{name}\n" for name in names).encode(), durable=False
-    )
-    quoted = [name.replace("'", "''") for name in names]  # as YAML's scalars in single quotes
-    numbered = [f"  {number}: '{name}'" for number, name in enumerate(quoted)]
-    lines = ["path: .", "train: images", "val: images", "names:", *numbered]
-    atomic_write_bytes(folder / "data.yaml", ("\n".join(lines) + "\n").encode(), durable=False)
 
 
 def _annotation(

@@ -147,7 +147,26 @@ def _control(report: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def _plots(report: Mapping[str, Any]) -> dict[str, str]:
-    track = _track(report)
+    # without GPS there is nothing that its positions could be compared with
+    rows = at(report, "track") or []
+    unknown = float("nan")
+    has_gps = bool(report.get("georeferenced"))
+    columns = {
+        name: np.array(
+            [
+                unknown if (number := finite_or_none(row.get(name))) is None else number
+                for row in rows
+            ]
+        )
+        if has_gps or not name.startswith("gps_")
+        else np.full(len(rows), unknown)
+        for name in _TRACK_NUMBERS
+    }
+    track = TrackColumns(
+        tuple(str(row.get("frame")) for row in rows),
+        tuple(str(row.get("status")) for row in rows),
+        columns,
+    )
     if not len(track):
         return {"plan": "", "residuals": "", "scatter": "", "along": ""}
     unit = "m" if report.get("georeferenced") else ""
@@ -178,29 +197,6 @@ def _stages(report: Mapping[str, Any]) -> list[dict[str, Any]]:
         }
         for name, value, cpu_s in rows
     ]
-
-
-def _track(report: Mapping[str, Any]) -> TrackColumns:
-    """The report's track; without GPS there is nothing that its positions could be compared with."""
-    rows = at(report, "track") or []
-    unknown = float("nan")
-    has_gps = bool(report.get("georeferenced"))
-    columns = {
-        name: np.array(
-            [
-                unknown if (number := finite_or_none(row.get(name))) is None else number
-                for row in rows
-            ]
-        )
-        if has_gps or not name.startswith("gps_")
-        else np.full(len(rows), unknown)
-        for name in _TRACK_NUMBERS
-    }
-    return TrackColumns(
-        tuple(str(row.get("frame")) for row in rows),
-        tuple(str(row.get("status")) for row in rows),
-        columns,
-    )
 
 
 _MOST_CROP_BYTES = 250_000  # of all pictures together: the page stays one that can be mailed

@@ -280,7 +280,30 @@ def read_raster(path: Path, max_px: int) -> Raster:
     """
     try:
         with open_raster(path, "a GeoTIFF") as source:
-            return _raster(source, path, max_px)
+            _demand_readable(source, path)
+            transform = source.transform
+            step = -(-max(source.width, source.height) // max_px)
+            width, height = source.width // step, source.height // step
+            if not width or not height:
+                raise InputError(
+                    f"{path} is {source.width}x{source.height} px, too narrow to thin to {max_px} px"
+                )
+            window = Window(0, 0, width * step, height * step)
+            bands = [1, 2, 3] if source.count >= 3 else [1, 1, 1]
+            rgb = source.read(
+                bands, window=window, out_shape=(3, height, width), resampling=Resampling.average
+            )
+            alpha = source.dataset_mask(
+                window=window, out_shape=(height, width), resampling=Resampling.average
+            )
+            m_per_px = transform.a * step
+            epsg = source.crs.to_epsg() if source.crs is not None else None
+            return Raster(
+                np.ascontiguousarray(np.moveaxis(np.concatenate([rgb, alpha[None]]), 0, 2)),
+                (transform.c + m_per_px / 2, transform.f - m_per_px / 2),
+                m_per_px,
+                f"EPSG:{epsg}" if epsg else source.crs.to_wkt() if source.crs is not None else "",
+            )
     except RasterioError as error:
         raise InputError(
             f"{path} is no readable GeoTIFF ({error}); export it as GeoTIFF again"
@@ -513,30 +536,3 @@ def _demand_readable(source: rasterio.DatasetReader, path: Path) -> None:
         raise InputError(
             f"{path} is in degrees ({source.crs}); warp it to a CRS in metres, as its UTM zone"
         )
-
-
-def _raster(source: rasterio.DatasetReader, path: Path, max_px: int) -> Raster:
-    _demand_readable(source, path)
-    transform = source.transform
-    step = -(-max(source.width, source.height) // max_px)
-    width, height = source.width // step, source.height // step
-    if not width or not height:
-        raise InputError(
-            f"{path} is {source.width}x{source.height} px, too narrow to thin to {max_px} px"
-        )
-    window = Window(0, 0, width * step, height * step)
-    bands = [1, 2, 3] if source.count >= 3 else [1, 1, 1]
-    rgb = source.read(
-        bands, window=window, out_shape=(3, height, width), resampling=Resampling.average
-    )
-    alpha = source.dataset_mask(
-        window=window, out_shape=(height, width), resampling=Resampling.average
-    )
-    m_per_px = transform.a * step
-    epsg = source.crs.to_epsg() if source.crs is not None else None
-    return Raster(
-        np.ascontiguousarray(np.moveaxis(np.concatenate([rgb, alpha[None]]), 0, 2)),
-        (transform.c + m_per_px / 2, transform.f - m_per_px / 2),
-        m_per_px,
-        f"EPSG:{epsg}" if epsg else source.crs.to_wkt() if source.crs is not None else "",
-    )

@@ -31,11 +31,6 @@ def is_plain_name(name: str) -> bool:
     )
 
 
-def is_epsg(crs: str) -> bool:
-    """Whether the text is an EPSG code. Anything else may make GDAL or PROJ open a file or an address."""
-    return _EPSG.fullmatch(crs) is not None
-
-
 def checked_name(name: str, what: str) -> str:
     """The name of a flight, a change or an object; raises StoreError when it cannot name a file."""
     if not isinstance(name, str) or not is_plain_name(name):
@@ -75,7 +70,8 @@ def checked_image_path(path: str, flight_id: str) -> str:
 
 def checked_crs(crs: str) -> str:
     """An EPSG code, or "" for none; raises StoreError for anything else."""
-    if crs and not (isinstance(crs, str) and is_epsg(crs)):
+    # anything else may make GDAL or PROJ open a file or an address
+    if crs and not (isinstance(crs, str) and _EPSG.fullmatch(crs)):
         raise _refused(
             crs, "coordinate reference system", "an EPSG code such as EPSG:32633 was needed"
         )
