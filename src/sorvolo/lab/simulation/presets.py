@@ -1,6 +1,6 @@
 """Ready-made simulations: the demo, the benchmark flights, and the variety of the UMCD dataset (Tables 2.1-2.4)."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from sorvolo.errors import SettingsError
@@ -64,7 +64,6 @@ _WITH_TELEMETRY = {
 
 
 _COMPARE_LATER = LaterSettings(people=2, cars=1, small_objects=3, removed=3, moved=3)
-_WEATHER, _REVISIT = WeatherSettings(), RevisitSettings()
 
 
 def preset_names() -> tuple[str, ...]:
@@ -78,7 +77,7 @@ def preset(name: str) -> SimulationSettings:
     Raises SettingsError for an unknown name, with those that come close in it.
     """
     if name in _GENERAL:
-        return _GENERAL[name]()
+        return replace(_GENERAL[name], preset=name)
     rows = _dataset()
     if name not in rows:
         raise SettingsError(
@@ -118,19 +117,8 @@ def _dataset() -> dict[str, _Row]:
     return rows | {f"umcd-telemetry-{name}": row for name, row in _WITH_TELEMETRY.items()}
 
 
-def _demo() -> SimulationSettings:
+def _survey(ground: str) -> SimulationSettings:
     return SimulationSettings(
-        preset="demo",
-        scene=SceneSettings("countryside", people=4, cars=3, small_objects=5),
-        path=PathSettings(height_m=24, speed_m_s=5, length_m=50, strips=3, strip_spacing_m=12),
-        imaging=ImagingSettings(fps=10),
-        sensor=SensorSettings(noise_m=(0.5, 0.5, 0.5), wander_m=0.5),
-    )
-
-
-def _survey(ground: str, name: str) -> SimulationSettings:
-    return SimulationSettings(
-        preset=name,
         flights=1,
         scene=SceneSettings(ground),
         # 40 m and 62 degrees give 0.05 m a pixel; five strips at 70 % overlap along, 60 % across
@@ -140,10 +128,48 @@ def _survey(ground: str, name: str) -> SimulationSettings:
     )
 
 
-def _fixed_wing() -> SimulationSettings:
-    """A survey by a small flying wing: 60 % overlap, gusts that roll it by 15 degrees, wind across, poor light."""
+def _compare(
+    ground: str = "countryside", later: LaterSettings = _COMPARE_LATER
+) -> SimulationSettings:
+    """Two short video flights over the same path: things added, taken away, moved and moving, in other weather."""
     return SimulationSettings(
-        preset="fixed-wing",
+        scene=SceneSettings(ground, people=3, cars=2, small_objects=5),
+        # 24 m and 62 degrees give 0.022 m a pixel: a person is some 20 pixels wide
+        path=PathSettings(height_m=24, speed_m_s=5, length_m=45, strips=2, strip_spacing_m=12),
+        imaging=ImagingSettings(*_HD, fps=30),
+        sensor=SensorSettings(noise_m=(0.5, 0.5, 0.5)),
+        later=later,
+        # views are taken about five times a second: every sixth frame
+        output=OutputSettings(truth_step=3),
+    )
+
+
+def _compare_unlike(
+    weather: WeatherSettings = WeatherSettings(), revisit: RevisitSettings = RevisitSettings()
+) -> SimulationSettings:
+    """The flights of `compare`, shorter, the second one in a way that makes comparing hard or impossible."""
+    settings = _compare(later=replace(_COMPARE_LATER, weather=weather, revisit=revisit))
+    return replace(
+        settings,
+        path=replace(settings.path, length_m=25),
+        imaging=replace(settings.imaging, fps=10),
+        output=replace(settings.output, truth_step=2),
+    )
+
+
+_GENERAL: Mapping[str, SimulationSettings] = {
+    "demo": SimulationSettings(
+        scene=SceneSettings("countryside", people=4, cars=3, small_objects=5),
+        path=PathSettings(height_m=24, speed_m_s=5, length_m=50, strips=3, strip_spacing_m=12),
+        imaging=ImagingSettings(fps=10),
+        sensor=SensorSettings(noise_m=(0.5, 0.5, 0.5), wander_m=0.5),
+    ),
+    "survey": _survey("countryside"),
+    "survey-urban": _survey("urban"),
+    "survey-dirt": _survey("dirt"),
+    "sand": _survey("sand"),
+    # a small flying wing: 60 % overlap, gusts that roll it by 15 degrees, wind across, poor light
+    "fixed-wing": SimulationSettings(
         flights=1,
         scene=SceneSettings("countryside"),
         # 65 m and 72 degrees give 0.06 m a pixel; strips at 60 % overlap both ways
@@ -163,91 +189,32 @@ def _fixed_wing() -> SimulationSettings:
         imaging=ImagingSettings(1600, 1200, 72.0, fps=5, exposure_s=1 / 400),
         sensor=SensorSettings(noise_m=(1.0, 1.0, 1.5), wander_m=1.0, attitude_noise_deg=2.0),
         output=OutputSettings(photos=True, photo_overlap=0.6),
-    )
-
-
-def _compare(
-    name: str, ground: str = "countryside", later: LaterSettings | None = None
-) -> SimulationSettings:
-    """Two short video flights over the same path: things added, taken away, moved and moving, in other weather."""
-    return SimulationSettings(
-        preset=name,
-        scene=SceneSettings(ground, people=3, cars=2, small_objects=5),
-        # 24 m and 62 degrees give 0.022 m a pixel: a person is some 20 pixels wide
-        path=PathSettings(height_m=24, speed_m_s=5, length_m=45, strips=2, strip_spacing_m=12),
-        imaging=ImagingSettings(*_HD, fps=30),
-        sensor=SensorSettings(noise_m=(0.5, 0.5, 0.5)),
-        later=later or _COMPARE_LATER,
-        # views are taken about five times a second: every sixth frame
-        output=OutputSettings(truth_step=3),
-    )
-
-
-def _compare_photos(name: str) -> SimulationSettings:
-    """Two survey flights by photos, each place of the ground in four or more of them."""
-    return SimulationSettings(
-        preset=name,
+    ),
+    "compare": _compare(),
+    "compare-urban": _compare("urban"),
+    "compare-dirt": _compare("dirt"),
+    # each place of the ground in four or more of the photos
+    "compare-photos": SimulationSettings(
         scene=SceneSettings("countryside", people=4, cars=3, small_objects=6),
         path=PathSettings(height_m=36, speed_m_s=6, length_m=70, strips=3, strip_spacing_m=17),
         imaging=ImagingSettings(1600, 1200, fps=5),
         sensor=SensorSettings(noise_m=(0.5, 0.5, 0.5)),
         later=replace(_COMPARE_LATER, people=3, small_objects=4),
         output=OutputSettings(photos=True, photo_overlap=0.75),
-    )
-
-
-def _compare_none(name: str) -> SimulationSettings:
-    """The flights of `compare` with nothing changed but light, clouds and wind: whatever is found is false."""
-    settings = _compare(
-        name, later=LaterSettings(people=0, cars=0, small_objects=0, removed=0, moved=0)
-    )
-    return replace(settings, scene=replace(settings.scene, moving_share=0.0))
-
-
-def _compare_unlike(
-    name: str, weather: WeatherSettings = _WEATHER, revisit: RevisitSettings = _REVISIT
-) -> SimulationSettings:
-    """The flights of `compare`, shorter, the second one in a way that makes comparing hard or impossible."""
-    settings = _compare(name, later=replace(_COMPARE_LATER, weather=weather, revisit=revisit))
-    return replace(
-        settings,
-        path=replace(settings.path, length_m=25),
-        imaging=replace(settings.imaging, fps=10),
-        output=replace(settings.output, truth_step=2),
-    )
-
-
-_GENERAL: Mapping[str, Callable[[], SimulationSettings]] = {
-    "demo": _demo,
-    "survey": lambda: _survey("countryside", "survey"),
-    "survey-urban": lambda: _survey("urban", "survey-urban"),
-    "survey-dirt": lambda: _survey("dirt", "survey-dirt"),
-    "sand": lambda: _survey("sand", "sand"),
-    "fixed-wing": _fixed_wing,
-    "compare": lambda: _compare("compare"),
-    "compare-urban": lambda: _compare("compare-urban", "urban"),
-    "compare-dirt": lambda: _compare("compare-dirt", "dirt"),
-    "compare-photos": lambda: _compare_photos("compare-photos"),
-    "compare-none": lambda: _compare_none("compare-none"),
-    "compare-higher": lambda: _compare_unlike(
-        "compare-higher", revisit=RevisitSettings(height_factor=1.5)
     ),
-    "compare-across": lambda: _compare_unlike(
-        "compare-across", revisit=RevisitSettings(heading_change_deg=90)
+    # nothing changed but light, clouds and wind: whatever is found is false
+    "compare-none": replace(
+        _compare(later=LaterSettings(people=0, cars=0, small_objects=0, removed=0, moved=0)),
+        scene=SceneSettings("countryside", people=3, cars=2, small_objects=5, moving_share=0.0),
     ),
-    "compare-back": lambda: _compare_unlike(
-        "compare-back", revisit=RevisitSettings(heading_change_deg=180)
-    ),
-    "compare-camera": lambda: _compare_unlike(
-        "compare-camera",
+    "compare-higher": _compare_unlike(revisit=RevisitSettings(height_factor=1.5)),
+    "compare-across": _compare_unlike(revisit=RevisitSettings(heading_change_deg=90)),
+    "compare-back": _compare_unlike(revisit=RevisitSettings(heading_change_deg=180)),
+    "compare-camera": _compare_unlike(
         revisit=RevisitSettings(
             imaging=ImagingSettings(1920, 1080, 74.0, (-0.02, 0.01, 0.0, 0.0, 0.0), fps=10)
         ),
     ),
-    "compare-night": lambda: _compare_unlike(
-        "compare-night", WeatherSettings(has_clouds=False, brightness=0.06)
-    ),
-    "compare-snow": lambda: _compare_unlike(
-        "compare-snow", WeatherSettings(has_clouds=False, snow=1.0)
-    ),
+    "compare-night": _compare_unlike(WeatherSettings(has_clouds=False, brightness=0.06)),
+    "compare-snow": _compare_unlike(WeatherSettings(has_clouds=False, snow=1.0)),
 }
