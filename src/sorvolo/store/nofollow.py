@@ -33,7 +33,26 @@ def read_below(folder: Path, relative: str, most_bytes: int = MOST_BYTES) -> byt
 
 def open_below(folder: Path, relative: str) -> BinaryIO:
     """The file `relative` below the folder, opened to be read piece by piece; raises as `read_below`."""
-    return os.fdopen(_descriptor_below(folder, relative), "rb")
+    path = folder / relative
+    parts = PurePosixPath(relative).parts
+    if not parts or ".." in parts or parts[0] == "/":
+        raise StoreError(
+            f"{relative!r} is no path below {folder}; the site is damaged or was made to do harm"
+        )
+    try:
+        descriptor = _descend(folder, parts)
+    except FileNotFoundError as error:
+        raise FileNotFoundError(error.errno, error.strerror, str(path)) from error
+    except OSError as error:
+        if error.errno in _LINK_ERRORS:
+            raise _refused(path) from error
+        raise StoreError(
+            f"cannot read {path} ({error.strerror}); check the disk and its permissions"
+        ) from error
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise _refused(path)
+    return os.fdopen(descriptor, "rb")
 
 
 def chunks_of(stream: BinaryIO) -> Iterator[bytes]:
@@ -63,29 +82,6 @@ def refuse_links(folder: Path, *, skipped: frozenset[str] = frozenset()) -> None
                     waiting.append(Path(entry.path))
             elif not entry.is_file(follow_symlinks=False):
                 raise _refused(Path(entry.path))
-
-
-def _descriptor_below(folder: Path, relative: str) -> int:
-    path = folder / relative
-    parts = PurePosixPath(relative).parts
-    if not parts or ".." in parts or parts[0] == "/":
-        raise StoreError(
-            f"{relative!r} is no path below {folder}; the site is damaged or was made to do harm"
-        )
-    try:
-        descriptor = _descend(folder, parts)
-    except FileNotFoundError as error:
-        raise FileNotFoundError(error.errno, error.strerror, str(path)) from error
-    except OSError as error:
-        if error.errno in _LINK_ERRORS:
-            raise _refused(path) from error
-        raise StoreError(
-            f"cannot read {path} ({error.strerror}); check the disk and its permissions"
-        ) from error
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        os.close(descriptor)
-        raise _refused(path)
-    return descriptor
 
 
 def _descend(folder: Path, parts: tuple[str, ...]) -> int:

@@ -26,6 +26,7 @@ def training_page(report: Mapping[str, Any]) -> str:
         list(lines.values()).count(lines["all classes"]) == len(lines) == 2
     ):  # the mean over one class is that class
         del lines["all classes"]
+    early = ", then its checks no longer got better" if report["stopped_early"] else ""
     page = render(
         "training.html",
         package=__package__,
@@ -34,7 +35,10 @@ def training_page(report: Mapping[str, Any]) -> str:
         headline="Accuracy not measured: no pictures were held out"
         if ap50 is None
         else f"AP50 {_number(ap50)}",
-        summary=_summary(report),
+        summary=(
+            f"{report['step']} of {report['steps']} steps in {seconds_words(report['seconds'])} on "
+            f"{known(report['device'])}{early}. The model file has {report['export']['bytes'] / 1e6:.1f} MB."
+        ),
         notices=report["notices"],
         losses=_losses(report),
         checks=_plot("AP50 over steps", lines, high=1.0),
@@ -54,14 +58,6 @@ def training_page(report: Mapping[str, Any]) -> str:
         settings=_settings(report),
     )
     return str(page)
-
-
-def _summary(report: Mapping[str, Any]) -> str:
-    early = ", then its checks no longer got better" if report["stopped_early"] else ""
-    return (
-        f"{report['step']} of {report['steps']} steps in {seconds_words(report['seconds'])} on "
-        f"{known(report['device'])}{early}. The model file has {report['export']['bytes'] / 1e6:.1f} MB."
-    )
 
 
 def _losses(report: Mapping[str, Any]) -> dict[str, Any] | None:

@@ -131,8 +131,11 @@ def looked_at(
     return LookedAt(searched, seen, enough, ground.of_classes(), ground.flown_m2, excuses)
 
 
-def _searched_geojson(ground: LookedGround, site: Site) -> bytes:
-    """The flown ground as polygons: `state` looked at, too coarse or skipped, for its `classes`."""
+def searched_document(ground: LookedGround | None, site: Site) -> dict[str, bytes]:
+    """`searched.geojson` by its name, where the flight has a place; else nothing."""
+    if ground is None or not ground.flown_m2:
+        return {}
+    # the flown ground as polygons: `state` looked at, too coarse or skipped, for its `classes`
     cells, features = ground.cells(), list[dict[str, Any]]()
     if cells is not None:
         grid = CellGrid(cells.outer_corner_m(), cells.cell_m, site.crs, site.origin.longitude_deg)
@@ -145,14 +148,7 @@ def _searched_geojson(ground: LookedGround, site: Site) -> bytes:
                 {"state": GroundState(each.number).words, "classes": names} for each in regions
             ]
             features += region_features(regions, properties)
-    return geojson_bytes(feature_collection("searched", features, is_local=False))
-
-
-def searched_document(ground: LookedGround | None, site: Site) -> dict[str, bytes]:
-    """`searched.geojson` by its name, where the flight has a place; else nothing."""
-    if ground is None or not ground.flown_m2:
-        return {}
-    return {SEARCHED: _searched_geojson(ground, site)}
+    return {SEARCHED: geojson_bytes(feature_collection("searched", features, is_local=False))}
 
 
 def _percent(share: float) -> str:

@@ -43,25 +43,6 @@ def frames_geojson(placed: Sequence[PlacedFrame], site: Site) -> dict[str, Any]:
 def _frame(frame: PlacedFrame, site: Site) -> dict[str, Any]:
     # a video's frames are named by their index, photos by their file
     is_indexed = frame.name == str(frame.index)
-    properties = {
-        "frame": frame.index if is_indexed else frame.name,
-        "time": utc_text(frame.time_ns),
-        "status": frame.status.value,
-        "reason": frame.reason,
-        **_camera_place(frame, site),
-        "residual_px": rounded(frame.residual_px, 4),
-        "sigma_m": rounded(frame.sigma_m, 4),
-        "gps_residual_east_m": rounded(frame.gps_residual_m[0], 4),
-        "gps_residual_north_m": rounded(frame.gps_residual_m[1], 4),
-        "gps_residual_up_m": rounded(frame.gps_residual_m[2], 4),
-    }
-    geometry = None
-    if np.isfinite(frame.outline_m).all():
-        geometry = {"type": "Polygon", "coordinates": [ring(frame.outline_m, site, 10)]}
-    return feature(geometry, properties)
-
-
-def _camera_place(frame: PlacedFrame, site: Site) -> dict[str, Any]:
     longitude_deg = latitude_deg = height_m = up_m = yaw_deg = pitch_deg = roll_deg = np.nan
     local = {}
     if frame.site_from_camera is not None:
@@ -72,7 +53,11 @@ def _camera_place(frame: PlacedFrame, site: Site) -> dict[str, Any]:
             local = {"camera_east": rounded(east_m, 6), "camera_north": rounded(north_m, 6)}
         else:
             longitude_deg, latitude_deg = place_deg(frame.site_from_camera.translation_m, site)
-    return {
+    properties = {
+        "frame": frame.index if is_indexed else frame.name,
+        "time": utc_text(frame.time_ns),
+        "status": frame.status.value,
+        "reason": frame.reason,
         "camera_longitude_deg": rounded(longitude_deg, 10),
         "camera_latitude_deg": rounded(latitude_deg, 10),
         **local,
@@ -82,7 +67,16 @@ def _camera_place(frame: PlacedFrame, site: Site) -> dict[str, Any]:
         "camera_yaw_deg": rounded(yaw_deg, 5),
         "camera_pitch_deg": rounded(pitch_deg, 5),
         "camera_roll_deg": rounded(roll_deg, 5),
+        "residual_px": rounded(frame.residual_px, 4),
+        "sigma_m": rounded(frame.sigma_m, 4),
+        "gps_residual_east_m": rounded(frame.gps_residual_m[0], 4),
+        "gps_residual_north_m": rounded(frame.gps_residual_m[1], 4),
+        "gps_residual_up_m": rounded(frame.gps_residual_m[2], 4),
     }
+    geometry = None
+    if np.isfinite(frame.outline_m).all():
+        geometry = {"type": "Polygon", "coordinates": [ring(frame.outline_m, site, 10)]}
+    return feature(geometry, properties)
 
 
 def coverage_geojson(ground: Sequence[CoveredGround], site: Site) -> dict[str, Any]:

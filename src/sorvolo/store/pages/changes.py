@@ -166,6 +166,26 @@ def _listed(
     change: StoredChange, site: Site, crops: _Crops, most_bytes: int, shown: Picture | None
 ) -> _Listed:
     outline_px = None if shown is None else _outline_px(change, site, shown)
+    details = [
+        (f"{name} (1 sigma)" if name == "position accuracy" else name, value)
+        for name, value in _cells(change, site)
+    ]
+    details.append(("last seen", time_words(change.last_seen_ns)))
+    if change.kind in (ChangeKind.DISAPPEARED, ChangeKind.REPLACED):
+        details.append(("was", change.class_before or "unknown object"))
+    if change.kind in (ChangeKind.APPEARED, ChangeKind.REPLACED, ChangeKind.MOVING):
+        details.append(("is now", change.class_after or "unknown object"))
+    if not site.is_local and np.isfinite(change.sigma_in_map_m):
+        details.append(("position on this map (1 sigma)", _length(change.sigma_in_map_m)))
+    if change.height_change is not None:
+        risen = change.height_change
+        details.append(
+            ("height change", f"{risen.rise_m:+.2f} m (accuracy {risen.sigma_m:.2f} m, 1 sigma)")
+        )
+    if change.kind is ChangeKind.MOVING:
+        details.append(("moves", _velocity(change.velocity_m_s, site)))
+    if change.note:
+        details.append(("note", change.note))
     return _Listed(
         change.number,
         change.id,
@@ -176,7 +196,7 @@ def _listed(
         None if outline_px is None or shown is None else _pin(outline_px, shown),
         tuple(place_words(change.centre_m, site).items()),
         _cells(change, site),
-        _details(change, site),
+        tuple(details),
         tuple(
             _crop(rgba, change, when, most_bytes) for when, rgba in zip(("before", "after"), crops)
         ),
@@ -200,30 +220,6 @@ def _cells(change: StoredChange, site: Site) -> tuple[tuple[str, str], ...]:
         ("first seen", time_words(change.first_seen_ns)),
         ("score", f"{change.score:.2f}"),
     )
-
-
-def _details(change: StoredChange, site: Site) -> tuple[tuple[str, str], ...]:
-    details = [
-        (f"{name} (1 sigma)" if name == "position accuracy" else name, value)
-        for name, value in _cells(change, site)
-    ]
-    details.append(("last seen", time_words(change.last_seen_ns)))
-    if change.kind in (ChangeKind.DISAPPEARED, ChangeKind.REPLACED):
-        details.append(("was", change.class_before or "unknown object"))
-    if change.kind in (ChangeKind.APPEARED, ChangeKind.REPLACED, ChangeKind.MOVING):
-        details.append(("is now", change.class_after or "unknown object"))
-    if not site.is_local and np.isfinite(change.sigma_in_map_m):
-        details.append(("position on this map (1 sigma)", _length(change.sigma_in_map_m)))
-    if change.height_change is not None:
-        risen = change.height_change
-        details.append(
-            ("height change", f"{risen.rise_m:+.2f} m (accuracy {risen.sigma_m:.2f} m, 1 sigma)")
-        )
-    if change.kind is ChangeKind.MOVING:
-        details.append(("moves", _velocity(change.velocity_m_s, site)))
-    if change.note:
-        details.append(("note", change.note))
-    return tuple(details)
 
 
 def _crop(rgba: ImageRGBA | None, change: StoredChange, when: str, most_bytes: int) -> _Crop:
