@@ -9,6 +9,8 @@ from sorvolo.capture.clock_offset import OffsetEstimate, estimate_offset
 from sorvolo.capture.photos import PhotoSource
 from sorvolo.capture.source import LiveSource, Source
 from sorvolo.capture.sync import (
+    STARTS_TIED,
+    UTC_TIE,
     CameraTrack,
     Clock,
     shifted,
@@ -86,11 +88,6 @@ class FlightTelemetry:
         return max(float(np.median(self.track.up_m[self._known])), _LOWEST_M)
 
     @property
-    def median_height_m(self) -> float:
-        """The median of the heights above the ground at all samples, with or without a fix."""
-        return float(np.nanmedian(self.track.up_m))
-
-    @property
     def usual_sigma_m(self) -> float:
         """The median of the fixes' stated sigma, horizontal."""
         return float(np.nanmedian(self.track.horizontal_sigma_m[self._known]))
@@ -121,7 +118,7 @@ class FlightTelemetry:
             np.array(seconds)[tied],
             seen_m[tied, :2],
             reach_s=reach_s,
-            is_free=self.clock.is_of_a_log and not applied_s,
+            is_free=self.clock.tie in (UTC_TIE, STARTS_TIED) and not applied_s,
         )
 
     def prior(self, seconds: float, smooth_s: float) -> CameraPrior:

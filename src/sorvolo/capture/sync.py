@@ -75,11 +75,6 @@ class Clock:
     is_per_photo: bool = False
     covered_share: float = 1.0  # of the frames' time, by the fixes
 
-    @property
-    def is_of_a_log(self) -> bool:
-        """Whether the frames and a log of its own length are tied by what their clocks say, or by their starts."""
-        return self.tie in (UTC_TIE, STARTS_TIED)
-
 
 def tie_clocks(
     telemetry: Telemetry,
@@ -206,11 +201,6 @@ class CameraTrack:
         """Whether all fixes are one place: the drone hovered, or its receiver had stopped."""
         known_m = known_points(self.east_north_m)
         return len(known_m) > 0 and bool(np.ptp(known_m, axis=0).max() < _STILL_M)
-
-    @property
-    def counts_from_takeoff(self) -> bool:
-        """Whether heights are those above take-off, wherever in the world that is."""
-        return self.height_kind is HeightKind.ABOVE_TAKEOFF
 
     @property
     def height_words(self) -> str:

@@ -1,6 +1,6 @@
 """Frames found on a base map, as ties of a flight to its ground."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,7 +84,16 @@ def tie_to_base(
     misfit: Floats = np.zeros(0)
     for _ in range(_ROUNDS):
         parts = [_ties(mapper, each, full, m_per_px) for each in kept]
-        mapper.tie_to_ground(_joined(parts), is_datum=is_datum)
+        mapper.tie_to_ground(
+            GroundTies(
+                *(
+                    np.concatenate([getattr(each, name) for each in parts])
+                    for name in ("keyframe_ids", "ideal", "place_m", "sigma_px", "sigma_m")
+                ),
+                common_m=max(each.common_m for each in parts),
+            ),
+            is_datum=is_datum,
+        )
         misfit = np.array(
             [
                 np.median(
@@ -124,21 +133,6 @@ def _ties(
         np.full(count, scale),
         np.full(count, sigma_m),
         common_m=m_per_px,
-    )
-
-
-def _joined(parts: Sequence[GroundTies]) -> GroundTies:
-    columns: Mapping[str, Floats] = {
-        name: np.concatenate([getattr(each, name) for each in parts])
-        for name in ("keyframe_ids", "ideal", "place_m", "sigma_px", "sigma_m")
-    }
-    return GroundTies(
-        columns["keyframe_ids"].astype(int),
-        columns["ideal"],
-        columns["place_m"],
-        columns["sigma_px"],
-        columns["sigma_m"],
-        common_m=max(each.common_m for each in parts),
     )
 
 
@@ -185,13 +179,6 @@ def base_grid(
     return SiteGrid.at(
         frame.origin, max(base_m_per_px, native_m_per_px * max(1.0, width_px / 900)), crs
     )
-
-
-def overview_grid(
-    frame: LocalFrame, crs: str, base_m_per_px: float, extent_m: float, side_px: int
-) -> SiteGrid:
-    """The grid in which the whole of a base map is `side_px` at most."""
-    return SiteGrid.at(frame.origin, max(base_m_per_px, extent_m / side_px), crs)
 
 
 def as_overview(rgba: ImageRGBA, first_m: PointsM, site_grid: SiteGrid) -> Overview:

@@ -235,10 +235,6 @@ class _Refusal:
     reason: str
     prediction: LinkPrediction | None
 
-    @property
-    def was_tight(self) -> bool:
-        return self.prediction is not None and self.prediction.is_tight
-
 
 @dataclass(eq=False)
 class _Tie:
@@ -249,15 +245,6 @@ class _Tie:
     links: list[Link] = field(default_factory=list)
     refusals: dict[int, _Refusal] = field(default_factory=dict)
     dear: tuple[int, int] = (0, 0)  # asked the dear way, and linked by that
-
-    @property
-    def refusal_reason(self) -> str:
-        """Why the picture that refused first did."""
-        return (
-            next(iter(self.refusals.values())).reason
-            if self.refusals
-            else "nothing of the map lies under it"
-        )
 
 
 class PlanarMapper:
@@ -527,7 +514,9 @@ class PlanarMapper:
                     self._ask(tie, each, None, Effort.ALL)
         if not self._own and tie.guess is None:
             tie.guess = Pose(new.prior.rotation, new.prior.position_m)
-        reason = tie.refusal_reason
+        # why the picture that refused first did
+        first = next(iter(tie.refusals.values()), None)
+        reason = first.reason if first else "nothing of the map lies under it"
         if not tie.links and self._own and not new.prior.knows_place:
             tie.guess = None
             reason = f"no picture of the map fits it ({reason}) and telemetry reports no position"
@@ -558,7 +547,11 @@ class PlanarMapper:
         if tie.guess is None:
             return
         asked = {each.old_id for each in tie.links}
-        asked |= {other for other, no in tie.refusals.items() if not tie.links or no.was_tight}
+        asked |= {
+            other
+            for other, no in tie.refusals.items()
+            if not tie.links or (no.prediction is not None and no.prediction.is_tight)
+        }
         for each in self._under(tie.new, tie.guess, asked, previous, bool(tie.links)):
             self._ask(
                 tie,

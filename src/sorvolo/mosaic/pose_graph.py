@@ -240,7 +240,7 @@ class PoseGraph:
         self._solved_at = self._region_solved_at = len(self._nodes)
         self._is_strained = False
         self._align()
-        self._solve(self._own(), shared=True, iterations=iterations)
+        self._solve(self._own(), iterations)
         self._weigh_links()
         self._weigh_telemetry()
         return self._moved(np.flatnonzero(self._own()))
@@ -269,7 +269,18 @@ class PoseGraph:
         self._ground_common_m = ties.common_m
         self._align()
         if is_datum:
-            self._forget_places()
+            # take the flight's own frame out of its telemetry: looking down, with the heading that the map has
+            forward = -self._rows.rotations[:, :2, 1]
+            for at in np.flatnonzero(self._own()).tolist():
+                yaw_deg = float(np.degrees(np.arctan2(forward[at, 0], forward[at, 1])))
+                sigma_deg = np.array([*np.degrees(self._rows.stated_sigma_rad[at, :2]), np.inf])
+                down = site_from_gimbal_rotation(yaw_deg, -90.0, 0.0)
+                self._rows.set_prior(
+                    at,
+                    CameraPrior(
+                        self._rows.centres_m[at].copy(), np.full(3, np.inf), down, sigma_deg
+                    ),
+                )
         return self.conclude()
 
     def ground_places_m(self, ties: GroundTies) -> PointsM:
@@ -291,7 +302,7 @@ class PoseGraph:
         self._as_reported[:] = False
         moved = self.settle()
         sigma = shared_sigma(self._settings, self._as_reported)
-        factors = self._solve(self._own(), shared=True, iterations=0).equations.factorised()
+        factors = self._solve(self._own(), 0).equations.factorised()
         # the offsets, as indices of SHARED, that a flight does not show: telemetry is taken
         # as it reports them
         variances = shared_variances(factors)
@@ -313,7 +324,7 @@ class PoseGraph:
         """Focal length, offsets, links and residuals as they stand."""
         sigma = 0.0
         if self._settings.focal_sigma > 0:
-            factors = self._solve(self._own(), shared=True, iterations=0).equations.factorised()
+            factors = self._solve(self._own(), 0).equations.factorised()
             sigma = float(np.sqrt(max(0.0, shared_variances(factors)[0])))
         rms = np.array([value for value in self.residuals_px().values() if np.isfinite(value)])
         leans = list(self.leans_m().values())
@@ -366,7 +377,7 @@ class PoseGraph:
         """Each own keyframe's one-sigma error on the ground at its image centre, per axis, by the covariance; NaN where
         nothing shows where it lies."""
         own = self._own()
-        solution = self._solve(own, shared=True, iterations=0)
+        solution = self._solve(own, 0)
         sigmas = dict.fromkeys((self._names[at] for at in np.flatnonzero(own)), float("nan"))
         index = np.flatnonzero(own & self._held())
         sample = (
@@ -462,8 +473,8 @@ class PoseGraph:
             self._rows.centres_m[own, 2]
         )
 
-    def _solve(self, free: Mask, *, shared: bool, iterations: int) -> Solution:
-        sigma = shared_sigma(self._settings, self._as_reported) if shared else np.zeros(len(SHARED))
+    def _solve(self, free: Mask, iterations: int) -> Solution:
+        sigma = shared_sigma(self._settings, self._as_reported)
         solution = solve(
             self._state(),
             self._links,
@@ -584,18 +595,6 @@ class PoseGraph:
         places_m = self.ground_places_m(ties)
         known = np.isfinite(places_m).all(axis=1)
         return change_to_ground(places_m[known], ties.place_m[known, :2])
-
-    def _forget_places(self) -> None:
-        """Take the flight's own frame out of its telemetry: looking down, with the heading that the map has."""
-        forward = -self._rows.rotations[:, :2, 1]
-        for at in np.flatnonzero(self._own()).tolist():
-            yaw_deg = float(np.degrees(np.arctan2(forward[at, 0], forward[at, 1])))
-            sigma_deg = np.array([*np.degrees(self._rows.stated_sigma_rad[at, :2]), np.inf])
-            down = site_from_gimbal_rotation(yaw_deg, -90.0, 0.0)
-            self._rows.set_prior(
-                at,
-                CameraPrior(self._rows.centres_m[at].copy(), np.full(3, np.inf), down, sigma_deg),
-            )
 
     def _weigh_links(self) -> None:
         """Learn each link's noise across the parallax and the relief along it; drop links that cannot be true."""

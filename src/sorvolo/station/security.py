@@ -9,7 +9,7 @@ from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from http.cookies import CookieError, SimpleCookie
 from typing import Any
-from urllib.parse import quote
+from urllib.parse import quote, urlsplit
 
 from fastapi import Depends
 from starlette.exceptions import HTTPException
@@ -213,7 +213,9 @@ def check_host(host: str, settings: StationSettings) -> None:
         if ":" in host
         else host
     )
-    if name.lower() == "localhost" or name.lower() in settings.host_names:
+    public = urlsplit(settings.public_url).hostname or "localhost"
+    known = {each.lower() for each in ("localhost", public, settings.host, *settings.names)}
+    if name.lower() in known:
         return
     if not settings.is_loopback and (
         _is_address(name) or name.lower() == socket.gethostname().lower()

@@ -139,14 +139,6 @@ class StationSettings:
         return f"https://{parts.netloc.removesuffix(':443')}" if parts.netloc else ""
 
     @property
-    def host_names(self) -> frozenset[str]:
-        """The names and addresses under which browsers may ask, lower case, besides this machine's own."""
-        public = urlsplit(self.public_url).hostname
-        return frozenset(
-            each.lower() for each in (self.host, *self.names, *([public] if public else []))
-        )
-
-    @property
     def address(self) -> str:
         """What a browser on this machine opens."""
         host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.host, self.host)

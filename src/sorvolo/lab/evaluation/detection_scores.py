@@ -336,6 +336,19 @@ def score_set(
             )
         )
     m_per_px = np.array([picture.m_per_px for picture in labelled.pictures])
+    pictures = len(labelled)
+    remarks = [
+        f"only {each.labels} labels of {each.label}: read its numbers with their intervals"
+        for each in scores
+        if 0 < each.labels < 100
+    ]
+    remarks += [f"no label of {each.label}: it is not scored" for each in scores if not each.labels]
+    if tables.groups == 1 and pictures > 1:
+        remarks.append("all pictures are of one video or flight: no interval can be given")
+    elif tables.groups < 10:
+        remarks.append(
+            f"only {tables.groups} videos or flights: the intervals themselves are rough"
+        )
     return SetScores(
         labelled.name,
         len(labelled),
@@ -349,7 +362,7 @@ def score_set(
         recall_by_size(matches, thresholds, np.ones(len(labelled)), SIZES_PX),
         recall_by_size(matches, thresholds, m_per_px, SIZES_M),
         mistakes,
-        _remarks(scores, tables, len(labelled)),
+        tuple(remarks),
     )
 
 
@@ -406,19 +419,3 @@ def _thinned(rows: Floats) -> Floats:
     if len(rows) <= _CURVE_POINTS:
         return rows
     return rows[np.unique(np.linspace(0, len(rows) - 1, _CURVE_POINTS).round().astype(int))]
-
-
-def _remarks(scores: Sequence[ClassScores], tables: GroupTables, pictures: int) -> tuple[str, ...]:
-    remarks = [
-        f"only {each.labels} labels of {each.label}: read its numbers with their intervals"
-        for each in scores
-        if 0 < each.labels < 100
-    ]
-    remarks += [f"no label of {each.label}: it is not scored" for each in scores if not each.labels]
-    if tables.groups == 1 and pictures > 1:
-        remarks.append("all pictures are of one video or flight: no interval can be given")
-    elif tables.groups < 10:
-        remarks.append(
-            f"only {tables.groups} videos or flights: the intervals themselves are rough"
-        )
-    return tuple(remarks)

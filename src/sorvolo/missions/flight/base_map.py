@@ -13,6 +13,7 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import ImageRGB, PointsM
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import LocalFrame, utm_epsg
+from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.homography import site_from_image_homography
 from sorvolo.mosaic.base_ties import (
     BaseReport,
@@ -21,7 +22,6 @@ from sorvolo.mosaic.base_ties import (
     as_overview,
     base_grid,
     find_flight,
-    overview_grid,
     prior_on_map,
     sought_keyframes,
     tie_to_base,
@@ -142,7 +142,8 @@ class FlightBase:
     def _find_all(self, mapper: PlanarMapper, camera: Camera, frame: LocalFrame, crs: str) -> float:
         """Find a flight of unknown place; how well its place is known then, m."""
         overview = mapper.overview(_OVERVIEW_PX)
-        site_grid = overview_grid(frame, crs, self.base.m_per_px, self.base.extent_m, _OVERVIEW_PX)
+        coarse_m = max(self.base.m_per_px, self.base.extent_m / _OVERVIEW_PX)
+        site_grid = SiteGrid.at(frame.origin, coarse_m, crs)
         ground = as_overview(*self.base.overview(site_grid), site_grid)
         if overview is None or not find_flight(mapper, overview, ground, camera):
             raise InputError(

@@ -70,8 +70,9 @@ class FlightSetup:
 
     @property
     def usual_height_m(self) -> float:
-        """The median of the camera's height above the ground; NaN where telemetry does not give it."""
-        return float("nan") if self.telemetry is None else self.telemetry.median_height_m
+        """The median of the camera's height above the ground at all samples, with or without a fix; NaN where telemetry
+        does not give it."""
+        return float(np.nan if self.telemetry is None else np.nanmedian(self.telemetry.track.up_m))
 
     @property
     def usual_tilt_deg(self) -> float:

@@ -71,6 +71,10 @@ class Basis:
     ) -> Self:
         """The basis of a search of these frames."""
         area = "" if prepared.area is None else content_sha256(prepared.area.polygons_lonlat)
+        kept = [
+            (each.m_per_px, each.texture.shape, each.texture.tobytes().hex())
+            for each in prepared.cut_outs
+        ]
         places = [(each.placed.camera, pose_of(each.placed)) for each in frames]
         return cls(
             content_sha256(build(), software()),
@@ -82,7 +86,7 @@ class Basis:
             settings.plants,
             settings.seed,
             area,
-            prepared.cut_outs_sha256,
+            content_sha256(kept) if kept else "",
         )
 
     @classmethod

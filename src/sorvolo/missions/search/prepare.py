@@ -138,15 +138,6 @@ class PreparedSearch:
     detector: ObjectDetector
     cut_outs: tuple[CutOut, ...] = ()
 
-    @property
-    def cut_outs_sha256(self) -> str:
-        """A hash of the people to be planted; "" without any."""
-        kept = [
-            (each.m_per_px, each.texture.shape, each.texture.tobytes().hex())
-            for each in self.cut_outs
-        ]
-        return content_sha256(kept) if kept else ""
-
 
 def check_area(area: Area | None, site: Site) -> None:
     """Raise InputError for an area with a polygon farther from the site than any small drone flies."""
@@ -193,7 +184,18 @@ def prepare_search(
         with scratch_folder(there):
             pass
     check_waypoint_files(outputs.refly, outputs.folder, outputs.dji_drone)
-    _check_apart(outputs)
+    # waypoints must not take the place of an input, or of another file of the search
+    taken = {
+        path.resolve(): name
+        for name, path in (("--area", outputs.area), ("--poa", outputs.poa))
+        if path
+    }
+    taken |= {(outputs.folder / name).resolve(): f"a result, {name}" for name in RESULTS}
+    for path in outputs.refly:
+        if (name := taken.get(path.resolve())) is not None:
+            raise SettingsError(
+                f"--refly {path} is the file of {name}; give the waypoints another name"
+            )
     area = None if outputs.area is None else read_area(outputs.area)
     segments = [] if outputs.poa is None else read_segments(outputs.poa)
     looks = open_detector(settings.model, detector, is_live=is_live)
@@ -261,21 +263,6 @@ def _by_difference(source: Source, m_per_px: float | None) -> list[CutOut | None
         CutOut.of(frame.name, image, alpha, m_per_px * times, light)
         for frame, image, alpha, light in zip(frames, images, alphas, lights)
     ]
-
-
-def _check_apart(outputs: SearchOutputs) -> None:
-    """Raise SettingsError for waypoints that would take the place of an input, or of another file of the search."""
-    taken = {
-        path.resolve(): name
-        for name, path in (("--area", outputs.area), ("--poa", outputs.poa))
-        if path
-    }
-    taken |= {(outputs.folder / name).resolve(): f"a result, {name}" for name in RESULTS}
-    for path in outputs.refly:
-        if (name := taken.get(path.resolve())) is not None:
-            raise SettingsError(
-                f"--refly {path} is the file of {name}; give the waypoints another name"
-            )
 
 
 def site_with_metres(archive: Archive) -> Site:

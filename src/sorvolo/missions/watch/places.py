@@ -62,7 +62,7 @@ def over_heights(
             f"{model} has no height at {latitudes[0]:.5f}, {longitudes[0]:.5f}, where the telemetry begins; give one "
             "without a hole there, or --ground-elevation"
         )
-    if not setup.track.counts_from_takeoff:
+    if setup.track.height_kind is not HeightKind.ABOVE_TAKEOFF:
         is_ellipsoidal = setup.track.height_kind is HeightKind.ELLIPSOIDAL
         if heights.datum and ("ellips" in heights.datum.lower()) is not is_ellipsoidal:
             raise InputError(

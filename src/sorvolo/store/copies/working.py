@@ -58,11 +58,6 @@ class WorkingCopy:
         """Where the site lies."""
         return self._objects.name
 
-    @property
-    def is_unsent(self) -> bool:
-        """Whether the folder may hold what the store has not."""
-        return (self.folder / UNSENT).is_file()
-
     def is_ahead(self) -> bool:
         """Whether the folder's catalogue holds anything else than what it was made of, by anybody's work."""
         known = known_manifest(self.folder)
@@ -79,7 +74,7 @@ class WorkingCopy:
 
         Raises OvertakenError where another writer has changed the site, and StoreError as copies do.
         """
-        if self.is_unsent:
+        if (self.folder / UNSENT).is_file():
             yield from self.send(scratch)
         end = BucketEnd(self._objects)
         manifest, _ = end.find_manifest()
@@ -101,7 +96,8 @@ class WorkingCopy:
         """Send what the store has not; whether there was anything. Raises OvertakenError; StoreError as copies do."""
         known = known_manifest(self.folder)
         folder = _WorkingFolder(self.folder)
-        if not folder.has_map:
+        # unless a flight was ever completed
+        if not is_site(self.folder) or folder.find_held() is None:
             (self.folder / UNSENT).unlink(missing_ok=True)
             return False
         before = "" if known is None else known.id
@@ -198,11 +194,6 @@ class _WorkingFolder(FolderEnd):
     """The folder of a working copy: what is fetched when asked for need not be there; the store replaces it."""
 
     may_lose = True  # all that was added here was sent before
-
-    @property
-    def has_map(self) -> bool:
-        """Whether a flight was ever completed."""
-        return is_site(self.folder) and self.find_held() is not None
 
     def lacks(self, state: SiteState) -> list[SiteFile]:
         """Nothing that comes when it is asked for."""

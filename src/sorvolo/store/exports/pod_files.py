@@ -103,11 +103,15 @@ def regions_of(numbers: NDArray[np.uint8], grid: CellGrid) -> list[Region]:
     regions = []
     for shape, number in found:
         rings_m = [np.array(ring, np.float64)[:-1] for ring in shape["coordinates"]]
+        areas = []
+        for ring in rings_m:
+            x, y = (ring - ring[0]).T
+            areas.append(0.5 * abs(float(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1)))))
         regions.append(
             Region(
                 int(number),
                 tuple(_lonlat(ring, grid) for ring in rings_m),
-                _area_m2(rings_m),
+                areas[0] - sum(areas[1:]),
             )
         )
     return sorted(regions, key=lambda each: -each.area_m2)
@@ -203,11 +207,3 @@ def _with_all(
 def _lonlat(ring_m: PointsM, grid: CellGrid) -> Floats:
     latitude, longitude = Projection(grid.crs).wgs84_from_projected(ring_m)
     return np.column_stack([near_longitudes(longitude, grid.reference_deg), latitude])
-
-
-def _area_m2(rings_m: Sequence[PointsM]) -> float:
-    areas = []
-    for ring in rings_m:
-        x, y = (ring - ring[0]).T
-        areas.append(0.5 * abs(float(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1)))))
-    return areas[0] - sum(areas[1:])

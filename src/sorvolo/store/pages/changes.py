@@ -84,6 +84,15 @@ def changes_page(
         Counter(each.verdict for each in changes if each.verdict is not None),
     )
     measured = [name for name, _ in listed[0].cells] if listed else []
+    residual_px = number_at(report, "comparison", "residual_px", "median")
+    rows = [
+        ("method", at(report, "comparison", "method")),
+        ("misalignment of views and map", with_unit(residual_px, "{:.2f} px median")),
+        *(
+            (str(name).replace("_", " "), _plain(value))
+            for name, value in (at(report, "comparison", "chosen") or {}).items()
+        ),
+    ]
     page = render(
         "changes.html",
         report,
@@ -120,7 +129,7 @@ def changes_page(
         reasons=[
             (count, why) for why, count in (at(report, "comparison", "reasons") or {}).items()
         ],
-        how=_how(report),
+        how=[(name, str(value)) for name, value in rows if value is not None],
     )
     return str(page)
 
@@ -233,19 +242,6 @@ def _crop(rgba: ImageRGBA | None, change: StoredChange, when: str, most_bytes: i
     crop = change.crop
     outline_px = (change.outline_m - [crop.west_m, crop.north_m]) * [1, -1] / crop.m_per_px
     return _Crop(when, picture_uri(small, most_bytes), width_px, height_px, _points(outline_px))
-
-
-def _how(report: Mapping[str, Any]) -> list[tuple[str, str]]:
-    residual_px = number_at(report, "comparison", "residual_px", "median")
-    rows = [
-        ("method", at(report, "comparison", "method")),
-        ("misalignment of views and map", with_unit(residual_px, "{:.2f} px median")),
-        *(
-            (str(name).replace("_", " "), _plain(value))
-            for name, value in (at(report, "comparison", "chosen") or {}).items()
-        ),
-    ]
-    return [(name, str(value)) for name, value in rows if value is not None]
 
 
 def _outline_px(change: StoredChange, site: Site, shown: Picture) -> PointsPx:

@@ -60,6 +60,14 @@ def report_page(
     `object_crops` are the JPEG pictures of the objects, by their ids; `site` gives them coordinates. What is None, NaN
     or missing in the report is shown as unknown or left out. All text is escaped.
     """
+    # name, seconds, and seconds of processor time where known, of each stage and of the rest
+    wall, cpu = at(report, "seconds") or {}, at(report, "cpu_s") or {}
+    stages = {name: finite_or_none(value) or 0.0 for name, value in wall.items() if name != "total"}
+    rest = (finite_or_none(wall.get("total")) or 0.0) - sum(stages.values())
+    rows = [(name, value, finite_or_none(cpu.get(name))) for name, value in stages.items()]
+    if rest > 0:
+        rows.append(("reading frames, and the rest", rest, None))
+    longest = max([value for _, value, _ in rows] + [1e-9])
     page = render(
         "flight.html",
         report,
@@ -75,7 +83,15 @@ def report_page(
             [known(each.get(name)) for name in ("count", "text", "code")]
             for each in at(report, "notices") or []
         ],
-        stages=_stages(report),
+        stages=[
+            {
+                "name": name,
+                "share": value / longest,
+                "time": seconds_words(value),
+                "cpu": "" if cpu_s is None else seconds_words(cpu_s),
+            }
+            for name, value, cpu_s in rows
+        ],
         settings=[
             (name, _setting_words(value)) for name, value in (at(report, "settings") or {}).items()
         ],
@@ -176,27 +192,6 @@ def _plots(report: Mapping[str, Any]) -> dict[str, str]:
         "scatter": gps_scatter(track, unit=unit),
         "along": gps_along(track, unit=unit),
     }
-
-
-def _stages(report: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """What each stage took, and the rest."""
-    # Name, seconds, and seconds of processor time where known, of each stage and of the rest.
-    wall, cpu = at(report, "seconds") or {}, at(report, "cpu_s") or {}
-    stages = {name: finite_or_none(value) or 0.0 for name, value in wall.items() if name != "total"}
-    rest = (finite_or_none(wall.get("total")) or 0.0) - sum(stages.values())
-    rows = [(name, value, finite_or_none(cpu.get(name))) for name, value in stages.items()]
-    if rest > 0:
-        rows.append(("reading frames, and the rest", rest, None))
-    longest = max([value for _, value, _ in rows] + [1e-9])
-    return [
-        {
-            "name": name,
-            "share": value / longest,
-            "time": seconds_words(value),
-            "cpu": "" if cpu_s is None else seconds_words(cpu_s),
-        }
-        for name, value, cpu_s in rows
-    ]
 
 
 _MOST_CROP_BYTES = 250_000  # of all pictures together: the page stays one that can be mailed

@@ -18,6 +18,19 @@ from sorvolo.store.pages.words import (
 
 def search_page(report: Mapping[str, Any], pictures: Mapping[str, ImageRGBA]) -> str:
     """search.html of search.json's content; `pictures` are the maps of the classes' probabilities. Text is escaped."""
+    # what is stated, and what was found
+    rows = [
+        (
+            f"{name}, {label}",
+            float(each["stated"]),
+            float(each["found"]),
+            float(each["found_low"]),
+            float(each["found_high"]),
+            int(each["count"]),
+        )
+        for name, label, each in _calibrated(report)
+    ]
+    names = list(dict.fromkeys(name for name, *_ in rows))
     page = render(
         "search.html",
         report,
@@ -51,7 +64,10 @@ def search_page(report: Mapping[str, Any], pictures: Mapping[str, ImageRGBA]) ->
             for label, row in flight["classes"].items()
         ],
         calibration=_calibration(report),
-        calibration_plot=_calibration_plot(report),
+        calibration_plot={
+            "drawing": stated_and_found(rows),
+            "legend": [(colour_class(k), name) for k, name in enumerate(names)],
+        },
     )
     return str(page)
 
@@ -84,26 +100,6 @@ def under_trees_page(report: Mapping[str, Any], floor: ImageRGBA, crops: Sequenc
         crops=[jpeg_uri(each) for each in crops],
     )
     return str(page)
-
-
-def _calibration_plot(report: Mapping[str, Any]) -> dict[str, Any]:
-    """The drawing of `_calibration`, and what its colours are."""
-    rows = [
-        (
-            f"{name}, {label}",
-            float(each["stated"]),
-            float(each["found"]),
-            float(each["found_low"]),
-            float(each["found_high"]),
-            int(each["count"]),
-        )
-        for name, label, each in _calibrated(report)
-    ]
-    names = list(dict.fromkeys(name for name, *_ in rows))
-    return {
-        "drawing": stated_and_found(rows),
-        "legend": [(colour_class(k), name) for k, name in enumerate(names)],
-    }
 
 
 def _calibration(report: Mapping[str, Any]) -> list[list[str]]:

@@ -122,19 +122,7 @@ def _drawing(tracks: Sequence[_Track], drone_m: Floats, *, is_local: bool) -> Ma
         return np.asarray(middle_px + signs * (points - (low + high) / 2) * scale)
 
     bar = round_length(0.25 * (_WIDE_PX - 2 * _RIM_PX) / scale)
-    return render(
-        "plots/places.svg",
-        width=_WIDE_PX,
-        height=height_px,
-        rim=_RIM_PX,
-        path=on_drawing(path[:: max(1, len(path) // 1000)]).tolist(),
-        spots=_spots(tracks, on_drawing(places), scale),
-        bar=bar * scale,
-        bar_words=f"{bar:g} {'px' if is_local else 'm'}",
-    )
-
-
-def _spots(tracks: Sequence[_Track], places_px: Floats, scale: float) -> list[_Spot]:
+    places_px = on_drawing(places)
     classes = _classes(tracks)
     names = [str(each["id"]) for each in tracks]
     spots = []
@@ -145,7 +133,16 @@ def _spots(tracks: Sequence[_Track], places_px: Floats, scale: float) -> list[_S
         style = f"c{classes.index(str(each['class'])) % _COLOURS}"
         words = f"{each['class']} {each['id']}"
         spots.append(_Spot(float(x), float(y), radius, style, words, name, label_x, label_y))
-    return spots
+    return render(
+        "plots/places.svg",
+        width=_WIDE_PX,
+        height=height_px,
+        rim=_RIM_PX,
+        path=on_drawing(path[:: max(1, len(path) // 1000)]).tolist(),
+        spots=spots,
+        bar=bar * scale,
+        bar_words=f"{bar:g} {'px' if is_local else 'm'}",
+    )
 
 
 def _label_places(dots_px: Floats, names: Sequence[str]) -> list[tuple[float, float]]:

@@ -273,7 +273,17 @@ def list_versions(connection: Connection) -> list[VersionEntry]:
     tiles = func.count(schema.version_tiles.c.sha256)
     flown = schema.checked_rows(connection, schema.flown, select(schema.flown))
     flown_ns = {row.version_id: row.first_ns for row in flown}
-    compressions = _compressions(connection)
+    # how the versions' GeoTIFFs are compressed, by version; a version whose flight chose nothing is as its parent
+    wishes = {
+        row.id: row.settings.get("compress") if isinstance(row.settings, dict) else None
+        for row in connection.execute(select(schema.runs.c.id, schema.runs.c.settings))
+    }
+    compressions: dict[int, str] = {}
+    for row in connection.execute(select(schema.versions).order_by(schema.versions.c.id)):
+        wish = wishes.get(row.run_id)
+        compressions[row.id] = (
+            wish if wish in COMPRESSIONS else compressions.get(row.parent_id, COMPRESSIONS[0])
+        )
     rows = connection.execute(
         select(schema.versions, tiles.label("tiles"))
         .outerjoin(schema.version_tiles, schema.version_tiles.c.version_id == schema.versions.c.id)
@@ -293,19 +303,6 @@ def list_versions(connection: Connection) -> list[VersionEntry]:
         )
         for row in rows
     ]
-
-
-def _compressions(connection: Connection) -> dict[int, str]:
-    """How the versions' GeoTIFFs are compressed, by version; a version whose flight chose nothing is as its parent."""
-    wishes = {
-        row.id: row.settings.get("compress") if isinstance(row.settings, dict) else None
-        for row in connection.execute(select(schema.runs.c.id, schema.runs.c.settings))
-    }
-    found: dict[int, str] = {}
-    for row in connection.execute(select(schema.versions).order_by(schema.versions.c.id)):
-        wish = wishes.get(row.run_id)
-        found[row.id] = wish if wish in COMPRESSIONS else found.get(row.parent_id, COMPRESSIONS[0])
-    return found
 
 
 def newest_version(connection: Connection, *, complete: bool = True) -> int:
