@@ -84,16 +84,13 @@ def tie_to_base(
     misfit: Floats = np.zeros(0)
     for _ in range(_ROUNDS):
         parts = [_ties(mapper, each, full, m_per_px) for each in kept]
-        mapper.tie_to_ground(
-            GroundTies(
-                *(
-                    np.concatenate([getattr(each, name) for each in parts])
-                    for name in ("keyframe_ids", "ideal", "place_m", "sigma_px", "sigma_m")
-                ),
-                common_m=max(each.common_m for each in parts),
-            ),
-            is_datum=is_datum,
+        ids, ideal, place_m, sigma_px, sigma_m = (
+            np.concatenate([getattr(each, name) for each in parts])
+            for name in ("keyframe_ids", "ideal", "place_m", "sigma_px", "sigma_m")
         )
+        common_m = max(each.common_m for each in parts)
+        ties = GroundTies(ids, ideal, place_m, sigma_px, sigma_m, common_m)
+        mapper.tie_to_ground(ties, is_datum=is_datum)
         misfit = np.array(
             [
                 np.median(

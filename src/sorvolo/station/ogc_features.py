@@ -96,31 +96,7 @@ def feature_routes(collections: SiteCollections, reviews: Reviews) -> APIRouter:
         )
         if name == "changes":
             kept = [each for each in kept if _between(each["properties"], from_version, to_version)]
-        shown = kept[offset : offset + limit]
-        path = address(request, request.url.path)
-        links = [
-            _link(
-                f"{path}?{request.url.query}" if request.url.query else path,
-                "self",
-                _GEOJSON,
-                "This page",
-            )
-        ]
-        if offset + limit < len(kept):
-            query = urlencode(
-                {**dict(request.query_params), "limit": limit, "offset": offset + limit}
-            )
-            links.append(_link(f"{path}?{query}", "next", _GEOJSON, "Next page"))
-        return GeoJsonResponse(
-            {
-                "type": "FeatureCollection",
-                "timeStamp": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
-                "numberMatched": len(kept),
-                "numberReturned": len(shown),
-                "links": links,
-                "features": shown,
-            }
-        )
+        return GeoJsonResponse(_page(request, kept, limit, offset))
 
     @router.get("/collections/{name}/items/{feature_id}", response_class=GeoJsonResponse)
     def one_item(site: str, name: str, feature_id: str) -> JSONResponse:
@@ -167,6 +143,30 @@ def _about(name: str, collection: Collection, base: str) -> Json:
 
 def _link(href: str, rel: str, kind: str, title: str) -> dict[str, str]:
     return {"href": href, "rel": rel, "type": kind, "title": title}
+
+
+def _page(request: Request, features: Sequence[Feature], limit: int, offset: int) -> Json:
+    shown = features[offset : offset + limit]
+    path = address(request, request.url.path)
+    links = [
+        _link(
+            f"{path}?{request.url.query}" if request.url.query else path,
+            "self",
+            _GEOJSON,
+            "This page",
+        )
+    ]
+    if offset + limit < len(features):
+        query = urlencode({**dict(request.query_params), "limit": limit, "offset": offset + limit})
+        links.append(_link(f"{path}?{query}", "next", _GEOJSON, "Next page"))
+    return {
+        "type": "FeatureCollection",
+        "timeStamp": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
+        "numberMatched": len(features),
+        "numberReturned": len(shown),
+        "links": links,
+        "features": shown,
+    }
 
 
 def _places(collection: Collection, bbox: str) -> list[int]:
