@@ -24,23 +24,34 @@ _UNKNOWN_SIGMA_M = 1e6
 _FIRST_ROOM = 16  # rows; then they double
 
 
-class _Columns:
-    """Equally long columns, each (N, ...); appending costs the same however long they are."""
+class _Column:
+    """One of `_Rows`' columns, (N, *shape): a view, good until the next row or `keep`."""
 
-    def __init__(self, **shapes: tuple[type, tuple[int, ...]]) -> None:
+    def __init__(self, kind: type, *shape: int) -> None:
+        self.kind, self.shape = kind, shape
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    def __get__(self, rows: "_Rows", owner: type) -> NDArray[Any]:
+        return rows._columns[self.name][: rows._count]
+
+
+class _Rows:
+    """Equally long columns; a row more costs the same however long they are."""
+
+    def __init__(self) -> None:
         self._columns: dict[str, NDArray[Any]] = {
-            name: np.zeros((_FIRST_ROOM, *shape), dtype) for name, (dtype, shape) in shapes.items()
+            each.name: np.zeros((_FIRST_ROOM, *each.shape), each.kind)
+            for each in vars(type(self)).values()
+            if isinstance(each, _Column)
         }
         self._count = 0
 
     def __len__(self) -> int:
         return self._count
 
-    def column(self, name: str) -> NDArray[Any]:
-        """(N, ...) a view, good until the next `append` or `keep`."""
-        return self._columns[name][: self._count]
-
-    def append(self, **row: Any) -> None:
+    def _add(self, **row: Any) -> None:
         """One value for each column."""
         if self._count == len(next(iter(self._columns.values()))):
             self._columns = {
@@ -58,61 +69,20 @@ class _Columns:
         self._count = count
 
 
-class NodeRows:
+class NodeRows(_Rows):
     """Where each keyframe stands and what telemetry reports of it; rows are views and may be written to."""
 
-    def __init__(self) -> None:
-        self._rows = _Columns(
-            rotations=(float, (3, 3)),
-            centres_m=(float, (3,)),
-            prior_centres_m=(float, (3,)),
-            prior_sigma_m=(float, (3,)),
-            prior_rotations=(float, (3, 3)),
-            prior_sigma_rad=(float, (3,)),
-            own=(bool, ()),
-        )
-
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    @property
-    def rotations(self) -> Floats:
-        """(N, 3, 3) site_from_camera."""
-        return self._rows.column("rotations")
-
-    @property
-    def centres_m(self) -> Floats:
-        """(N, 3)."""
-        return self._rows.column("centres_m")
-
-    @property
-    def prior_centres_m(self) -> Floats:
-        """(N, 3) by telemetry."""
-        return self._rows.column("prior_centres_m")
-
-    @property
-    def prior_rotations(self) -> Floats:
-        """(N, 3, 3) by telemetry."""
-        return self._rows.column("prior_rotations")
-
-    @property
-    def stated_sigma_m(self) -> Floats:
-        """(N, 3) as telemetry states it, infinite: not known."""
-        return self._rows.column("prior_sigma_m")
-
-    @property
-    def stated_sigma_rad(self) -> Floats:
-        """(N, 3) about the camera's own axes, infinite: not known."""
-        return self._rows.column("prior_sigma_rad")
-
-    @property
-    def own(self) -> Mask:
-        """(N,) bool: of the flight that is mapped."""
-        return self._rows.column("own")
+    rotations = _Column(float, 3, 3)  # site_from_camera
+    centres_m = _Column(float, 3)
+    prior_centres_m = _Column(float, 3)  # by telemetry
+    stated_sigma_m = _Column(float, 3)  # as telemetry states it, infinite: not known
+    prior_rotations = _Column(float, 3, 3)  # by telemetry
+    stated_sigma_rad = _Column(float, 3)  # about the camera's own axes, infinite: not known
+    own = _Column(bool)  # of the flight that is mapped
 
     def append(self, prior: CameraPrior, pose: Pose, *, own: bool) -> None:
         """A keyframe more, at `pose` for now."""
-        self._rows.append(rotations=pose.rotation, centres_m=pose.translation_m, own=own)
+        self._add(rotations=pose.rotation, centres_m=pose.translation_m, own=own)
         self.set_prior(len(self) - 1, prior)
 
     def set_prior(self, at: int, prior: CameraPrior) -> None:
@@ -141,43 +111,20 @@ class NodeRows:
         )
 
 
-class LinkRows:
+class LinkRows(_Rows):
     """The links and their matched points; the points of older ones lie on the `shelf`, if there is one."""
 
+    old = _Column(int)  # node index
+    new = _Column(int)
+    pairs = _Column(int)  # how many
+    points = _Column(int)  # index on the shelf
+    focal_px = _Column(float)
+    sigma_px = _Column(float)  # across the parallax
+    relief_m = _Column(float)  # height of things above the ground
+
     def __init__(self, shelf: Shelf | None = None) -> None:
-        self._rows = _Columns(
-            old=(int, ()),
-            new=(int, ()),
-            pairs=(int, ()),
-            points=(int, ()),
-            focal_px=(float, ()),
-            sigma_px=(float, ()),
-            relief_m=(float, ()),
-        )
+        super().__init__()
         self._points = ShelvedRows("points", (2, PAIRS_PER_LINK, 2), float, shelf)
-
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    @property
-    def old(self) -> Rows:
-        """(L,) node index."""
-        return self._rows.column("old")
-
-    @property
-    def new(self) -> Rows:
-        """(L,) node index."""
-        return self._rows.column("new")
-
-    @property
-    def relief_m(self) -> Floats:
-        """(L,) height of things above the ground."""
-        return self._rows.column("relief_m")
-
-    @property
-    def sigma_px(self) -> Floats:
-        """(L,) across the parallax."""
-        return self._rows.column("sigma_px")
 
     def append(
         self, each: Link, old: tuple[int, Camera], new: tuple[int, Camera], sigma_px: float
@@ -189,7 +136,7 @@ class LinkRows:
         points = np.zeros((2, PAIRS_PER_LINK, 2))
         points[0, : len(pick)] = _ideal(old[1], each.old_px[pick])
         points[1, : len(pick)] = _ideal(new[1], each.new_px[pick])
-        self._rows.append(
+        self._add(
             old=old[0],
             new=new[0],
             pairs=len(pick),
@@ -200,14 +147,10 @@ class LinkRows:
         )
         self._points.append(points)
 
-    def keep(self, chosen: Mask) -> None:
-        """Drop the links where `chosen` (L,) is False."""
-        self._rows.keep(chosen)
-
     def of(self, chosen: Rows) -> Pairs:
         """The matched points of some links, each link's padded to the same number, for the solver."""
         old, new, pairs, points, focal_px, sigma_px, relief_m = (
-            self._rows.column(name)[chosen]
+            getattr(self, name)[chosen]
             for name in ("old", "new", "pairs", "points", "focal_px", "sigma_px", "relief_m")
         )
         exists = np.arange(PAIRS_PER_LINK) < pairs[:, None]

@@ -213,42 +213,7 @@ def simulate_picture(settings: PictureSettings, index: int) -> SimulatedPicture:
     painted = paint_ground(GroundKind(ground), area, fine_m, rng)
     things = scenery(ground, painted.layout, rng)
     if rng.uniform() >= settings.empty_share:
-        # people, cars and small objects in sight, as many as a lonely field, a street or a crowd has
-        ground_m2 = polygon_area([outline_m])
-        counts = {
-            label: int(min(rng.poisson(rng.choice(means)), ground_m2 / room_m2))
-            for label, means, room_m2 in (
-                (ThingLabel.PERSON, (0.5, 3.0, 9.0), 10.0),
-                (ThingLabel.CAR, (0.2, 2.0, 8.0), 45.0),
-                (ThingLabel.SMALL, (0.5, 2.0, 6.0), 6.0),
-            )
-        }
-        placed: list[Thing] = []
-        for label in (ThingLabel.CAR, ThingLabel.PERSON, ThingLabel.SMALL):
-            for _ in range(counts[label]):
-                kind = (
-                    str(rng.choice(list(POSES), p=(0.28, 0.34, 0.08, 0.08, 0.1, 0.12)))
-                    if label is ThingLabel.PERSON
-                    else new_kind(label, rng)
-                )
-                size_m = new_size(label, kind, rng)
-                new = Thing(
-                    len(things) + len(placed) + 1,
-                    label,
-                    kind,
-                    0.0,
-                    0.0,
-                    0.0,
-                    size_m,
-                    int(rng.integers(2**31)),
-                )
-                for _ in range(20):
-                    east, north, yaw_deg = _place(label, placed, painted.layout, camera, pose, rng)
-                    new = replace(new, east_m=east, north_m=north, yaw_deg=yaw_deg)
-                    if is_free(new, (*things, *placed)):
-                        placed.append(new)
-                        break
-        things += tuple(placed)
+        things += _targets(things, painted.layout, camera, pose, rng)
     # The site under a light of its own: mostly day, sometimes dusk, street lamps or snow
     sky = rng.uniform()
     weather = WeatherSettings(
@@ -305,6 +270,51 @@ def _new_shot(settings: PictureSettings, is_thermal: bool, rng: Generator) -> tu
         f"no camera sees the ground at {settings.m_per_px[0]:g} to {settings.m_per_px[1]:g} m per pixel from"
         f" {settings.height_m[0]:g} to {settings.height_m[1]:g} m; widen one of them"
     )
+
+
+def _targets(
+    others: tuple[Thing, ...],
+    layout: GroundLayout,
+    camera: Camera,
+    pose: Pose,
+    rng: Generator,
+) -> tuple[Thing, ...]:
+    """People, cars and small objects in sight, as many as a lonely field, a street or a crowd has."""
+    ground_m2 = polygon_area([footprint(camera, pose)])
+    counts = {
+        label: int(min(rng.poisson(rng.choice(means)), ground_m2 / room_m2))
+        for label, means, room_m2 in (
+            (ThingLabel.PERSON, (0.5, 3.0, 9.0), 10.0),
+            (ThingLabel.CAR, (0.2, 2.0, 8.0), 45.0),
+            (ThingLabel.SMALL, (0.5, 2.0, 6.0), 6.0),
+        )
+    }
+    placed: list[Thing] = []
+    for label in (ThingLabel.CAR, ThingLabel.PERSON, ThingLabel.SMALL):
+        for _ in range(counts[label]):
+            kind = (
+                str(rng.choice(list(POSES), p=(0.28, 0.34, 0.08, 0.08, 0.1, 0.12)))
+                if label is ThingLabel.PERSON
+                else new_kind(label, rng)
+            )
+            size_m = new_size(label, kind, rng)
+            new = Thing(
+                len(others) + len(placed) + 1,
+                label,
+                kind,
+                0.0,
+                0.0,
+                0.0,
+                size_m,
+                int(rng.integers(2**31)),
+            )
+            for _ in range(20):
+                east, north, yaw_deg = _place(label, placed, layout, camera, pose, rng)
+                new = replace(new, east_m=east, north_m=north, yaw_deg=yaw_deg)
+                if is_free(new, (*others, *placed)):
+                    placed.append(new)
+                    break
+    return tuple(placed)
 
 
 def _place(
