@@ -127,6 +127,16 @@ class Relief:
         """Whether the ground has no hills."""
         return not len(self.heights_m)
 
+    @property
+    def most_m(self) -> float:
+        """No ground is higher than this."""
+        return float(self.middle_m + self.heights_m.sum())
+
+    @property
+    def most_slope(self) -> float:
+        """No ground is steeper, as height over way."""
+        return float((self.heights_m * np.linalg.norm(self.turns_m, axis=1)).sum())
+
     def up_m(self, places_m: Floats) -> Floats:
         """(...,) heights of the ground at places (..., 2), east and north."""
         up = np.full(places_m.shape[:-1], self.middle_m)
@@ -139,13 +149,10 @@ class Relief:
 
         Each step is as long as no slope could cross, so that a hill in front hides what lies behind it (Hart 1996).
         """
-        # no ground is higher than this, and none steeper, as height over way
-        most_m = float(self.middle_m + self.heights_m.sum())
-        slope = float((self.heights_m * np.linalg.norm(self.turns_m, axis=1)).sum())
         with np.errstate(divide="ignore", invalid="ignore"):
-            way = (most_m - eye_m[2]) / rays_m[..., 2]
+            way = (self.most_m - eye_m[2]) / rays_m[..., 2]
         way[~((rays_m[..., 2] < 0) & (way >= 0))] = np.nan
-        closing = slope * np.linalg.norm(rays_m[..., :2], axis=-1) - rays_m[..., 2]
+        closing = self.most_slope * np.linalg.norm(rays_m[..., :2], axis=-1) - rays_m[..., 2]
         for _ in range(_MOST_STEPS if not self.is_level else 0):
             point = eye_m + rays_m * way[..., None]
             above_m = point[..., 2] - self.up_m(point[..., :2])
