@@ -360,7 +360,10 @@ class Aligner:
             image_px = np.column_stack([_sampled(each, found.new_px) for each in (x, y)])
             ground_m = apply_homography(site_from_image, found.old_px)
             points_m = np.column_stack([ground_m, _sampled(up_m, found.old_px)])
-            pose = _seen_so(image_px, points_m, camera, pose)
+            moved = _seen_so(image_px, points_m, camera, pose)
+            if moved is None:
+                return None
+            pose = moved
         return pose
 
     def _local(self, frame: "_Frame", placed: MapPlace) -> LocalFit | None:
@@ -622,9 +625,9 @@ def _sampled(values: Floats32, points_px: PointsPx) -> Floats:
     return np.asarray(cv2.remap(values, x, y, cv2.INTER_LINEAR), np.float64).ravel()
 
 
-def _seen_so(image_px: PointsPx, points_m: Floats, camera: Camera, start: Pose) -> Pose:
+def _seen_so(image_px: PointsPx, points_m: Floats, camera: Camera, start: Pose) -> Pose | None:
     """The pose from which a camera sees points in space (N, 3) where they are in its picture, (N, 2); what lies far
-    off most of the others counts for nothing."""
+    off most of the others counts for nothing. None where that leads to no camera above them."""
     middle_m = points_m.mean(axis=0)
     points = points_m - middle_m
     rotation, _ = cv2.Rodrigues(start.rotation.T)
@@ -633,11 +636,14 @@ def _seen_so(image_px: PointsPx, points_m: Floats, camera: Camera, start: Pose) 
         seen_px, _ = cv2.projectPoints(points, rotation, offset, camera.matrix, np.zeros(5))
         miss_px = np.linalg.norm(seen_px.reshape(-1, 2) - image_px, axis=1)
         near = miss_px < 3 * max(0.5, float(np.median(miss_px)))
+        if near.sum() < _LINKS.min_inliers // 2:
+            return None
         rotation, offset = cv2.solvePnPRefineLM(
             points[near], image_px[near], camera.matrix, np.zeros(5), rotation, offset
         )
     camera_from_site: Matrix3 = np.asarray(cv2.Rodrigues(rotation)[0], np.float64)
-    return Pose(camera_from_site.T, middle_m - camera_from_site.T @ offset.ravel())
+    place_m = middle_m - camera_from_site.T @ offset.ravel()
+    return Pose(camera_from_site.T, place_m) if place_m[2] > points_m[:, 2].max() else None
 
 
 def _as_known(known: FlightPlace, full: Camera, camera: Camera) -> MapPlace | NotAligned:
