@@ -154,14 +154,12 @@ def answer_raster_errors(app: FastAPI) -> None:
 
     @app.exception_handler(TileOutsideBounds)
     async def _outside(_: Request, __: TileOutsideBounds) -> JSONResponse:
-        return problem_answer(
-            404, "this tile shows nothing of the raster; its TileJSON states its bounds"
-        )
+        words = "this tile shows nothing of the raster; its TileJSON states its bounds"
+        return problem_answer(Problem(404, words))
 
     async def _unreadable(_: Request, error: Exception) -> JSONResponse:
-        return problem_answer(
-            400, f"this cannot be drawn ({str(error)[:200]}); /openapi.json describes what can"
-        )
+        words = f"this cannot be drawn ({str(error)[:200]}); /openapi.json describes what can"
+        return problem_answer(Problem(400, words))
 
     app.add_exception_handler(RioTilerError, _unreadable)
     app.add_exception_handler(RasterioError, _unreadable)

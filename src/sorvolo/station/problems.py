@@ -71,20 +71,15 @@ class Problem(Exception):
         self.more = more
 
 
-def problem_answer(
-    status: int,
-    detail: str,
-    headers: Mapping[str, str] | None = None,
-    more: Mapping[str, object] | None = None,
-) -> JSONResponse:
-    """The problem document of a status."""
+def problem_answer(problem: Problem) -> JSONResponse:
+    """The document of a problem."""
     body = {
-        "title": _TITLES.get(status, "Error"),
-        "status": status,
-        "detail": detail,
-        **(more or {}),
+        "title": _TITLES.get(problem.status, "Error"),
+        "status": problem.status,
+        "detail": problem.detail,
+        **problem.more,
     }
-    return JSONResponse(body, status, dict(headers or {}), media_type=_KIND)
+    return JSONResponse(body, problem.status, problem.headers, media_type=_KIND)
 
 
 def status_of(error: SorvoloError) -> int:
@@ -114,11 +109,11 @@ def answer_problems(app: FastAPI, root: Path) -> None:
 
     @app.exception_handler(Problem)
     async def _of_problem(_: Request, error: Problem) -> JSONResponse:
-        return problem_answer(error.status, error.detail, error.headers, error.more)
+        return problem_answer(error)
 
     @app.exception_handler(SorvoloError)
     async def _of_ours(_: Request, error: SorvoloError) -> JSONResponse:
-        return problem_answer(status_of(error), below(root, str(error)))
+        return problem_answer(Problem(status_of(error), below(root, str(error))))
 
     @app.exception_handler(RequestValidationError)
     async def _of_request(_: Request, error: RequestValidationError) -> JSONResponse:
@@ -126,13 +121,14 @@ def answer_problems(app: FastAPI, root: Path) -> None:
             f"{'.'.join(str(part) for part in each['loc'])}: {each['msg']}"
             for each in error.errors()[:4]
         )
-        return problem_answer(422, f"{faults}; /openapi.json describes what each request needs")
+        words = f"{faults}; /openapi.json describes what each request needs"
+        return problem_answer(Problem(422, words))
 
     @app.exception_handler(HTTPException)
     async def _of_http(_: Request, error: HTTPException) -> JSONResponse:
-        return problem_answer(error.status_code, str(error.detail), error.headers)
+        return problem_answer(Problem(error.status_code, str(error.detail), headers=error.headers))
 
     @app.exception_handler(Exception)
     async def _of_unexpected(_: Request, error: Exception) -> JSONResponse:
         words = f"an error in the station ({type(error).__name__}); its log has the rest: please report it"
-        return problem_answer(500, words)
+        return problem_answer(Problem(500, words))

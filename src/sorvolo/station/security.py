@@ -310,7 +310,7 @@ def _limited(connection: HTTPConnection, receive: Receive) -> Receive:
 async def _refuse(
     scope: Scope, receive: Receive, send: Callable[[Any], Awaitable[None]], problem: Problem
 ) -> None:
-    answer = problem_answer(problem.status, problem.detail, problem.headers, problem.more)
+    answer = problem_answer(problem)
     if scope["type"] == "http" or "websocket.http.response" in scope.get("extensions", {}):
         await answer(scope, receive, send)
     else:

@@ -231,6 +231,7 @@ def _bound(host: str, port: int) -> socket.socket:
 class _Socket:
     def __init__(self, wire: socket.socket, datagram_end: bytes | None = None) -> None:
         self._wire, self._end = wire, datagram_end
+        self.close = wire.close
 
     def read(self) -> bytes | None:
         if not select.select([self._wire], [], [], _POLL_S)[0]:
@@ -240,30 +241,22 @@ class _Socket:
             return None if self._end is None else b""
         return data + (self._end or b"")
 
-    def close(self) -> None:
-        self._wire.close()
-
 
 class _Serial:
     def __init__(self, port: Any) -> None:
-        self._port = port
+        self._port, self.close = port, port.close
 
     def read(self) -> bytes | None:
         return bytes(self._port.read(max(1, self._port.in_waiting)))
-
-    def close(self) -> None:
-        self._port.close()
 
 
 class _FollowedLog:
     def __init__(self, path: Path) -> None:
         self._file = path.open("rb")
+        self.close = self._file.close
 
     def read(self) -> bytes | None:
         data = self._file.read(65_536)
         if not data:
             time.sleep(_POLL_S)
         return data
-
-    def close(self) -> None:
-        self._file.close()

@@ -10,24 +10,30 @@ from sorvolo.survey.flight import TELEMETRY_COLUMNS, CameraModel, Notice
 
 
 @dataclass(frozen=True, eq=False)
-class FlightSoFar:
-    """What was known of a live flight when it was last read.
-
-    `samples` (N, columns of `TELEMETRY_COLUMNS`) with their times are its telemetry. `last_ns` is the UTC of its last
-    frame, `names` are those of its frames. `gaps_s` are the pauses between its segments so far.
-    """
+class FlightBegun:
+    """How a live flight began, and the pauses between its segments so far."""
 
     name: str
     fingerprint: str
     start_ns: int
     start_origin: str
     camera: CameraModel
+    gaps_s: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FlightSoFar(FlightBegun):
+    """What was known of a live flight when it was last read.
+
+    `samples` (N, columns of `TELEMETRY_COLUMNS`) with their times are its telemetry. `last_ns` is the UTC of its last
+    frame, `names` are those of its frames.
+    """
+
     next_index: int
     last_ns: int
     names: frozenset[str]
     times_ns: TimesNs
     samples: Floats
-    gaps_s: tuple[float, ...] = ()
 
 
 def joined_samples(parts: Sequence[tuple[TimesNs, Floats]]) -> tuple[TimesNs, Floats]:

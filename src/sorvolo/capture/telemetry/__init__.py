@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import Protocol, cast
 
 from sorvolo.build import added
-from sorvolo.capture.telemetry import dji_srt, flight_table, gpx, nmea
+from sorvolo.capture.telemetry import dji_srt, flight_table, gpx, mcap_log, nmea
 from sorvolo.capture.telemetry.autopilot_logs import AUTOPILOT_READERS
-from sorvolo.capture.telemetry.mcap_log import McapReader
 from sorvolo.errors import InputError, SorvoloWarning
 from sorvolo.survey.flight import Telemetry
 
@@ -61,7 +60,7 @@ class Reader(Protocol):
 # Order matters where a file fits two: a table may hold NMEA sentences in one of its columns.
 TELEMETRY_READERS: dict[str, Reader] = {
     **AUTOPILOT_READERS,
-    "mcap": McapReader(),
+    "mcap": mcap_log,
     "dji_srt": dji_srt,
     "gpx": gpx,
     "table": flight_table,

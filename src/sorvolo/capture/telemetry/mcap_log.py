@@ -31,53 +31,51 @@ _LARGEST_CHUNK_BYTES = 50_000_000  # recorders write chunks of about 4 MB
 _Row = tuple[int, dict[str, float]]
 
 
-class McapReader:
-    """The fixes of the topic that has the most; the others are counted."""
+def recognises(head: bytes) -> bool:
+    """Whether the file begins as an MCAP does."""
+    return head.startswith(_MAGIC)
 
-    def recognises(self, head: bytes) -> bool:
-        """Whether the file begins as an MCAP does."""
-        return head.startswith(_MAGIC)
 
-    def read(self, data: bytes, name: str) -> Telemetry:
-        """One sample a message, at its own stamp, else when it was recorded.
+def read(data: bytes, name: str) -> Telemetry:
+    """One sample a message, at its own stamp, else when it was recorded.
 
-        Raises InputError without the extra `logs`, for a damaged recording and for one without fixes.
-        """
-        try:
-            import mcap.reader  # noqa: F401  # whether it is there
-        except ImportError as error:
-            raise InputError(
-                f"{name} is an MCAP recording, which needs an extra: pip install 'sorvolo[logs]'"
-            ) from error
-        by_topic: dict[str, list[_Row]] = {}
-        unread = is_cut = 0
-        try:
-            for topic, row in _fixes(data):
-                if row is None:
-                    unread += 1
-                else:
-                    by_topic.setdefault(topic, []).append(row)
-        except Exception:  # the library raises whatever damaged bytes lead to
-            is_cut = 1
-        if not by_topic:
-            raise InputError(
-                f"{name}: no fix in this MCAP recording{' (it is cut or damaged)' if is_cut else ''}; NavSatFix (ROS 2, "
-                "JSON) or foxglove.LocationFix (protobuf, JSON) messages are read"
-            )
-        topic = max(by_topic, key=lambda each: len(by_topic[each]))
-        rows = sorted(by_topic[topic], key=lambda row: row[0])
-        others = ", ".join(sorted({*by_topic} - {topic}))
-        columns = {key: [row[key] for _, row in rows] for key in rows[0][1]}
-        notices = [
-            *notice("unreadable_line", unread, "{} messages dropped: not readable"),
-            *notice("truncated", is_cut, "the recording is cut or damaged: read as far as it goes"),
-            *notice(
-                "other_topics",
-                len(by_topic) - 1,
-                f"other topics with fixes, not used: {{}} ({others}); {topic} is used",
-            ),
-        ]
-        return clean("mcap", name, [time_ns for time_ns, _ in rows], columns, notices=notices)
+    Raises InputError without the extra `logs`, for a damaged recording and for one without fixes.
+    """
+    try:
+        import mcap.reader  # noqa: F401  # whether it is there
+    except ImportError as error:
+        raise InputError(
+            f"{name} is an MCAP recording, which needs an extra: pip install 'sorvolo[logs]'"
+        ) from error
+    by_topic: dict[str, list[_Row]] = {}
+    unread = is_cut = 0
+    try:
+        for topic, row in _fixes(data):
+            if row is None:
+                unread += 1
+            else:
+                by_topic.setdefault(topic, []).append(row)
+    except Exception:  # the library raises whatever damaged bytes lead to
+        is_cut = 1
+    if not by_topic:
+        raise InputError(
+            f"{name}: no fix in this MCAP recording{' (it is cut or damaged)' if is_cut else ''}; NavSatFix (ROS 2, "
+            "JSON) or foxglove.LocationFix (protobuf, JSON) messages are read"
+        )
+    topic = max(by_topic, key=lambda each: len(by_topic[each]))
+    rows = sorted(by_topic[topic], key=lambda row: row[0])
+    others = ", ".join(sorted({*by_topic} - {topic}))
+    columns = {key: [row[key] for _, row in rows] for key in rows[0][1]}
+    notices = [
+        *notice("unreadable_line", unread, "{} messages dropped: not readable"),
+        *notice("truncated", is_cut, "the recording is cut or damaged: read as far as it goes"),
+        *notice(
+            "other_topics",
+            len(by_topic) - 1,
+            f"other topics with fixes, not used: {{}} ({others}); {topic} is used",
+        ),
+    ]
+    return clean("mcap", name, [time_ns for time_ns, _ in rows], columns, notices=notices)
 
 
 def _fixes(data: bytes) -> Iterator[tuple[str, _Row | None]]:

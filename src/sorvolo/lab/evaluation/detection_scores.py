@@ -322,19 +322,18 @@ def score_set(
     matches, coco, by_class = match_pictures(labelled, found, judged)
     table, mistakes = confusion(matches, thresholds)
     tables = group_tables(matches, _groups(labelled), thresholds)
-    scores = []
-    for match in matches:
-        scores.append(
-            ClassScores(
-                match.label,
-                len(match.true_scores),
-                by_class[match.label],
-                at_score(match, thresholds[match.label]),
-                best_threshold(match),
-                _thinned(np.column_stack(precision_recall(match))),
-                tuple(right_by_score(match)),
-            )
+    scores = [
+        ClassScores(
+            match.label,
+            len(match.true_scores),
+            by_class[match.label],
+            at_score(match, thresholds[match.label]),
+            best_threshold(match),
+            _thinned(np.column_stack(precision_recall(match))),
+            tuple(right_by_score(match)),
         )
+        for match in matches
+    ]
     m_per_px = np.array([picture.m_per_px for picture in labelled.pictures])
     pictures = len(labelled)
     remarks = [

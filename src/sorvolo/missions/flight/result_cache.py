@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sorvolo.build import build
-from sorvolo.capture.live.segments import FlightSoFar, joined_samples
+from sorvolo.capture.live.segments import FlightBegun, FlightSoFar, joined_samples
 from sorvolo.capture.source import LiveSource, Source
 from sorvolo.errors import SorvoloError, SorvoloWarning
 from sorvolo.geometry.arrays import Floats, TimesNs
@@ -22,7 +22,7 @@ from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.store.images import image_from_jpeg, jpeg_from_image
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.journal import Entry, RunJournal, content_sha256, packed, unpacked
-from sorvolo.survey.flight import CameraModel, CameraPrior, Frame
+from sorvolo.survey.flight import CameraPrior, Frame
 
 _BEGUN, _SAMPLES, _FRAME, _CAME = "flight", "telemetry", "frame", "came"
 _DAMAGED = (KeyError, TypeError, ValueError, IndexError, SorvoloError)
@@ -193,18 +193,6 @@ class ResultCache:
             journal.append(Entry(_SAMPLES, {}, {"times_ns": times_ns, "samples": samples}))
 
 
-@dataclass(frozen=True, eq=False)
-class FlightBegun:
-    """How a live flight began, and the pauses between its segments so far."""
-
-    name: str
-    fingerprint: str
-    start_ns: int
-    start_origin: str
-    camera: CameraModel
-    gaps_s: tuple[float, ...]
-
-
 def note_flight(journal: RunJournal, source: LiveSource) -> None:
     """Note how a live flight began."""
     arrays: dict[str, NDArray[Any]] = {}
@@ -241,17 +229,12 @@ def flight_so_far(journal: RunJournal) -> FlightSoFar | None:
     if begun is None or index < 0:
         return None
     return FlightSoFar(
-        begun.name,
-        begun.fingerprint,
-        begun.start_ns,
-        begun.start_origin,
-        begun.camera,
-        index + 1,
-        last_ns,
-        frozenset(names),
-        times_ns,
-        samples,
-        begun.gaps_s,
+        **vars(begun),
+        next_index=index + 1,
+        last_ns=last_ns,
+        names=frozenset(names),
+        times_ns=times_ns,
+        samples=samples,
     )
 
 
