@@ -105,7 +105,7 @@ def telemetry_faults(
         [prior.position_m - pose.translation_m for prior, pose in zip(priors, poses)]
     ).reshape(-1, 3)
     scatter_m = _together([_bias(moved[placed, k]) for k in range(2)]).scatter / float(np.sqrt(2))
-    beside_deg = _beside_usual(off_deg, _COMPASS_OUTLYING_DEG)
+    beside_deg = _beside_usual(off_deg)
     near = beside_deg <= _COMPASS_OUTLYING_DEG
     turned = np.zeros(len(priors), bool)
     turned[knows_heading] = ~near
@@ -299,21 +299,21 @@ def _heading_and_tilt(rotation: Floats, pose: Pose) -> Floats:
     return np.degrees([-about_up_rad, *tilt_rad[:2]])
 
 
-def _beside_usual(off_deg: Floats, outlying_deg: float) -> Floats:
+def _beside_usual(off_deg: Floats) -> Floats:
     """(N,) how far each frame's angles lie beside what the flight's usually are off, (N, 3), degrees.
 
     A compass that hangs, or a strip whose pictures are turned by half a turn, hides behind the flight's median.
     """
     if not len(off_deg):
         return np.zeros(0)
-    heading_deg = _wrapped(off_deg[:, 0] - _usual_angle(off_deg[:, 0], outlying_deg))
-    alike = np.abs(heading_deg) <= outlying_deg
+    heading_deg = _wrapped(off_deg[:, 0] - _usual_angle(off_deg[:, 0]))
+    alike = np.abs(heading_deg) <= _COMPASS_OUTLYING_DEG
     return np.hypot(
         heading_deg, np.linalg.norm(off_deg[:, 1:] - np.median(off_deg[alike, 1:], axis=0), axis=1)
     )
 
 
-def _usual_angle(angles_deg: Floats, outlying_deg: float) -> float:
+def _usual_angle(angles_deg: Floats) -> float:
     """The median of those angles that most others are near, degrees; they may lie anywhere on the circle.
 
     Of two groups that are nearly as large, the one nearer to 0: a small error is likelier than half a turn.
@@ -322,7 +322,7 @@ def _usual_angle(angles_deg: Floats, outlying_deg: float) -> float:
     around_deg = np.concatenate([ordered_deg - 360.0, ordered_deg, ordered_deg + 360.0])
     first, last = (
         np.searchsorted(
-            around_deg, ordered_deg + side * outlying_deg, "left" if side < 0 else "right"
+            around_deg, ordered_deg + side * _COMPASS_OUTLYING_DEG, "left" if side < 0 else "right"
         )
         for side in (-1, 1)
     )
@@ -330,7 +330,7 @@ def _usual_angle(angles_deg: Floats, outlying_deg: float) -> float:
     usual_deg = float(large_deg[np.argmin(np.abs(large_deg))])
     for _ in range(_MOST_ROUNDS):  # the first guess may lie at the edge of its group
         beside_deg = _wrapped(angles_deg - usual_deg)
-        step_deg = float(np.median(beside_deg[np.abs(beside_deg) <= outlying_deg]))
+        step_deg = float(np.median(beside_deg[np.abs(beside_deg) <= _COMPASS_OUTLYING_DEG]))
         usual_deg += step_deg
         if abs(step_deg) < 1e-9:
             break
@@ -351,7 +351,7 @@ def _heading(off_deg: Floats, near: Mask, path: PathFit) -> Bias:
     """The compass's error by those frames that agree; its sigma is infinite where too few do, or fixes are too few."""
     if not len(off_deg):
         return _UNKNOWN
-    usual_deg = _usual_angle(off_deg, _COMPASS_OUTLYING_DEG)
+    usual_deg = _usual_angle(off_deg)
     found = _bias(_wrapped(off_deg[near] - usual_deg))
     value_deg, sigma_deg = usual_deg + found.value, inf
     if np.isfinite(path.turn_deg.value):

@@ -410,9 +410,9 @@ _MOST_MESSAGE_BYTES = 16_000_000  # of one WebSocket message: a key frame of 4K 
 def run_station(
     settings: StationSettings,
     announce: Callable[[], None],
-    receivers: OutwardSettings = OutwardSettings(),
+    receivers: OutwardSettings,
     *,
-    logs_json: bool = False,
+    logs_json: bool,
 ) -> None:
     """Serve until Ctrl-C or SIGTERM; `announce` is called once it listens.
 

@@ -35,7 +35,7 @@ def on_earth(site: Site) -> Site:
 
 
 def found_features(
-    archive: Archive | None, tracks: Sequence[Track], marks: Sequence[Track] = ()
+    archive: Archive | None, tracks: Sequence[Track], marks: Sequence[Track]
 ) -> list[Feature]:
     """All findings, what a person wants first in front; `tracks` of a site's watches belong to the flights whose time
     is theirs, people's `marks` to the newest flight before them. Without a site there are the watches' alone."""

@@ -65,7 +65,7 @@ def jpeg_from_image(image: ImageRGB, most_px: int | None = None) -> bytes:
     return data.tobytes()
 
 
-def jpeg_from_rgba(rgba: ImageRGBA, most_px: int | None = None) -> bytes:
+def jpeg_from_rgba(rgba: ImageRGBA, most_px: int) -> bytes:
     """Encode a picture as `jpeg_from_image` does, what is transparent in it in a grey."""
     alpha = rgba[..., 3:].astype(np.float32) / 255
     flat = np.round(rgba[..., :3] * alpha + _PAPER * (1 - alpha))

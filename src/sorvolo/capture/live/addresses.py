@@ -134,7 +134,7 @@ def _stream(text: str) -> StreamAddress:
         raise InputError(
             f"{shown_address(text)} has no host; give for instance {scheme}://192.168.1.10/live"
         )
-    if scheme == "srt" and not _has_protocol("srt"):
+    if scheme == "srt" and not _has_srt():
         raise InputError(
             "this PyAV was built without SRT; receive it with another program and pass it on, for instance: "
             "srt-live-transmit srt://HOST:PORT udp://127.0.0.1:5000, then give udp://:5000"
@@ -168,9 +168,9 @@ def _existing(text: str, words: str) -> Path:
     return path
 
 
-def _has_protocol(name: str) -> bool:
+def _has_srt() -> bool:
     try:
-        av.open(f"{name}://127.0.0.1:1?mode=listener", timeout=0.01)
+        av.open("srt://127.0.0.1:1?mode=listener", timeout=0.01)
     except av.error.ProtocolNotFoundError:
         return False
     except (av.FFmpegError, OSError):

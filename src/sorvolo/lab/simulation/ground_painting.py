@@ -196,7 +196,7 @@ class GroundCanvas:
         per_m2: float,
         sizes_m: tuple[float, float],
         colour: tuple[float, float, float],
-        cover: FieldF32 | None = None,
+        cover: FieldF32 | None,
     ) -> None:
         """Scatter stones, each with a lit face and a dark foot, more where `cover` is high."""
         width_m, height_m = self.area.size_m

@@ -204,8 +204,8 @@ def batches_from(
     side: int,
     seed: int,
     batch: int,
-    start: int = 0,
-    threads: int = 1,
+    start: int,
+    threads: int,
 ) -> Generator[list[TrainingSample], None, None]:
     """Endless batches from number `start` on, the next ones cut on other threads meanwhile.
 

@@ -34,9 +34,9 @@ def flight_warnings(
     figures: FlightFigures,
     setup: FlightSetup,
     log: FlightLog,
-    agreement: Consistency = NOTHING_KNOWN,
-    graph: GraphReport | None = None,
-    others: Sequence[str] = (),
+    agreement: Consistency,
+    graph: GraphReport | None,
+    others: Sequence[str],
 ) -> list[str]:
     """The warnings of a flight's report; `others` are what `map_headline` takes as such."""
     camera, clock, warnings = (

@@ -258,9 +258,7 @@ def go_on(source: LiveSource, journal: RunJournal, most_gap_s: float) -> bool:
     return True
 
 
-def cache_of_run(
-    setup: FlightSetup, archive: Archive, request: str, *, anew: bool = False
-) -> ResultCache:
+def cache_of_run(setup: FlightSetup, archive: Archive, request: str, *, anew: bool) -> ResultCache:
     """Return a mission's cache, with what a killed run of the same request left; `anew` discards that."""
     if isinstance(setup.source, LiveSource):
         key = _live_key(archive, request)

@@ -190,8 +190,8 @@ def build_search_report(
     settings: SearchSettings,
     detector: ObjectDetector,
     refly: "Refly | None",
-    so_far: SoFar | None = None,
-    warnings: Sequence[str] = (),
+    so_far: SoFar | None,
+    warnings: Sequence[str],
 ) -> dict[str, Any]:
     """search.json (docs/formats.md), these warnings first; `so_far` is given while the flight goes on."""
     rows = {
@@ -438,12 +438,7 @@ def write_search(
             again = regions_of(
                 cells.as_grid(flyable(without_seen(holes, cells, seen_before_m))), grid
             )
-    write_pod_tif(
-        outputs.folder / "pod.tif",
-        bands,
-        grid,
-        {"sorvolo": "probability of detection; docs/search.md"},
-    )
+    write_pod_tif(outputs.folder / "pod.tif", bands, grid)
     collection = feature_collection("pod", features, is_local=False)
     atomic_write_bytes(outputs.folder / "pod.geojson", geojson_bytes(collection))
     was_stopped = so_far is not None and so_far.state is State.STOPPED

@@ -116,11 +116,11 @@ def kml_bytes(title: str, placemarks: Sequence[Placemark]) -> bytes:
         return str(document.kml()).encode()
 
 
-def network_link(title: str, address: str, every_s: int = 30) -> bytes:
+def network_link(title: str, address: str) -> bytes:
     """KML that has Google Earth load the KML at an address again and again."""
     with kml_from_one(printable(title)) as document:
         link = document.newnetworklink(name=printable(title)).link
-        link.href, link.refreshmode, link.refreshinterval = address, "onInterval", every_s
+        link.href, link.refreshmode, link.refreshinterval = address, "onInterval", 30
         return str(document.kml()).encode()
 
 

@@ -64,9 +64,7 @@ class Region:
     area_m2: float
 
 
-def write_pod_tif(
-    path: Path, bands: Mapping[str, Floats], grid: CellGrid, notes: Mapping[str, str]
-) -> None:
+def write_pod_tif(path: Path, bands: Mapping[str, Floats], grid: CellGrid) -> None:
     """Write named bands, (rows, columns) each, as a float32 GeoTIFF; NaN, where nothing was seen, is its nodata."""
     rows, columns = next(iter(bands.values())).shape
     profile = {
@@ -92,7 +90,7 @@ def write_pod_tif(
         for number, (name, values) in enumerate(bands.items(), start=1):
             file.write(values.astype(np.float32), number)
             file.set_band_description(number, name)
-        file.update_tags(**notes)
+        file.update_tags(sorvolo="probability of detection; docs/search.md")
 
 
 def regions_of(numbers: NDArray[np.uint8], grid: CellGrid) -> list[Region]:
