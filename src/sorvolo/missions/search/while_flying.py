@@ -196,7 +196,14 @@ class SearchWhileFlying:
                         measure.add(frame)
                         unwritten += 1
             counted = len(earlier.frames)
-            has_looked = self._look_back(earlier, self._pace.earlier * (time.monotonic() - began_s))
+            # one picture of earlier flights, and more for a share of the time that this one took
+            now_s, has_looked = time.monotonic(), False
+            until_s = now_s + self._pace.earlier * (now_s - began_s)
+            with self._warning():
+                while earlier.look():
+                    has_looked = True
+                    if time.monotonic() >= until_s or self._landed.is_set():
+                        break
             unwritten += len(earlier.frames) - counted
             if unwritten and measure.frames and time.monotonic() >= again_s:
                 started_s = time.monotonic()
@@ -206,16 +213,6 @@ class SearchWhileFlying:
                 again_s = time.monotonic() + max(self._pace.again_s, self._pace.rest * took_s)
             elif stored is None and not has_looked:
                 self._landed.wait(self._pace.look_s)
-
-    def _look_back(self, earlier: EarlierFlights, for_s: float) -> bool:
-        """Look at one picture of earlier flights, and at more for so many seconds; whether there was one."""
-        until_s, has_looked = time.monotonic() + for_s, False
-        with self._warning():
-            while earlier.look():
-                has_looked = True
-                if time.monotonic() >= until_s or self._landed.is_set():
-                    break
-        return has_looked
 
     def _next(self) -> StoredKeyframe | None:
         """The frame that is measured next: in their order, those that were put off when no others wait."""
