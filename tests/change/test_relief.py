@@ -117,7 +117,8 @@ def test_a_frame_stands_where_it_was_taken_from() -> None:
     seen_at[:8] += 30  # false pairs
     start = Pose(NADIR_CAMERA_NORTH_UP, LATER + np.array([0.7, -0.4, 0.9]))
     found = alignment._seen_so(seen_at, np.column_stack([points, up]), CAMERA, start)
-    assert found is not None and np.abs(found.translation_m - LATER).max() < 0.05
+    assert found is not None and np.abs(found[0].translation_m - LATER).max() < 0.05
+    assert found[1] < 0.5
     # of points that no camera above them could see so
     unseen = np.random.default_rng(2).uniform(0, 300, seen_at.shape)
     below = np.column_stack([points, up + 40])

@@ -250,18 +250,19 @@ class Aligner:
                 reason, placed.residual_px / scale, is_outside, is_cautious and not is_outside
             )
         moved, left, size_m = self._settled(frame, placed)
+        stand, residual_px = self._stand(frame, moved)
         self._remember(time_ns, moved, prior, new)
         self.step = AlignStep(moved, self._misses)
         small_from_full = resized(size[0] / image.shape[1], size[1] / image.shape[0])
         return Aligned(
             moved.site_from_image @ small_from_full,
             moved.pose.translation_m,
-            placed.residual_px / scale,
+            residual_px / scale,
             placed.followed,
             left,
             size_m,
             with_flight=place is not None,
-            stand=None if self._surface is None else self._stand(frame, moved, self._surface),
+            stand=stand,
         )
 
     def recall(
@@ -340,31 +341,36 @@ class Aligner:
                 break
         return place, left, size_m
 
-    def _stand(self, frame: _Frame, placed: MapPlace, surface: OrthoSurface) -> Pose | None:
-        """Where a frame's camera stands in space: its picture is laid over the heights as its place on level ground has
-        it, points are followed from there to the map, and the camera is moved to see them where they are."""
+    def _stand(self, frame: _Frame, placed: MapPlace) -> tuple[Pose | None, float]:
+        """Where a frame's camera stands in space, and the median distance that points keep, px: its picture is laid over
+        the heights as its place on level ground has it, points are followed from there to the map, and the camera is
+        moved to see them where they are. Without heights None, and the place's own distance."""
+        surface, nowhere = self._surface, (None, placed.residual_px)
+        if surface is None:
+            return nowhere
         camera, site_from_image = frame.even.camera, placed.site_from_image
         size = camera.width_px, camera.height_px
         seen = self._seen(site_from_image, camera)
         if seen is None:
-            return None
+            return nowhere
         old, up_m = self._keyframe(camera, normalised(*seen)), surface.under(site_from_image, size)
-        raised_m = np.array([0.0, 0.0, float(np.median(up_m))])
+        raised_m = np.array([0.0, 0.0, np.median(up_m)])
         pose = Pose(placed.pose.rotation, placed.pose.translation_m + raised_m)
         for _ in range(_STANDING_ROUNDS):
             x, y, _ = surface.lay(site_from_image, size, camera, pose)
-            new = self._keyframe(camera, normalise_contrast(_remapped(frame.gray, x, y)))
+            laid = cv2.remap(frame.gray, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            new = self._keyframe(camera, normalise_contrast(np.asarray(laid, np.uint8)))
             found = refine(new, old, np.eye(3), _LINKS, LinkCache(_LINKS.features, 2))
             if not isinstance(found, Link):
-                return None
+                return nowhere
             image_px = np.column_stack([_sampled(each, found.new_px) for each in (x, y)])
             ground_m = apply_homography(site_from_image, found.old_px)
             points_m = np.column_stack([ground_m, _sampled(up_m, found.old_px)])
-            moved = _seen_so(image_px, points_m, camera, pose)
-            if moved is None:
-                return None
-            pose = moved
-        return pose
+            stood = _seen_so(image_px, points_m, camera, pose)
+            if stood is None:
+                return nowhere
+            pose, miss_px = stood
+        return pose, miss_px
 
     def _local(self, frame: "_Frame", placed: MapPlace) -> LocalFit | None:
         """The local fit of a frame at its place, in pixels of the `_fine` camera."""
@@ -613,21 +619,17 @@ class Aligner:
         return MapPlace(fit, pose, residual_px, followed, np.inf if is_held else 0.0)
 
 
-def _remapped(image: ImageGray, x: Floats32, y: Floats32) -> ImageGray:
-    """A picture (h, w) at these places; its edge goes on."""
-    laid = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(laid, np.uint8)
-
-
 def _sampled(values: Floats32, points_px: PointsPx) -> Floats:
     """(N,) values (h, w) between pixels, at points (N, 2)."""
     x, y = points_px.astype(np.float32).T[..., None]
     return np.asarray(cv2.remap(values, x, y, cv2.INTER_LINEAR), np.float64).ravel()
 
 
-def _seen_so(image_px: PointsPx, points_m: Floats, camera: Camera, start: Pose) -> Pose | None:
-    """The pose from which a camera sees points in space (N, 3) where they are in its picture, (N, 2); what lies far
-    off most of the others counts for nothing. None where that leads to no camera above them."""
+def _seen_so(
+    image_px: PointsPx, points_m: Floats, camera: Camera, start: Pose
+) -> tuple[Pose, float] | None:
+    """The pose from which a camera sees points in space (N, 3) where they are in its picture, (N, 2), and how far off
+    they are, px, the median; what lies far off most of the others counts for nothing. None where that leads to no camera above them."""
     middle_m = points_m.mean(axis=0)
     points = points_m - middle_m
     rotation, _ = cv2.Rodrigues(start.rotation.T)
@@ -643,7 +645,9 @@ def _seen_so(image_px: PointsPx, points_m: Floats, camera: Camera, start: Pose) 
         )
     camera_from_site: Matrix3 = np.asarray(cv2.Rodrigues(rotation)[0], np.float64)
     place_m = middle_m - camera_from_site.T @ offset.ravel()
-    return Pose(camera_from_site.T, place_m) if place_m[2] > points_m[:, 2].max() else None
+    if not place_m[2] > points_m[:, 2].max():
+        return None
+    return Pose(camera_from_site.T, place_m), float(np.median(miss_px))
 
 
 def _as_known(known: FlightPlace, full: Camera, camera: Camera) -> MapPlace | NotAligned:
