@@ -87,8 +87,8 @@ class Aligned:
     `residual_px` is the median distance that paired points keep, in the frame's own pixels. `followed`: the last fit
     predicted this one, no features were needed. `local` is what the frame is moved by on the map beyond that
     homography, None where nothing is; `local_m` how far a local fit moved it in all (median, m). `with_flight`: it was
-    not found for sure by itself and lies where its flight as a whole has it. `stand` is its
-    camera in space over a true orthophoto's heights; None over level ground, and where none is found.
+    not found for sure by itself and lies where its flight as a whole has it. `stand` is its camera in space over a
+    true orthophoto's heights; None over level ground, and where none is found.
     """
 
     site_from_image: Matrix3
@@ -629,25 +629,34 @@ def _seen_so(
     image_px: PointsPx, points_m: Floats, camera: Camera, start: Pose
 ) -> tuple[Pose, float] | None:
     """The pose from which a camera sees points in space (N, 3) where they are in its picture, (N, 2), and how far off
-    they are, px, the median; what lies far off most of the others counts for nothing. None where that leads to no camera above them."""
-    middle_m = points_m.mean(axis=0)
-    points = points_m - middle_m
-    rotation, _ = cv2.Rodrigues(start.rotation.T)
-    offset = (-start.rotation.T @ (start.translation_m - middle_m)).reshape(3, 1)
+    they are, px, the median; what lies far off most of the others counts for nothing. None where that leads to no camera
+    above them."""
+    pose = start
     for _ in range(_FITTING_ROUNDS):
-        seen_px, _ = cv2.projectPoints(points, rotation, offset, camera.matrix, np.zeros(5))
-        miss_px = np.linalg.norm(seen_px.reshape(-1, 2) - image_px, axis=1)
+        seen_px = camera.pixels_from_points((points_m - pose.translation_m) @ pose.rotation)
+        miss_px = np.nan_to_num(np.linalg.norm(seen_px - image_px, axis=1), nan=1e9)
         near = miss_px < 3 * max(0.5, float(np.median(miss_px)))
         if near.sum() < _LINKS.min_inliers // 2:
             return None
-        rotation, offset = cv2.solvePnPRefineLM(
-            points[near], image_px[near], camera.matrix, np.zeros(5), rotation, offset
-        )
+        try:
+            pose = _refined_pose(image_px[near], points_m[near], camera, pose)
+        except GeometryError:
+            return None
+    is_above = pose.translation_m[2] > points_m[:, 2].max()
+    return (pose, float(np.median(miss_px))) if is_above else None
+
+
+def _refined_pose(image_px: PointsPx, points_m: Floats, camera: Camera, start: Pose) -> Pose:
+    """The pose from which a camera sees points in space (N, 3) nearest to where they are in its picture, (N, 2), from
+    one close by. Raises GeometryError where that leads to none."""
+    middle_m = points_m.mean(axis=0)
+    rotation, _ = cv2.Rodrigues(start.rotation.T)
+    offset = -start.rotation.T @ (start.translation_m - middle_m)
+    rotation, offset = cv2.solvePnPRefineLM(
+        points_m - middle_m, image_px, camera.matrix, np.zeros(5), rotation, offset.reshape(3, 1)
+    )
     camera_from_site: Matrix3 = np.asarray(cv2.Rodrigues(rotation)[0], np.float64)
-    place_m = middle_m - camera_from_site.T @ offset.ravel()
-    if not place_m[2] > points_m[:, 2].max():
-        return None
-    return Pose(camera_from_site.T, place_m), float(np.median(miss_px))
+    return Pose(camera_from_site.T, middle_m - camera_from_site.T @ offset.ravel())
 
 
 def _as_known(known: FlightPlace, full: Camera, camera: Camera) -> MapPlace | NotAligned:
@@ -701,17 +710,10 @@ def _stiffened(
     near = free_miss < 3 * max(1.0, float(np.median(free_miss)))
     if near.sum() < 6:
         return site_from_image
-    middle_m = np.append(ground_m[near].mean(axis=0), 0.0)
-    points = np.column_stack([ground_m[near], np.zeros(near.sum())]) - middle_m
-    rotation, _ = cv2.Rodrigues(start.rotation.T)
-    offset = -start.rotation.T @ (start.translation_m - middle_m)
-    rotation, offset = cv2.solvePnPRefineLM(
-        points, link.new_px[near], camera.matrix, np.zeros(5), rotation, offset.reshape(3, 1)
-    )
-    camera_from_site: Matrix3 = np.asarray(cv2.Rodrigues(rotation)[0], np.float64)
-    place_m = middle_m - camera_from_site.T @ offset.ravel()
+    points_m = np.column_stack([ground_m[near], np.zeros(near.sum())])
     try:
-        stiff = site_from_image_homography(camera, Pose(camera_from_site.T, place_m))
+        pose = _refined_pose(link.new_px[near], points_m, camera, start)
+        stiff = site_from_image_homography(camera, pose)
     except GeometryError:
         return site_from_image
     stiff_miss = _miss_px(stiff, ground_m, link.new_px)
