@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_flights import SITE, image, map_flight
+from fake_flights import ORIGIN, SITE, image, map_flight
 
 from sorvolo.errors import StoreError
+from sorvolo.geometry.grid import SiteGrid
 from sorvolo.store.atomic import atomic_path, atomic_write_bytes, remove_leftovers, scratch_folder
+from sorvolo.store.rasters.geotiff import write_cog
 from sorvolo.store.site.archive import Archive
 
 
@@ -170,3 +172,23 @@ def test_a_disk_that_fills_while_the_map_is_exported_is_made_good_later(small_di
     with Archive.open(folder, write=True) as archive:
         assert archive.mosaic_path.exists()
         assert (archive.folder / "mosaic.kmz").exists()
+
+
+def test_a_disk_that_fills_at_any_step_of_a_raster_is_named(small_disk: Path) -> None:
+    """GDAL writes a file, its pyramid and its copy: each can be what no longer fits, with another error each."""
+    noise = np.random.default_rng(1).integers(1, 255, (512, 512, 4), dtype=np.uint8)
+    noise[..., 3] = 255
+    tiles = {(column, 0): np.roll(noise, column, axis=0) for column in range(3)}
+    grid = SiteGrid.at(ORIGIN, 0.05, SITE.crs)
+    written = 0
+    for free_kb in (*range(1000, 2600, 400), *range(2600, 3200, 20), 12_000):
+        size = f"remount,size={free_kb}k"
+        subprocess.run(["mount", "-o", size, str(small_disk)], check=True)
+        try:
+            write_cog(tiles, grid, small_disk / "map.tif")
+            written += 1
+            (small_disk / "map.tif").unlink()
+        except StoreError as error:
+            assert "MB free on its disk" in str(error) or "disk full" in str(error)
+        assert not list(small_disk.iterdir())
+    assert written == 1

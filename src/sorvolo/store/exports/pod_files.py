@@ -19,7 +19,7 @@ from sorvolo.store.atomic import atomic_path
 from sorvolo.store.exports.map_pictures import Picture, with_room
 from sorvolo.store.exports.places import longitude_latitude, near_longitudes
 from sorvolo.store.exports.plain import feature
-from sorvolo.store.rasters.geotiff import crs_of_epsg, quiet_gdal
+from sorvolo.store.rasters.geotiff import crs_of_epsg, writing_raster
 from sorvolo.survey.flight import Site
 
 PICTURE_PX = 1200
@@ -84,7 +84,7 @@ def write_pod_tif(path: Path, bands: Mapping[str, Floats], grid: CellGrid) -> No
     }
     with (
         atomic_path(path) as temporary,
-        quiet_gdal(),
+        writing_raster(path),
         rasterio.open(temporary, "w", **profile) as file,
     ):
         for number, (name, values) in enumerate(bands.items(), start=1):

@@ -21,6 +21,7 @@ import numpy as np
 import rasterio
 import rasterio.shutil
 from numpy.typing import NDArray
+from rasterio._err import CPLE_BaseError
 from rasterio.crs import CRS
 from rasterio.enums import ColorInterp, Resampling
 from rasterio.errors import CRSError, NotGeoreferencedWarning, RasterioError, RasterioIOError
@@ -210,8 +211,7 @@ def write_cog(
     with (
         scratch_folder(path.parent) as scratch,
         atomic_path(path) as temporary,
-        quiet_gdal(),
-        _naming_faults(path),
+        writing_raster(path),
     ):
         plain = scratch / "plain.tif"
         _write_plain(tiles, grid, plain, pass_by)
@@ -243,7 +243,7 @@ def write_mbtiles_or_pdf(
 
     The site must have a CRS. Raises StoreError for an empty map or a full disk.
     """
-    with scratch_folder(path.parent) as scratch, quiet_gdal(), _naming_faults(path):
+    with scratch_folder(path.parent) as scratch, writing_raster(path):
         write_cog(tiles, site_grid, plain := scratch / "map.tif")
         with atomic_path(path) as temporary:
             if path.suffix.lower() == ".pdf":
@@ -503,11 +503,12 @@ def _differs(path: Path) -> str:
 
 
 @contextmanager
-def _naming_faults(path: Path) -> Iterator[None]:
+def writing_raster(path: Path) -> Iterator[None]:
+    """Within it GDAL writes `path`. Raises StoreError, which states the free space, for every fault of GDAL."""
     try:
-        with writing(path):
+        with quiet_gdal(), writing(path):
             yield
-    except RasterioError as error:
+    except (RasterioError, CPLE_BaseError) as error:  # rasterio.shutil.copy lets GDAL's own through
         free_mb = shutil.disk_usage(path.parent).free / 1e6
         raise StoreError(
             f"could not write {path}: {error} ({free_mb:.0f} MB free on its disk); "

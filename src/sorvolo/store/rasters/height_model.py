@@ -25,9 +25,9 @@ from sorvolo.store.atomic import atomic_path, scratch_folder
 from sorvolo.store.rasters.geotiff import (
     crs_of_epsg,
     open_raster,
-    quiet_gdal,
     transform_on_grid,
     why_no_place,
+    writing_raster,
 )
 
 _LOWEST_M, _HIGHEST_M = (
@@ -197,21 +197,22 @@ def write_height_cog(
         "crs": crs_of_epsg(grid.crs) if grid.crs else None,
         "transform": transform_on_grid(grid, *first),
     }
-    with scratch_folder(path.parent) as scratch, atomic_path(path) as temporary, quiet_gdal():
-        try:
-            with rasterio.open(scratch / "plain.tif", "w", **profile) as sink:
-                for number, (band, name) in enumerate(zip(bands, names), start=1):
-                    sink.write(band.astype(np.float32, copy=False), number)
-                    sink.set_band_description(number, name)
-                    sink.set_band_unit(number, "metre")
-            with rasterio.open(scratch / "plain.tif") as source:
-                rasterio.shutil.copy(source, temporary, **_COG)
-            with rasterio.open(temporary, driver="GTiff") as written:
-                whole = np.array_equal(
-                    written.read(1), bands[0].astype(np.float32, copy=False), equal_nan=True
-                )
-        except RasterioError as error:
-            raise StoreError(f"{path} could not be written ({error}); is the disk full?") from error
+    with (
+        scratch_folder(path.parent) as scratch,
+        atomic_path(path) as temporary,
+        writing_raster(path),
+    ):
+        with rasterio.open(scratch / "plain.tif", "w", **profile) as sink:
+            for number, (band, name) in enumerate(zip(bands, names), start=1):
+                sink.write(band.astype(np.float32, copy=False), number)
+                sink.set_band_description(number, name)
+                sink.set_band_unit(number, "metre")
+        with rasterio.open(scratch / "plain.tif") as source:
+            rasterio.shutil.copy(source, temporary, **_COG)
+        with rasterio.open(temporary, driver="GTiff") as written:
+            whole = np.array_equal(
+                written.read(1), bands[0].astype(np.float32, copy=False), equal_nan=True
+            )
         if not whole:
             raise StoreError(f"{path} reads back differently; is the disk full?")
 
