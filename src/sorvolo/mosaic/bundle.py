@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sorvolo.geometry.arrays import Floats, Mask, Rows
 from sorvolo.geometry.pose import rotation_from_vector
-from sorvolo.mosaic.normal_equations import Elimination, NormalEquations
+from sorvolo.mosaic.normal_equations import NormalEquations
 
 SHARED = (
     "log_focal",
@@ -247,7 +247,9 @@ def solve(
     `shared_sigma` (8,) is each shared unknown's prior sigma about 0; 0 holds it at its present value.
     """
     damping = 1e-6
-    problem = _Problem.of(pairs, ground, shared_sigma, free)
+    position = np.full(len(free), -1)
+    position[free] = np.arange(int(free.sum()))
+    problem = _Problem(pairs, ground, shared_sigma, position)
     if iterations and free.sum() > 2 and np.array_equal(free, nodes.own):
         nodes, shared = _moved_as_one(problem, nodes, shared)
     equations = _normal_equations(problem, nodes, shared)
@@ -276,28 +278,6 @@ class _Problem:
     ground: Ground
     shared_sigma: Floats  # (8,)
     position: Rows  # (N,) of each node among those that move, -1 for those held
-    elimination: Elimination
-
-    @classmethod
-    def of(
-        cls,
-        pairs: Linked,
-        ground: Ground,
-        shared_sigma: Floats,
-        free: Mask,
-    ) -> "_Problem":
-        """With the nodes that are `free`, (N,) bool."""
-        position = np.full(len(free), -1)
-        position[free] = np.arange(int(free.sum()))
-        one, other = position[pairs.old], position[pairs.new]
-        both = (one >= 0) & (other >= 0)
-        return cls(
-            pairs,
-            ground,
-            shared_sigma,
-            position,
-            Elimination(int(free.sum()), one[both], other[both]),
-        )
 
 
 def _moved_as_one(problem: _Problem, nodes: Nodes, shared: Floats) -> tuple[Nodes, Floats]:
@@ -321,7 +301,7 @@ def _moved_as_one(problem: _Problem, nodes: Nodes, shared: Floats) -> tuple[Node
         basis = np.zeros((6 * count + len(SHARED), 4 + len(SHARED)))
         basis[: 6 * count, :4] = motions.reshape(-1, 4)
         basis[6 * count :, 4:] = np.eye(len(SHARED))
-        among, pull = basis.T @ equations.times(basis), basis.T @ equations.gradient()
+        among, pull = basis.T @ (equations.matrix() @ basis), basis.T @ equations.gradient()
         step = np.asarray(np.linalg.lstsq(among, pull, rcond=None)[0], np.float64)
         trial_nodes, trial_shared = _move_as_one(nodes, middle_m, step[:4]), shared + step[4:]
         trial = _normal_equations(problem, trial_nodes, trial_shared)
@@ -343,7 +323,8 @@ def _move_as_one(nodes: Nodes, middle_m: Floats, step: Floats) -> Nodes:
 
 
 def _normal_equations(problem: _Problem, nodes: Nodes, shared: Floats) -> NormalEquations:
-    into = NormalEquations(problem.elimination, len(SHARED))
+    index = np.flatnonzero(problem.position >= 0)  # in the order of their positions
+    into = NormalEquations(len(index), len(SHARED))
     if len(problem.pairs.old):
         _add_links(into, nodes, problem.pairs, shared, problem.position)
     if len(problem.ground.node):
@@ -358,7 +339,6 @@ def _normal_equations(problem: _Problem, nodes: Nodes, shared: Floats) -> Normal
         into.add(
             jacobian * root[..., None], residual * root, (problem.position[problem.ground.node],)
         )
-    index = np.flatnonzero(problem.position >= 0)  # in the order of their positions
     blocks, coupling = np.zeros((len(index), 6, 6)), np.zeros((len(index), 6, len(SHARED)))
     own, shared_pull = np.zeros((len(SHARED), len(SHARED))), np.zeros(len(SHARED))
     # place: GPS belongs to the camera, up to the offsets that the flight shares

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse.linalg import SuperLU
 
 from sorvolo.geometry.arrays import Floats, Matrix3, Rows
-from sorvolo.mosaic.normal_equations import Factors
 
 _AT_ONCE = 16  # points on the ground: two right-hand sides each, as long as the flight
 
@@ -48,7 +48,7 @@ def leans_m(rotations: Floats, stated: Floats, heights_m: Floats) -> Floats:
 
 
 def ground_sigmas_m(
-    rotations: Floats, heights_m: Floats, starts: Rows, factors: Factors
+    rotations: Floats, heights_m: Floats, starts: Rows, factors: SuperLU
 ) -> list[float]:
     """One sigma of the ground points at some cameras' image centres, per axis; their unknowns begin at `starts` (M,) of
     `factors`.
@@ -63,10 +63,10 @@ def ground_sigmas_m(
             for each in zip(rotations[some], heights_m[some], strict=True)
         ]
         unknowns = starts[some, None] + np.arange(6)
-        right = np.zeros((factors.size, len(blocks), 2))
+        right = np.zeros((factors.shape[0], len(blocks), 2))
         for k, block in enumerate(blocks):
             right[unknowns[k], k] = block.T
-        solved = factors.solve(right.reshape(factors.size, -1)).reshape(right.shape)
+        solved = factors.solve(right.reshape(len(right), -1)).reshape(right.shape)
         for k, block in enumerate(blocks):
             found.append(float(np.sqrt(max(0.0, np.trace(block @ solved[unknowns[k], k]) / 2))))
     return found

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import SuperLU
 
 from sorvolo.geometry.arrays import Floats, Mask, Matrix3, PointsM, Rows
 from sorvolo.geometry.camera import Camera
@@ -46,7 +47,6 @@ from sorvolo.mosaic.graph_settings import (
     PoseGraphSettings,
 )
 from sorvolo.mosaic.ground_ties import GroundTies
-from sorvolo.mosaic.normal_equations import Factors
 from sorvolo.mosaic.shelf import Shelf
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Link
@@ -92,9 +92,9 @@ def shared_sigma(settings: PoseGraphSettings, as_reported: Mask) -> Floats:
     )
 
 
-def shared_variances(factors: Factors) -> Floats:
+def shared_variances(factors: SuperLU) -> Floats:
     """(8,) of the shared unknowns, the last of the normal equations."""
-    units = np.zeros((factors.size, len(SHARED)))
+    units = np.zeros((factors.shape[0], len(SHARED)))
     units[-len(SHARED) :] = np.eye(len(SHARED))
     return np.diag(factors.solve(units)[-len(SHARED) :])
 
