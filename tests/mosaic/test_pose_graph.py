@@ -417,14 +417,9 @@ def test_stated_angles_that_pictures_rule_out_are_counted_and_a_compass_that_is_
     assert abs(report.turned_deg[1]) == pytest.approx(8.0, abs=1.5)
 
 
-def test_a_large_flight_is_solved_around_its_newest_keyframes():
+def test_most_keyframes_move_only_the_newest_of_a_flight():
     poses = flown(15, strips=6, per_strip=9)
-    graph, rng, most_moved, reached = (
-        PoseGraph(replace(DEFAULTS, region=16)),
-        np.random.default_rng(15),
-        [],
-        set(),
-    )
+    graph, rng, counts = PoseGraph(DEFAULTS), np.random.default_rng(15), []
     for number, pose in enumerate(poses):
         prior, links = prior_of(pose, rng), links_of(number, poses, rng) if number else []
         before = {each: graph.pose(each).translation_m for each in graph.ids()}
@@ -438,17 +433,14 @@ def test_a_large_flight_is_solved_around_its_newest_keyframes():
             if (graph.pose(each).translation_m != place).any()
         }
         if number > 20:
-            most_moved.append(len(moved))
-            reached |= {number - each for each in moved}
-    assert (
-        max(most_moved) <= 15 + 6 + 4
-    )  # the region, the window, and what the links of the new one end at
-    assert max(reached) > 9  # other strips are in it
+            counts.append(len(moved))
+    assert np.median(counts) <= 6 + 4  # the window, and what the links of the new one end at
+    assert max(counts) > 20  # all, now and then
     graph.conclude()
     assert shape_error_m(graph, poses) < 0.05
 
 
-def test_a_loop_that_strains_a_large_flight_moves_all_of_it():
+def test_a_loop_moves_all_of_a_flight():
     angles = np.linspace(0, 2 * np.pi, 49)[:-1]
     poses = [
         Pose(
@@ -458,7 +450,7 @@ def test_a_loop_that_strains_a_large_flight_moves_all_of_it():
         for a in angles
     ]
     rng = np.random.default_rng(16)
-    graph = PoseGraph(replace(DEFAULTS, region=12))
+    graph = PoseGraph(DEFAULTS)
     unknown = CameraPrior(np.zeros(3), np.full(3, np.inf), np.eye(3), UNKNOWN_ATTITUDE)
     for number, pose in enumerate((poses * 2)[:60]):
         others = [each for each in (number - 1, number - 2, number - 48) if each >= 0]

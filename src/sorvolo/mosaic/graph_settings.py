@@ -25,8 +25,6 @@ INDEPENDENT_PAIRS = 20.0  # matches of one link share lens and relief errors: th
 WINDOW = 6  # recent keyframes freed by each local solve
 # relief left between linked pictures over the height: level ground 0.0003, hills 0.004
 UNEVEN = 0.002
-# times a link's believed noise: the ground around it cannot be laid without bending more
-STRAINED = 3.0
 
 
 @dataclass(frozen=True)
@@ -35,7 +33,6 @@ class PoseGraphSettings:
 
     # floor of a match's noise; calibration and rolling shutter never are better
     sigma_px: float = 0.3
-    region: int = 120  # keyframes; a larger flight is solved around its newest ones only, until it ends or is strained
     focal_sigma: float = 0.0  # relative; 0 holds the focal length
     radial_sigma: float = 0.0  # prior of the left-over radial distortion; 0 holds it
     altitude_offset_sigma_m: float = 1.0  # how well the altitude's zero is known to be the ground

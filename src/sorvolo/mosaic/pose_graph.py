@@ -24,7 +24,6 @@ from sorvolo.mosaic.bundle import (
 )
 from sorvolo.mosaic.graph_report import GraphReport, ground_sigmas_m, leans_m
 from sorvolo.mosaic.graph_rows import (
-    LinkNoise,
     LinkRows,
     NodeRows,
     Trust,
@@ -41,7 +40,6 @@ from sorvolo.mosaic.graph_settings import (
     OFFSET_LEAST_SIGMAS,
     OFFSET_TILT_RAD,
     OFFSET_WIDEST_SIGMA,
-    STRAINED,
     UNEVEN,
     WINDOW,
     PoseGraphSettings,
@@ -126,8 +124,7 @@ class PoseGraph:
         self._links = LinkRows(shelf)
         self._shared = np.zeros(len(SHARED))
         self._dropped = 0
-        self._solved_at = self._region_solved_at = 0
-        self._is_strained = False
+        self._solved_at = 0
         self._trust = Trust()
         self._as_reported = np.zeros(len(SHARED), bool)
         self._ground = NO_GROUND
@@ -227,18 +224,29 @@ class PoseGraph:
         free[-WINDOW:] = True
         free[[self._ids[each.old_id] for each in links]] = True
         free &= self._own()
-        self._solve_around(free, iterations=2)
-        if self._due():
+        # The free nodes among those that they have links with: it costs the same however long the flight is.
+        pairs = self._links.of(np.flatnonzero(free[self._links.old] | free[self._links.new]))
+        near = np.unique(np.concatenate([np.flatnonzero(free), pairs.old, pairs.new]))
+        solution = solve(
+            self._state(near),
+            replace(
+                pairs, old=np.searchsorted(near, pairs.old), new=np.searchsorted(near, pairs.new)
+            ),
+            self._shared,
+            np.zeros(len(SHARED)),
+            free[near],
+            2,
+            ground=self._weighed_ground().among(near),
+        )
+        self._rows.rotations[near] = solution.nodes.rotations
+        self._rows.centres_m[near] = solution.nodes.centres_m
+        if len(self._nodes) - self._solved_at >= max(4, len(self._nodes) // 6):
             return self.settle(iterations=3)
-        grown, region = len(self._nodes) - self._region_solved_at, self._settings.region
-        if len(self._nodes) > region and grown >= max(1, region // 8):
-            return self._settle_region()
         return self._moved(np.flatnonzero(free))
 
     def settle(self, iterations: int = 8) -> frozenset[int]:
         """Solve everything at once: align to GPS, weigh links by what they show, drop false ones."""
-        self._solved_at = self._region_solved_at = len(self._nodes)
-        self._is_strained = False
+        self._solved_at = len(self._nodes)
         self._align()
         self._solve(self._own(), iterations)
         self._weigh_links()
@@ -492,63 +500,6 @@ class PoseGraph:
             self._shared = solution.shared
         return solution
 
-    def _solve_around(self, free: Mask, iterations: int) -> Rows:
-        """Move the free nodes, (N,) bool, among those that they have links with; the links (L,) that took part.
-
-        It costs the same however long the flight is.
-        """
-        # The links that a free node, (N,) bool, has.
-        chosen = np.flatnonzero(free[self._links.old] | free[self._links.new])
-        pairs = self._links.of(chosen)
-        near = np.unique(np.concatenate([np.flatnonzero(free), pairs.old, pairs.new]))
-        few = replace(
-            pairs, old=np.searchsorted(near, pairs.old), new=np.searchsorted(near, pairs.new)
-        )
-        solution = solve(
-            self._state(near),
-            few,
-            self._shared,
-            np.zeros(len(SHARED)),
-            free[near],
-            iterations,
-            ground=self._weighed_ground().among(near),
-        )
-        self._rows.rotations[near], self._rows.centres_m[near] = (
-            solution.nodes.rotations,
-            solution.nodes.centres_m,
-        )
-        return chosen
-
-    def _settle_region(self) -> frozenset[int]:
-        """Solve the ground around the newest keyframe, learn the noise of its links, and see whether it is strained."""
-        self._region_solved_at = len(self._nodes)
-        free = self._around_newest(self._settings.region) & self._own()
-        chosen = self._solve_around(free, iterations=3)
-        if not len(chosen):
-            return self._moved(np.flatnonzero(free))
-        noise = link_noise(self._state(), self._links.of(chosen), self._shared)
-        usual_px = float(np.median(self._links.sigma_px))
-        false = noise.is_false(usual_px)  # perhaps: the whole map is solved before one is dropped
-        believed_px = np.maximum(self._links.sigma_px[chosen], usual_px)
-        self._is_strained |= bool((noise.across_px > STRAINED * believed_px).any())
-        self._weigh(chosen[~false], noise, ~false)
-        self._weigh_telemetry()
-        return self._moved(np.flatnonzero(free))
-
-    def _around_newest(self, most: int) -> Mask:
-        """(N,) the newest node and those that the fewest links part from it, the newer first, `most` in all."""
-        old, new = self._links.old, self._links.new
-        reached = np.zeros(len(self._nodes), bool)
-        reached[-1] = True
-        while True:
-            wider = reached.copy()
-            wider[old[reached[new]]] = wider[new[reached[old]]] = True
-            ring = np.flatnonzero(wider & ~reached)
-            room = most - int(reached.sum())
-            if not len(ring) or room <= 0:
-                return reached
-            reached[ring[-room:]] = True
-
     def _weighed_ground(self) -> Ground:
         """The ties to known ground, their sigmas as large as most of them miss by now: else none would pull."""
         ground = self._ground
@@ -558,13 +509,6 @@ class PoseGraph:
         miss = np.linalg.norm(rows.residual_px, axis=1) / rows.sigma_px
         factor = float(np.clip(np.median(miss[rows.seen]), 1.0, 1e4)) if rows.seen.any() else 1.0
         return replace(ground, sigma_px=ground.sigma_px * factor, sigma_m=ground.sigma_m * factor)
-
-    def _due(self) -> bool:
-        """Whether it is time to solve everything: often at first; of a large flight only where its newest ground is
-        strained, as it is after a loop without fixes."""
-        if len(self._nodes) > self._settings.region and not self._is_strained:
-            return False
-        return len(self._nodes) - self._solved_at >= max(4, len(self._nodes) // 6)
 
     def _align(self) -> None:
         """Bring the whole map to known ground, else to its GPS fixes, by a similarity where it is far off: the solve
@@ -601,20 +545,14 @@ class PoseGraph:
         if not len(self._links):
             return
         noise = link_noise(self._state(), self._links, self._shared)
-        every = np.arange(len(self._links))
-        self._weigh(every, noise, np.ones(len(every), bool))
+        # a link's relief is half its own and half that of most
+        overall = float(np.median(noise.relief_m))
+        self._links.relief_m[:] = np.clip(np.sqrt(0.5 * (noise.relief_m**2 + overall**2)), 0.0, 5.0)
+        self._links.sigma_px[:] = np.clip(noise.across_px, self._settings.sigma_px, 5.0)
         false = noise.is_false(float(np.median(noise.across_px)))
         if false.any():
             self._dropped += int(false.sum())
             self._links.keep(~false)
-
-    def _weigh(self, links: Rows, noise: LinkNoise, chosen: Mask) -> None:
-        """Give `links` the noise of those that are `chosen`, their relief half their own and half that of most."""
-        overall = float(np.median(noise.relief_m))
-        self._links.relief_m[links] = np.clip(
-            np.sqrt(0.5 * (noise.relief_m[chosen] ** 2 + overall**2)), 0.0, 5.0
-        )
-        self._links.sigma_px[links] = np.clip(noise.across_px[chosen], self._settings.sigma_px, 5.0)
 
     def _weigh_telemetry(self) -> None:
         tied = np.zeros(len(self._nodes), bool)
