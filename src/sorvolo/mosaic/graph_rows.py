@@ -93,12 +93,10 @@ class NodeRows(_Rows):
             np.radians(prior.attitude_sigma_deg),
         )
 
-    def nodes(
-        self, place: Floats, attitude: Floats, contradicted: Rows, at: Rows | slice = slice(None)
-    ) -> Nodes:
-        """For the solver: stated sigmas times `place` and `attitude`, (3,) each, no angles where contradicted; all
-        nodes, or those `at` some rows."""
-        sigma_m, sigma_rad = self.stated_sigma_m[at] * place, self.stated_sigma_rad[at] * attitude
+    def nodes(self, place: Floats, contradicted: Rows, at: Rows | slice = slice(None)) -> Nodes:
+        """For the solver: stated sigmas of places times `place` (3,), no angles where contradicted; all nodes, or those
+        `at` some rows."""
+        sigma_m, sigma_rad = self.stated_sigma_m[at] * place, self.stated_sigma_rad[at].copy()
         sigma_rad[np.isin(np.arange(len(self))[at], contradicted)] = np.inf
         return Nodes(
             self.rotations[at],
@@ -247,10 +245,9 @@ _ENOUGH = 8  # frames from which telemetry's own errors are learnt
 
 @dataclass(frozen=True, eq=False)
 class Trust:
-    """Factors on telemetry's stated sigmas, (3,) each, and the nodes whose angles are plainly wrong."""
+    """Factors on the stated sigmas of places, (3,), and the nodes whose angles are plainly wrong."""
 
     place: Floats = field(default_factory=lambda: np.ones(3))
-    attitude: Floats = field(default_factory=lambda: np.ones(3))
     contradicted: Rows = field(default_factory=lambda: np.zeros(0, int))
 
 
@@ -287,8 +284,8 @@ def miss_px(nodes: Nodes, pairs: Linked, shared: Floats) -> Iterator[tuple[Rows,
 def telemetry_trust(rows: NodeRows, tied: Mask, miss_m: Floats) -> Trust:
     """How good telemetry really is, from how it departs from the pictures, once there are enough of them.
 
-    Fixes and angles scatter more or less than they claim, and both are scaled to what they show. Angles that are
-    plainly wrong are left out one by one. `tied` (N,): the flight's keyframes that have links; `miss_m` (N, 3): their
+    Fixes scatter more or less than they claim, and are scaled to what they show. Angles that are plainly wrong are left
+    out one by one. `tied` (N,): the flight's keyframes that have links; `miss_m` (N, 3): their
     cameras' distance from telemetry's places.
     """
     stated_m, stated_rad = rows.stated_sigma_m, rows.stated_sigma_rad
@@ -298,8 +295,6 @@ def telemetry_trust(rows: NodeRows, tied: Mask, miss_m: Floats) -> Trust:
     contradicted = np.flatnonzero(
         tied & angled & (size > np.maximum(5 * stated_rad.max(axis=1), np.radians(15)))
     )
-    used = tied & angled
-    used[contradicted] = False
     place = np.ones(3)
     fixed = tied & np.isfinite(stated_m[:, 0])
     if fixed.sum() >= _ENOUGH:
@@ -309,20 +304,7 @@ def telemetry_trust(rows: NodeRows, tied: Mask, miss_m: Floats) -> Trust:
     if high.sum() >= _ENOUGH:
         times = SIGMA_PER_MEDIAN_DEVIATION * np.median(np.abs(miss_m[high, 2]) / stated_m[high, 2])
         place[2] = np.clip(times, 0.5, 20.0)
-    return Trust(
-        place,
-        _attitude_factors(stated_rad, used, error_rad),
-        contradicted,
-    )
-
-
-def _attitude_factors(stated_rad: Floats, used: Mask, error_rad: Floats) -> Floats:
-    if used.sum() < _ENOUGH:
-        return np.ones(3)
-    scatter = error_rad[used] - np.median(error_rad[used], axis=0)
-    spread = SIGMA_PER_MEDIAN_DEVIATION * np.median(np.abs(scatter), axis=0)
-    # pictures see heading well, tilt hardly: a small scatter of tilt only shows that it was believed
-    return np.asarray(np.clip(spread / np.median(stated_rad[used], axis=0), [1.0, 1.0, 0.25], 5.0))
+    return Trust(place, contradicted)
 
 
 def _noise(nodes: Nodes, pairs: Pairs, shared: Floats) -> LinkNoise:

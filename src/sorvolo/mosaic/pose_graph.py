@@ -464,9 +464,7 @@ class PoseGraph:
 
     def _state(self, at: Rows | slice = slice(None)) -> Nodes:
         """All nodes, or some of them."""
-        return self._rows.nodes(
-            self._trust.place, self._trust.attitude, self._trust.contradicted, at
-        )
+        return self._rows.nodes(self._trust.place, self._trust.contradicted, at)
 
     def _gps_miss_m(self) -> Floats:
         return self._rows.centres_m + self._shared[[3, 4, 2]] - self._rows.prior_centres_m
