@@ -55,6 +55,7 @@ def test_the_report_names_ground_that_is_not_level(
     assert (off_m < 2 * report["sigma_m"] * np.sqrt(2)).mean() > 0.9, (off_m, report["sigma_m"])
     if stands:
         _compares_over_heights(tmp_path)
+        _extends_over_heights(tmp_path)
         _goes_on_after_a_full_disk(tmp_path, monkeypatch)
 
 
@@ -66,22 +67,48 @@ def _compares_over_heights(folder: Path) -> None:
     assert main([*command, "--model", "none", "--camera", str(folder / "made" / "camera.xml")]) == 0
     later = folder / "compared" / "flights" / "photos-2"
     assert json.loads((later / "changes.geojson").read_text())["features"] == []
+    off_m = _cameras_off_m(folder, later, "flight2")
+    off_m -= np.median(_cameras_off_m(folder, later.parent / "photos", "flight1"), axis=0)
+    assert len(off_m) >= 6 and np.median(np.linalg.norm(off_m, axis=1)) < 0.3
+
+
+def _extends_over_heights(folder: Path) -> None:
+    """What a map over heights gains by a later flight is no level plane: its cameras stand in space on that map."""
+    made = folder / "made"
+    for name in _names(made / "flight1" / "photos")[:6]:
+        (folder / "half").mkdir(exist_ok=True)
+        shutil.copy(made / "flight1" / "photos" / name, folder / "half")
+    with_camera = ["--model", "none", "--camera", str(made / "camera.xml")]
+    site = ["--site", str(folder / "extended"), *with_camera]
+    assert main(["map", str(folder / "half"), "--heights", *site]) == 0
+    main(["compare", str(made / "flight2" / "photos"), *site])
+    later = folder / "extended" / "flights" / "photos"
+    report = json.loads((later / "report.json").read_text())
+    assert report["comparison"]["extension"]["area_m2"] > 50
+    assert not any("fit each other badly" in each for each in report["warnings"])
+    off_m = _cameras_off_m(folder, later, "flight2")
+    off_m -= np.median(_cameras_off_m(folder, later.parent / "half", "flight1"), axis=0)
+    assert len(off_m) >= 6 and np.linalg.norm(off_m, axis=1).max() < 1
+
+
+def _names(folder: Path) -> list[str]:
+    return sorted(each.name for each in folder.iterdir())
+
+
+def _cameras_off_m(folder: Path, mapped: Path, flight: str) -> np.ndarray:
+    """(N, 3) how far a flight's cameras that were placed stand from where they were, m; heights by another zero."""
     truth = json.loads((folder / "made" / "truth" / "frames.geojson").read_text())
     true = {
         each["properties"]["frame"]: _camera_m(each["properties"])
         for each in truth["features"]
-        if each["properties"]["flight"] == "flight2"
+        if each["properties"]["flight"] == flight
     }
-    found = json.loads((later / "frames.geojson").read_text())["features"]
-    off_m = np.array(
-        [
-            _camera_m(each["properties"]) - true[each["properties"]["frame"]]
-            for each in found
-            if each["properties"]["status"] == "vision"
-        ]
-    )
-    off_m -= np.median(off_m, axis=0)  # the map's own shift
-    assert len(off_m) >= 6 and np.median(np.linalg.norm(off_m, axis=1)) < 0.3
+    found = [
+        each["properties"]
+        for each in json.loads((mapped / "frames.geojson").read_text())["features"]
+        if each["properties"]["status"] == "vision"
+    ]
+    return np.array([_camera_m(each) - true[each["frame"]] for each in found])
 
 
 def _camera_m(properties: dict[str, Any]) -> np.ndarray:

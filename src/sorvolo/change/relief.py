@@ -14,6 +14,7 @@ from sorvolo.geometry.pose import Pose
 _COARSER = 4  # pixels of a raster, either way, for which one line of sight is followed
 _HIDES_M = 0.3  # what rises less above a line of sight hides nothing
 _STEEP_M, _WALL_M = 1.5, 0.6  # what rises so much within this is no ground that pictures share
+_STEPS = 8  # of a ray to the surface
 _LONGER = 1.15  # times: each step along a line of sight
 
 
@@ -50,6 +51,18 @@ class OrthoSurface:
             ),
             np.float32,
         )
+
+    def met(self, eye_m: Vector3, rays: PointsM) -> PointsM:
+        """(N, 3) where rays (N, 3) from a camera meet the surface; by steps, each to the height below the last one's end,
+        so that by walls they may end beside it; NaN beyond it."""
+        ends_m = eye_m + rays * ((np.median(self.up_m) - eye_m[2]) / rays[:, 2:])
+        for _ in range(_STEPS):
+            up_m = self._at(ends_m[None, :, :2])[0]
+            ends_m = eye_m + rays * ((up_m - eye_m[2]) / rays[:, 2])[:, None]
+        affine = self.cells_from_site
+        cells = ends_m[:, :2] @ affine[:2, :2].T + affine[:2, 2]
+        inside = ((cells >= 0) & (cells < self.up_m.shape[::-1])).all(axis=1)
+        return np.where(inside[:, None], ends_m, np.nan)
 
     def lay(
         self, site_from_raster: Matrix3, size: tuple[int, int], camera: Camera, pose: Pose

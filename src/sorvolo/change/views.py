@@ -327,8 +327,9 @@ class ViewMaker:
         seen = self._lens.valid(*size)
         self._lens_sees: Mask = np.ones(size[::-1], bool) if seen is None else seen
         self._pictures = pictures
-        self._surface = None if pictures is None else pictures.surface
-        self._aligner = Aligner(reference, site_grid, self._surface)
+        self.surface = None if pictures is None else pictures.surface
+        """The heights that views are laid over; None where the map is flat."""
+        self._aligner = Aligner(reference, site_grid, self.surface)
         self._method = method
         self._measures = FlightMeasures() if method is None else None
         self._planting = Planting()
@@ -518,9 +519,9 @@ class ViewMaker:
     def _laid(self, aligned: Aligned, image: ImageRGB, known: Mask) -> tuple[ImageRGB, Mask]:
         """A frame (h, w, 3) laid on the map's picture, over its heights where it has any, and where (h, w) both are
         known."""
-        if self._surface is None or aligned.stand is None:
+        if self.surface is None or aligned.stand is None:
             return _laid_level(aligned, image, known)
-        x, y, sees = self._surface.lay(
+        x, y, sees = self.surface.lay(
             aligned.site_from_image, known.shape[::-1], self._lens.camera, aligned.stand
         )
         laid = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

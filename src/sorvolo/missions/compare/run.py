@@ -370,7 +370,7 @@ class CompareRun:
 
     def _extend_map(self) -> int:
         """Place the frames that extend the map for good; how many others their pictures make needless."""
-        self._placed |= {each.index: each for each in self._extension.complete()}
+        self._placed |= {each.index: each for each in self._extension.complete(self._placed)}
         shown_as_well = self._extension.shown_as_well(self._placed)
         for index in shown_as_well:
             del self._placed[index]
@@ -443,6 +443,6 @@ def _painted_over(
     cells_from_site: Matrix3 = np.asarray(
         np.linalg.inv(surface.lattice.site_from_cells), np.float64
     )
-    up_m = closed(surface.lattice, surface.up_m, ground.up_m)
+    up_m = closed(surface.lattice, surface.up_m, ground.up_m) - archive.site().origin.height_m
     lens = Undistorter(refined_camera(camera, 1.0, *radial_of(archive, flight_id)))
-    return OrthoSurface(up_m, cells_from_site), lens
+    return OrthoSurface(up_m.astype(np.float32), cells_from_site), lens

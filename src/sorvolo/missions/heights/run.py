@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -206,6 +206,10 @@ class GroundModel:
         return np.median(up_m, axis=0), up_m.std(axis=0)
 
 
+Tied = Callable[[Cameras3D], Cameras3D]
+"""What brings cameras in space, and their points, to ground that is known."""
+
+
 @mission
 def make_heights(
     site: AnyPath,
@@ -271,8 +275,9 @@ def model_ground(
     keyframes: Sequence[StoredKeyframe],
     cell_m: float | None = None,
     memo: ResultCache | None = None,
+    tied: Tied = lambda solved: solved,
 ) -> Generator[HeightsUpdate, None, GroundModel]:
-    """The ground that views, each of one keyframe, see in space, yielding progress.
+    """The ground that views, each of one keyframe, see in space, yielding progress; `tied` moves their cameras first.
 
     What a killed run found out is taken from its `memo`. Raises InputError where views share too little for it.
     """
@@ -283,7 +288,7 @@ def model_ground(
     yield HeightsUpdate(flight_id, "cameras", 0.0)
     gray = FlightPictures(archive, keyframes).gray
     tracks = memo.of(last, "tracks", Tracks, lambda: find_tracks(views, gray))
-    solved = solve_tracks(views, tracks)
+    solved = tied(solve_tracks(views, tracks))
     kept = [each for each in keyframes if each.name not in set(solved.lost)]
     pictures = FlightPictures(archive, kept, solved.radial)
     cameras_s = time.monotonic() - started_s

@@ -12,7 +12,7 @@ from sorvolo.geometry.level_ground import is_on_ground
 from sorvolo.heights.views import View, fix_from_residual, ground_outlines_m
 from sorvolo.missions.flight.report import LEVEL, MapShape
 from sorvolo.missions.flight.result_cache import ResultCache
-from sorvolo.missions.heights.run import GroundModel, model_ground
+from sorvolo.missions.heights.run import GroundModel, Tied, model_ground
 from sorvolo.mosaic.graph_report import GraphReport
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import StoredKeyframe
@@ -64,6 +64,7 @@ def ground_of(
     frames: Sequence[PlacedFrame],
     keyframes: Sequence[StoredKeyframe],
     memo: ResultCache,
+    tied: Tied,
 ) -> GroundModel | str:
     """The ground that a flight's frames see, each stored as the keyframe beside it; why there is none, in words."""
     views = [
@@ -76,7 +77,7 @@ def ground_of(
         for frame, stored in zip(frames, keyframes, strict=True)
         if stored.site_from_camera is not None
     ]
-    work = model_ground(archive, views, keyframes, memo=memo)
+    work = model_ground(archive, views, keyframes, memo=memo, tied=tied)
     while True:
         try:
             next(work)

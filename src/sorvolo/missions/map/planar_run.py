@@ -30,7 +30,7 @@ from sorvolo.missions.flight.request import REQUEST
 from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.flight.settings import TILES_MB, MapSettings, memory_budget_bytes
 from sorvolo.missions.flight.setup import FlightSetup, new_site
-from sorvolo.missions.heights.run import GroundModel, ground_tiles, write_heights
+from sorvolo.missions.heights.run import GroundModel, Tied, ground_tiles, write_heights
 from sorvolo.missions.map.coverage import FlightCoverage
 from sorvolo.missions.map.ground import ground_of, pieces_of, shape_of, standing_frames
 from sorvolo.missions.map.painting import FlightPainter, KnownKeyframes
@@ -358,15 +358,14 @@ class PlanarRun(FlightRun):
                 keyframe_id, camera, site_from_image, residual_px
             )
 
-    def complete(self) -> list[PlacedFrame]:
+    def complete(self, tied: Tied) -> list[PlacedFrame]:
         """Solve once more, find the clock offset, paint what moved: every selected frame as it ends, in their order.
 
-        Nothing is committed. Frames that came to nothing are rejected; without any other nothing is painted.
+        Nothing is committed. Frames that came to nothing are rejected; without any other nothing is painted. `tied`
+        brings cameras in space to where the site's map has their ground.
         """
-        painter = self._settled()
-        if painter is not None:
-            painter.finish()
-        return self._placed()
+        painter, placed = self._settled(), self._placed()
+        return placed if painter is None else self._paint_ground(painter, placed, tied)[0]
 
     def _settled(self) -> FlightPainter | None:
         """What paints the flight, all keyframes standing where they do in the end; None where none has a place."""
@@ -387,7 +386,10 @@ class PlanarRun(FlightRun):
         return painter
 
     def _paint_ground(
-        self, painter: FlightPainter, placed: list[PlacedFrame]
+        self,
+        painter: FlightPainter,
+        placed: list[PlacedFrame],
+        tied: Tied = lambda solved: solved,
     ) -> tuple[list[PlacedFrame], MapShape, GroundModel | None]:
         """Paint the map, flat or over the heights of its ground; the frames as they stand on it."""
         shape = shape_of(
@@ -404,7 +406,7 @@ class PlanarRun(FlightRun):
             frames = [each for each in placed if each.status is not Status.REJECTED]
             keyframes = [writer.keyframe(each, self.images[each.index]) for each in frames]
             with self._log.stage(Stage.HEIGHTS):
-                found = ground_of(self._archive, frames, keyframes, self._memo)
+                found = ground_of(self._archive, frames, keyframes, self._memo, tied)
             if isinstance(found, str):
                 shape = MapShape(True, f"the map is flat, for heights could not be made: {found}")
             else:
