@@ -7,7 +7,7 @@ import shlex
 import socket
 import sys
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -122,6 +122,46 @@ def test_a_receiver_that_had_stopped_places_nothing_unless_the_drone_hovered(
         "all one place, and the pictures move: no object is placed" in each for each in texts
     )
     assert not (tmp_path / "watch" / "tracks.geojson").exists()
+
+
+@pytest.mark.parametrize(
+    ("column", "changed", "headline"),
+    [
+        ("Latitude", lambda row, _: row["Longitude"], "positions are a mirror image"),
+        ("Latitude", lambda _, first: first["Latitude"], "do not follow the pictures"),
+        ("relativeHeight", lambda row, _: float(row["relativeHeight"]) / 0.3048, "(feet, a slope"),
+        ("Gimbal:pitch", lambda row, _: -float(row["Gimbal:pitch"]), "have no place on the ground"),
+        ("Tick#", lambda row, _: row["Tick#"], "100 % of the ground looked at"),
+    ],
+    ids=["swapped", "stopped", "feet", "upwards", "right"],
+)
+def test_telemetry_that_the_pictures_contradict_makes_no_clean_headline(
+    flown: Path,
+    detector: TruthDetector,
+    tmp_path: Path,
+    column: str,
+    changed: Callable[[dict[str, str], dict[str, str]], object],
+    headline: str,
+) -> None:
+    """Each ended as a right watch did: places 8 to 4,000,000 m off, stated to 1.3 m, or nobody there."""
+    rows = list(csv.DictReader((flown / "flight1" / "flight1.csv").open()))
+    half = rows[len(rows) // 2]
+    for k, row in enumerate(rows):
+        swapped = {"Longitude": row["Latitude"]} if headline.endswith("image") else {}
+        if "follow" not in headline or k > len(rows) // 2:  # from then on the receiver stands
+            stopped = {"Longitude": half["Longitude"]} if "follow" in headline else {}
+            row |= {column: str(changed(row, half)), **swapped, **stopped}
+    log = tmp_path / "log.csv"
+    with log.open("w") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    written = WatchOutputs(folder=tmp_path / "watch")
+    camera = flown / "camera.xml"
+    list(watch(_video(flown), outputs=written, telemetry=log, camera=camera, detector=detector))
+    found = _read(tmp_path / "watch" / "report.json")["headline"]
+    assert headline in found["text"] and found["complete"] is (column == "Tick#"), found
+    assert "no person" not in found["text"]
 
 
 def test_each_object_once_at_its_place(

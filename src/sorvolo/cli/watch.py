@@ -90,7 +90,7 @@ def watch_command(
     Ends with the source or with Ctrl-C, and writes all results either way. While a drone flies, frames of new ground are
     searched first; the others are kept and searched once it has landed, or after Ctrl-C (again: stop at once).
     The first line counts the ground that was looked at; exit code 3: less than was asked for, so what else is there is
-    not known. detections.jsonl grows while the watch runs. After a crash or a power cut, give the same command again:
+    not known, or its pictures contradict the telemetry. detections.jsonl grows while the watch runs. After a crash or a power cut, give the same command again:
     it continues where it was, and sends no alert twice.
 
     Example: sorvolo watch DJI_0042.MP4 --classes person

@@ -11,7 +11,12 @@ from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, rotation_from_vector
 from sorvolo.survey.flight import CameraModel, CameraPrior, Frame
 from sorvolo.survey.objects import Detections, Sighting, Track
-from sorvolo.tracking.headings import CompassError, HeadingCheck, HeadingFromPictures
+from sorvolo.tracking.headings import (
+    CompassError,
+    HeadingCheck,
+    HeadingFromPictures,
+    contradiction,
+)
 from sorvolo.tracking.image_motion import ImageMotion
 from sorvolo.tracking.laying import IMPOSSIBLE_SIZE, GroundHeight, LocateSettings, locate
 from sorvolo.tracking.sizes import SceneScale
@@ -117,6 +122,12 @@ class GroundFollower:
         """By how much, clockwise, headings of a video's frames were turned that were far off, a number each."""
         return () if self._check is None else self._check.turns_deg
 
+    @property
+    def contradiction(self) -> str:
+        """What in the telemetry the pictures' motion contradicts; "" where nothing does, and of photos."""
+        pictures = self._heading if self._check is None else self._check.pictures
+        return "" if pictures is None else contradiction(pictures.places, self._camera.camera.fx_px)
+
     def take(self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior) -> Taken:
         """Place a frame's detections, seen from `prior`, on the ground and give them to their tracks."""
         prior = self._with_heading(frame, time_ns, found, prior)
@@ -177,9 +188,9 @@ class GroundFollower:
     ) -> CameraPrior:
         """The prior with its heading from the pictures, or with its compass corrected by what stands."""
         if self._heading is not None:
-            return self._heading.take(frame, time_ns, found, prior)
+            return self._heading.take(frame, time_ns, found, prior, self._below_m(prior))
         if self._check is not None:
-            prior = self._check.take(frame, time_ns, found, prior)
+            prior = self._check.take(frame, time_ns, found, prior, self._below_m(prior))
         site_from_read = rotation_from_vector(
             np.array([0.0, 0.0, np.radians(self._compass.clockwise_deg)])
         )

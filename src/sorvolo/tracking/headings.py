@@ -1,7 +1,9 @@
 """Where a camera's top points: by the pictures' way without a compass, and how wrong compasses and telemetry are."""
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 
 import numpy as np
 
@@ -124,6 +126,48 @@ class CompassError:
         return self.clockwise_deg
 
 
+SeenPlace = tuple[int, int, complex, complex, float]
+"""Of a picture: its segment; its time, ns; its middle in pixels of the segment's first picture, and by telemetry, m (real
+part right, or east); the camera's height above it by telemetry, times how large the first picture shows it beside this."""
+_WAY_NS = 30 * 10**9  # of a stretch in which the pictures' way is held against telemetry's
+_JUDGED_M = 10.0  # of way, rms, by either of the two: less is within the fixes' errors
+_LONGER = 1.4  # than the other a way may be, as where the ground falls; by choice
+_ASTRAY = 0.35  # of a way, rms, that does not fit the other; by choice
+_MIRROR_M = 2.0  # rms, by which a way must miss before it is taken for the other's mirror image
+_MIRRORED = "its positions are a mirror image: latitude and longitude swapped, or a sign lost"
+_APART = "its positions do not follow the pictures: a receiver that stopped, or a wrong clock"
+_HEIGHTS = (
+    "its heights are not those above this ground (feet, a slope: give --ground-elevation or --height-model), or "
+    "--camera or the zoom is another"
+)
+
+
+def contradiction(places: Sequence[SeenPlace], fx_px: float) -> str:
+    """What in a flight's telemetry the pictures' way contradicts, in words; "" where nothing does."""
+    reasons = list[str]()
+    for _, stretch in groupby(places, lambda each: (each[0], each[1] // _WAY_NS)):
+        _, _, seen_px, told, height_m = np.array([*stretch]).T
+        seen_m = (seen_px - seen_px.mean()) * np.median(height_m.real) / fx_px
+        told_m = told - told.mean()
+        way_m, told_way_m = seen_m.std(), told_m.std()
+        if len(told) < 5 or max(way_m, told_way_m) < _JUDGED_M:
+            continue
+        turn = np.vdot(seen_m, told_m) / max(len(told) * way_m**2, 1e-9)
+        miss_m = (told_m - turn * seen_m).std()
+        both = np.column_stack([seen_m, seen_m.conj()])
+        fit, *_ = np.linalg.lstsq(both, told_m, rcond=None)
+        left_m = (told_m - both @ fit).std()
+        if abs(fit[1]) > 2 * abs(fit[0]) and miss_m > max(_MIRROR_M, 2 * left_m):
+            reasons.append(_MIRRORED)
+        elif miss_m >= _ASTRAY * told_way_m:
+            reasons.append(_APART)
+        else:
+            is_alike = way_m < _LONGER * told_way_m < _LONGER**2 * way_m
+            reasons.append("" if is_alike else _HEIGHTS)
+    worst = max(filter(None, reasons), key=reasons.count, default="")
+    return worst if 4 * reasons.count(worst) > len(reasons) else ""
+
+
 class HeadingFromPictures:
     """The heading of a camera from the motion that its pictures show; without `over_guesses` the way begins anew where
     a picture shows no motion that fits."""
@@ -131,19 +175,22 @@ class HeadingFromPictures:
     def __init__(self, *, over_guesses: bool = True) -> None:
         self._motion, self._heading = ImageMotion(), HeadingFromMotion()
         self._segments, self._guessed, self._over_guesses = 1, 0, over_guesses
+        self.places: list[SeenPlace] = []
 
     def take(
-        self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior
+        self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior, below_m: float
     ) -> CameraPrior:
-        """The prior with the heading in it, where that is known by now."""
-        heading = self.heading(frame, time_ns, found, prior)
+        """The prior with the heading in it, where that is known by now; `below_m` is the ground's height."""
+        heading = self.heading(frame, time_ns, found, prior, below_m)
         if not np.isfinite(heading.sigma_deg):
             return prior
         sigma_deg = np.array([*prior.attitude_sigma_deg[:2], heading.sigma_deg])
         rotation = site_from_gimbal_rotation(heading.heading_deg, -90.0, 0.0)
         return replace(prior, rotation=rotation, attitude_sigma_deg=sigma_deg)
 
-    def heading(self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior) -> Heading:
+    def heading(
+        self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior, below_m: float
+    ) -> Heading:
         """The heading of a frame, which has to be given each; its sigma is infinite where it is not known by now."""
         _, outline_px = self._motion.locate(found, frame, time_ns)
         is_guess = self._motion.guessed != self._guessed and not self._over_guesses
@@ -152,6 +199,13 @@ class HeadingFromPictures:
         self._segments, self._guessed = self._motion.segments, self._motion.guessed
         if not prior.knows_place:
             return Heading(0.0, float("inf"))
+        ahead, up_m = prior.rotation[:, 2], float(prior.position_m[2]) - below_m
+        if ahead[2] < -_LEAST_DOWN and up_m > 0:
+            x, y = outline_px.mean(axis=0)
+            east, north = prior.position_m[:2] - up_m / ahead[2] * ahead[:2]
+            up_m *= frame.image.shape[1] / float(np.hypot(*(outline_px[1] - outline_px[0])))
+            told_m = complex(east, north)
+            self.places.append((self._segments, time_ns, complex(x, -y), told_m, up_m))
         return self._heading.add(time_ns / 1e9, outline_px, prior.position_m[:2])
 
 
@@ -215,17 +269,17 @@ class HeadingCheck:
     """
 
     def __init__(self) -> None:
-        self._pictures = HeadingFromPictures(over_guesses=False)
+        self.pictures = HeadingFromPictures(over_guesses=False)
         self._turn: HeadingTurn | None = None
         self._last: tuple[int, float, float] | None = None  # time, heading, turn, as last shown
         self._steady_ns = 0  # the drone turns until then
         self.turns_deg: list[float] = []
 
     def take(
-        self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior
+        self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior, below_m: float
     ) -> CameraPrior:
-        """The prior, turned where its heading is wrong."""
-        shown = self._pictures.heading(frame, time_ns, found, prior)
+        """The prior, turned where its heading is wrong; `below_m` is the ground's height."""
+        shown = self.pictures.heading(frame, time_ns, found, prior, below_m)
         if not is_checked(prior):
             return prior
         if np.isfinite(shown.sigma_deg):

@@ -79,6 +79,7 @@ def over_heights(
 
 
 _COMPASS_REPORTED_DEG = 2.0  # by which a compass is off: less is not worth a notice; by choice
+CONTRADICTED = "telemetry_contradicted"
 _OF_MAPS = (
     "no_telemetry",
     "ground_unknown",
@@ -210,6 +211,9 @@ class GroundPlaces(Places):
                 f"{counted(len(turns_deg), what)}"
             )
             found.append(Notice("headings_wrong", len(turns_deg), text))
+        if why_not := follower.contradiction:
+            text = f"the pictures' motion contradicts the telemetry: {why_not}"
+            found.append(Notice(CONTRADICTED, 1, text))
         clockwise_deg = follower.compass_clockwise_deg
         if abs(clockwise_deg) > _COMPASS_REPORTED_DEG:
             side = "clockwise" if clockwise_deg > 0 else "counter-clockwise"

@@ -34,7 +34,7 @@ from sorvolo.missions.watch.alerts import interpreted_placeholder, interpreted_w
 from sorvolo.missions.watch.announced import Announced, SightingKey, sighting_key
 from sorvolo.missions.watch.files import SeenFrame, WatchFiles
 from sorvolo.missions.watch.notifier import Notifier
-from sorvolo.missions.watch.places import Places
+from sorvolo.missions.watch.places import CONTRADICTED, Places
 from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
 from sorvolo.search.looked_ground import near_ground
 from sorvolo.store.atomic import atomic_write_bytes
@@ -66,7 +66,7 @@ class WatchLog:
     with_detections: int = 0
     lost: Counter[str] = field(default_factory=Counter)  # reasons of frames that cannot be used
     found: Counter[str] = field(default_factory=Counter)  # detections by class
-    placed: int = 0  # detections with a place on the ground
+    placed: Counter[str] = field(default_factory=Counter)  # detections with a place, by class
     latency_s: list[float] = field(default_factory=list)
     asked: int = 0  # frames that were to be searched
     unkept: int = 0  # of a live flight, for want of disk
@@ -84,12 +84,12 @@ class WatchLog:
         finally:
             self.wall_s[name] = self.wall_s.get(name, 0.0) + time.monotonic() - started_s
 
-    def searched(self, time_ns: int, found: Detections, placed: int) -> None:
+    def searched(self, time_ns: int, found: Detections, placed: Sequence[Sighting]) -> None:
         """Count one frame that was searched."""
         self.detected += 1
         self.with_detections += len(found) > 0
         self.found.update(found.names)
-        self.placed += placed
+        self.placed.update(each.label for each in placed)
         self.first_ns = time_ns if self.first_ns < 0 else self.first_ns
         self.last_ns = time_ns
 
@@ -147,6 +147,8 @@ def model_facts(model: ModelInfo) -> dict[str, Any]:
     }
 
 
+_UNCOUNTED = "uncounted"
+_FEW = 2  # detections of a video that a false alarm may make; by choice
 _LAST_ALERTS_S, _LAST_EVENTS_S = 35.0, 5.0  # how long the end waits for what is still on its way
 
 
@@ -201,11 +203,17 @@ class WatchUpdate:
 
 
 def headline_of_watch(headline: dict[str, Any], notices: Sequence[Notice]) -> dict[str, Any]:
-    """A headline that also states that the flight's beginning was not read."""
-    if all(each.code != BEGUN_LATE for each in notices):
+    """A headline that also states what keeps it from being the whole truth."""
+    limits = [
+        "what was flown before the watch began was not looked at"
+        if each.code == BEGUN_LATE
+        else each.text
+        for each in notices
+        if each.code in (BEGUN_LATE, CONTRADICTED, _UNCOUNTED)
+    ]
+    if not limits:
         return headline
-    text = f"{headline['text']}; what was flown before the watch began was not looked at"
-    return {"text": text, "complete": False}
+    return {"text": "; ".join([headline["text"], *limits]), "complete": False}
 
 
 def utc_ns(setup: FlightSetup, frame_ns: int) -> int:
@@ -420,7 +428,7 @@ class WatchRun:
         seen = [track for track in confirmed if track.id in seen_ids]
         new = [track for track in confirmed if track.id in taken.new_ids]
         counts = count_by_class([*confirmed, *left])
-        log.searched(time_ns, found, 0 if self._places.site.is_local else len(sighted))
+        log.searched(time_ns, found, () if self._places.site.is_local else sighted)
         with log.stage("hand over"):
             files, notifier = self._files, self._notifier
             files.add(
@@ -511,7 +519,7 @@ class WatchRun:
         """Return report.json; its keys are specified in docs/formats.md. Numbers that are not known are None."""
         setup, log, detector, outputs = self._setup, self.log, self._detector, self._outputs
         total, seconds, is_local = sum(log.found.values()), log.seconds, self._places.site.is_local
-        set_aside = self._places.follower.impossible_size
+        set_aside, placed = self._places.follower.impossible_size, log.placed.total()
         telemetry = telemetry_facts(setup)
         if is_local:  # how a map finds the ground's height is of no use then
             telemetry["height"] = telemetry["height"].split(",")[0]
@@ -531,6 +539,17 @@ class WatchRun:
             reasons = "; ".join(f"{count} x {reason}" for reason, count in log.lost.most_common(5))
             text = f"{counted(lost, 'frame')} could not be used: {reasons}"
             notices.append(Notice("lost_frames", lost, text))
+        # nobody can say that there is none of a class of which detections have no place
+        few = set_aside + (0 if setup.source.kind == "photos" else _FEW)
+        hidden = {
+            name
+            for name in self._classes
+            if not (is_local or counts.get(name)) and log.found[name] - log.placed[name] > few
+        }
+        not_placed = total - placed - set_aside
+        if hidden or (not is_local and placed < 0.5 * (total - set_aside)):
+            text = f"{not_placed:,} of {counted(total, 'detection')} have no place on the ground and are not counted"
+            notices.append(Notice(_UNCOUNTED, not_placed, text))
         if log.unkept:
             text = f"{counted(log.unkept, 'frame')} did not wait for the landing: the disk is full"
             notices.append(Notice("disk_full", log.unkept, text))
@@ -539,12 +558,13 @@ class WatchRun:
             text = f"{counted(len(gone), 'object')} announced while live: not confirmed by all frames, not counted"
             notices.append(Notice("not_confirmed", len(gone), text))
         notices += self._notifier.notices()
+        classes = [each for each in self._classes if each not in hidden]
         return {
             **report_head(setup, is_local=is_local),
             "first_frame": utc_text(log.first_ns) if log.first_ns >= 0 else None,
             "last_frame": utc_text(log.last_ns) if log.last_ns >= 0 else None,
             "ended": ended,
-            "headline": headline_of_watch(looked.headline(counts, self._classes), notices),
+            "headline": headline_of_watch(looked.headline(counts, classes), notices),
             "looked_for": list(self._classes),
             "looked_at": looked.facts(),
             "objects": {"total": len(tracks), "by_class": counts},
@@ -558,8 +578,8 @@ class WatchRun:
             },
             "detections": {
                 "total": total,
-                "placed": log.placed,
-                "not_placed": total - log.placed - set_aside,
+                "placed": placed,
+                "not_placed": not_placed,
                 "set_aside": set_aside,
                 "by_class": dict(log.found.most_common()),
             },
@@ -578,7 +598,7 @@ class WatchRun:
             },
             "peak_memory_mb": peak_memory_mb(),
             "notices": [asdict(each) for each in notices],
-            "warnings": self._warnings(tracks, total - set_aside),
+            "warnings": self._warnings(tracks),
             "settings": {
                 **asdict(self._settings),
                 "save": outputs.save,
@@ -588,18 +608,13 @@ class WatchRun:
             "versions": software("numpy", "opencv-contrib-python-headless", "av", "onnxruntime"),
         }
 
-    def _warnings(self, tracks: Sequence[Track], found: int) -> list[str]:
-        """Return what makes places on the ground few or inaccurate, and alerts dangerous."""
+    def _warnings(self, tracks: Sequence[Track]) -> list[str]:
+        """Return what makes places on the ground inaccurate, and alerts dangerous."""
         warnings, camera = [], self._setup.source.camera
         if name := interpreted_placeholder(self._outputs.alert_command):
             warnings.append(interpreted_words(name))
         if self._places.site.is_local:
             return warnings
-        if found and self.log.placed < 0.5 * found:
-            warnings.append(
-                f"{found - self.log.placed} of {found} detections have no place on the ground and are in no track; "
-                "the notices state why"
-            )
         if camera.focal_sigma > 0.1:
             warnings.append(f"camera: {camera.origin}; until then places are some percent off")
         far = [track for track in tracks if track.sigma_m > 10]
