@@ -145,7 +145,7 @@ _HEIGHTS = (
 def contradiction(places: Sequence[SeenPlace], fx_px: float) -> str:
     """What in a flight's telemetry the pictures' way contradicts, in words; "" where nothing does."""
     reasons = list[str]()
-    for _, stretch in groupby(places, lambda each: (each[0], each[1] // _WAY_NS)):
+    for _, stretch in groupby(places, lambda each: (each[0], (each[1] - places[0][1]) // _WAY_NS)):
         _, _, seen_px, told, height_m = np.array([*stretch]).T
         seen_m = (seen_px - seen_px.mean()) * np.median(height_m.real) / fx_px
         told_m = told - told.mean()
