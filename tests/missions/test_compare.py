@@ -247,6 +247,17 @@ def test_the_same_flight_again_gives_the_same_and_doubles_nothing(compared, flow
     assert all(np.array_equal(once[index], again[index]) for index in once)
 
 
+def test_a_flight_from_before_the_map_turns_all_changes_round_and_states_so(flown, tmp_path):
+    """What had been taken away was reported as appeared, exit code 0."""
+    camera = flown / "camera.xml"
+    for _ in map_flights([flown / "flight2"], tmp_path, _MAP, camera=camera):
+        pass
+    for _ in compare_flights([flown / "flight1"], tmp_path, _COMPARE, camera=camera):
+        pass
+    headline = report(tmp_path, "flight1")["comparison"]["headline"]
+    assert headline["quality"] == "doubtful" and "flown before the map" in headline["text"]
+
+
 def test_heights_made_since_are_a_reason_to_compare_again(compared, flown, tmp_path):
     site, settings = tmp_path / "higher", _WITH_MASKS
     shutil.copytree(compared[0], site)

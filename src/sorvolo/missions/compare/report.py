@@ -121,9 +121,10 @@ def comparison_summary(
     ground: Sequence[CoveredGround],
     *,
     is_local: bool,
+    is_earlier: bool,
 ) -> dict[str, Any]:
     """The report's part on the comparison; specified in docs/formats.md. `suppressed` changes were not reported: a
-    person rejected them on an earlier flight."""
+    person rejected them on an earlier flight. `is_earlier`: the flight was flown before what the map shows."""
     kinds = Counter(each.kind for each in changes)
     coverage = coverage_summary(ground, counts.ground.unplaced, counts.ground.planted)
     areas_m2 = sum(each.area_m2 for each in changes if each.kind is ChangeKind.AREA)
@@ -137,7 +138,9 @@ def comparison_summary(
         "single_view": sum(each.is_single_view for each in changes),
         "suppressed": suppressed,
         "compared_area_m2": coverage["compared_m2"],
-        "headline": comparison_headline(len(changes), coverage, is_local=is_local),
+        "headline": comparison_headline(
+            len(changes), coverage, is_local=is_local, is_earlier=is_earlier
+        ),
         "coverage": coverage | {"planted": recall_curve(counts.ground.planted)},
         "unknown_share": counts.ground.unknown_share,
         "votes": settings.votes,
@@ -194,12 +197,13 @@ def views_notices(placed: Sequence[PlacedFrame], votes: int) -> list[Notice]:
 
 
 def comparison_headline(
-    changes: int, coverage: Mapping[str, Any], *, is_local: bool
+    changes: int, coverage: Mapping[str, Any], *, is_local: bool, is_earlier: bool = False
 ) -> dict[str, str]:
     """The first line of a comparison: its `quality`, "compared" or "doubtful", and its `text`.
 
     It is doubtful when most of the ground under the views that the map shows could not be compared, or is other ground
-    now: then the number of changes proves nothing about the site. `coverage` is that of the report.
+    now: then the number of changes proves nothing about the site; or when the flight is earlier than the map. `coverage`
+    is that of the report.
     """
     compared, missing = (
         area_text(coverage[name], is_local=is_local) for name in ("compared_m2", "not_compared_m2")
@@ -207,7 +211,9 @@ def comparison_headline(
     found = (
         f"{changes:,} {plural('change', changes)} in {compared}; {missing} could not be compared"
     )
-    if not coverage["is_enough"]:
+    if is_earlier:
+        doubt = "it was flown before the map, so that what appeared had left and the reverse (or a clock is wrong)"
+    elif not coverage["is_enough"]:
         doubt = "most of the ground could not be compared"
     elif coverage["other_ground_m2"] > _OTHER_GROUND * coverage["compared_m2"]:
         doubt = "most of the ground surface changed (snow, water, ploughing?), and objects on it may be missed"
