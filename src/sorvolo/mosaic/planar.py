@@ -487,7 +487,7 @@ class PlanarMapper:
         """The links of a new keyframe, where it stands by them or by telemetry, and what failed.
 
         All candidates are tried the cheap way first. Only where few of them link are those that refused tried
-        with SIFT and correlation, until enough link: few links let tall trees bend a strip.
+        with SIFT and learned features, until enough link: few links let tall trees bend a strip.
         """
         previous = self._own[::-1][:_PREVIOUS]
         tie = _Tie(new, self._guess_by_telemetry(new))

@@ -7,7 +7,6 @@ from typing import TypeVar
 
 import cv2
 import numpy as np
-from cv2.typing import MatLike
 from numpy.typing import NDArray
 
 from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, Mask, Matrix3, PointsPx
@@ -27,7 +26,6 @@ from sorvolo.survey.mosaic import Features, Keyframe, Link, NoLink
 _REFINE_WINDOW_PX = 15  # side of the patch around a corner (Lucas and Kanade)
 _REFINE_REACH_PX = 8.0  # a refined point may leave the first fit by this much
 _LEAST_LEARNED = 0.35  # share of learned pairs that agree, for them to link by themselves
-_MOST_SHARED = 0.4  # of a picture: what is known to share less is searched with SIFT there alone
 
 
 @dataclass(frozen=True)
@@ -69,10 +67,6 @@ class LinkCache:
         """Well-textured points of the keyframe, (N, 2)."""
         return self._of(self._corners, keyframe, corners)
 
-    def has_sift(self, keyframe: Keyframe) -> bool:
-        """Whether the keyframe's SIFT features are known."""
-        return keyframe.id in self._sift
-
     def sift(self, keyframe: Keyframe) -> Features:
         """The keyframe's SIFT features."""
         return self._of(self._sift, keyframe, lambda gray: sift_features(gray, self._settings))
@@ -110,7 +104,7 @@ def link(
     """How `new` fits `old`.
 
     Fits are tried from cheap to dear: a tight prediction as it is, ORB, then SIFT, then, where a prediction exists,
-    correlation of the images laid over each other as predicted, and learned features. The first believable one is
+    learned features. The first believable one is
     refined to sub-pixel pairs (Lucas-Kanade on the old image warped into the new one) and must make the overlaid images
     correlate; where it cannot be, pairs of SIFT and learned features of which enough agree are a link as they are.
     """
@@ -144,27 +138,19 @@ def _candidates(
     effort: Effort,
 ) -> Iterator[_Fit]:
     """First fits from cheap to dear; the last ones are those that only a prediction allows."""
-    nothing = np.zeros((0, 2))
     if effort is not Effort.DEAR:
         if prediction is not None and prediction.is_tight:
-            yield _Fit(prediction.new_from_old, nothing, nothing)
+            yield _Fit(prediction.new_from_old, np.zeros((0, 2)), np.zeros((0, 2)))
         if (fit := _fit(new.features, old.features, prediction, settings)) is not None:
             yield fit
     if effort is Effort.CHEAP:
         return
-    # SIFT where a shared part is known, then of all: the prediction may have been wrong
-    shared = _shared_sift(new, old, prediction, settings, cache)
-    if shared is not None and (fit := _fit(*shared, prediction, settings)) is not None:
-        yield fit
     if (fit := _fit(cache.sift(new), cache.sift(old), prediction, settings)) is not None:
         yield fit
-    if prediction is None:
-        return
-    shifted = _correlate(new.gray, old.gray, prediction.new_from_old, prediction.search_px)
-    if shifted is not None:
-        yield _Fit(shifted, nothing, nothing)
-    if (fit := _fit_learned(new, old, prediction, settings, cache)) is not None:
-        yield fit
+    if prediction is not None:
+        fit = _fit_learned(new, old, prediction, settings, cache)
+        if fit is not None:
+            yield fit
 
 
 def _fit(
@@ -228,55 +214,6 @@ def _are_spread(points_px: PointsPx, size: tuple[int, int]) -> bool:
     return bool((points_px.std(axis=0) > 0.05 * np.array(size)).all())
 
 
-def _shared_sift(
-    new: Keyframe,
-    old: Keyframe,
-    prediction: LinkPrediction | None,
-    settings: LinkSettings,
-    cache: LinkCache,
-) -> tuple[Features, Features] | None:
-    """SIFT features of what two pictures share, where that is little and known: the rest is most of the cost."""
-    if (
-        prediction is None
-        or not prediction.is_tight
-        or (cache.has_sift(new) and cache.has_sift(old))
-    ):
-        return None
-    in_new = _shared_box(new.gray, old.gray, prediction.new_from_old, prediction.search_px)
-    old_from_new: Matrix3 = np.linalg.inv(prediction.new_from_old).astype(np.float64)
-    in_old = _shared_box(old.gray, new.gray, old_from_new, prediction.search_px)
-    shares = [gray[box].size / gray.size for gray, box in ((new.gray, in_new), (old.gray, in_old))]
-    if sum(shares) >= 2 * _MOST_SHARED:
-        return None
-    return _sift_in(new, in_new, settings), _sift_in(old, in_old, settings)
-
-
-def _shared_box(
-    image: ImageGray, other: ImageGray, image_from_other: Matrix3, margin_px: float
-) -> tuple[slice, slice]:
-    """Rows and columns of `image` in which the other one lies, and as much around it."""
-    height, width = other.shape
-    corners_px = np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
-    seen = np.nan_to_num(
-        apply_homography(image_from_other, corners_px), nan=0.0, posinf=0.0, neginf=0.0
-    )
-    size = np.array(image.shape[::-1])
-    low = np.clip(np.floor(seen.min(axis=0) - margin_px), 0, size).astype(int)
-    high = np.clip(np.ceil(seen.max(axis=0) + margin_px), 0, size).astype(int)
-    return slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))
-
-
-def _sift_in(keyframe: Keyframe, box: tuple[slice, slice], settings: LinkSettings) -> Features:
-    """The SIFT features within rows and columns of a keyframe's picture."""
-    part = keyframe.gray[box]
-    if min(part.shape) < 2 * _REFINE_WINDOW_PX:
-        return Features("sift", np.zeros((0, 2)), np.zeros((0, 128), np.float32))
-    found = sift_features(np.ascontiguousarray(part), settings.features)
-    return Features(
-        found.kind, found.points_px + np.array([box[1].start, box[0].start]), found.descriptors
-    )
-
-
 def _as_link(new: Keyframe, old: Keyframe, found: _Fit, settings: LinkSettings) -> Link:
     """The pairs of a sub-pixel detector as they are: trees and roofs leave little that one plane could refine."""
     miss = np.linalg.norm(apply_homography(found.new_from_old, found.old_px) - found.new_px, axis=1)
@@ -284,45 +221,6 @@ def _as_link(new: Keyframe, old: Keyframe, found: _Fit, settings: LinkSettings) 
     sigma_px = max(0.3, float(np.median(miss) / 1.1774))
     return Link(
         new.id, old.id, found.new_px[chosen], found.old_px[chosen], found.new_from_old, sigma_px
-    )
-
-
-def _correlate(
-    new: ImageGray, old: ImageGray, predicted: Matrix3, search_px: float
-) -> Matrix3 | None:
-    """Shift the predicted overlay to the peak of the normalised cross-correlation, at half size."""
-    half = np.diag([0.5, 0.5, 1.0])
-    size = (new.shape[1] // 2, new.shape[0] // 2)
-    small = _band_pass(cv2.resize(new, size, interpolation=cv2.INTER_AREA))
-    homography = half @ predicted @ np.linalg.inv(half)
-    warped = cv2.warpPerspective(old, homography @ half, size, flags=cv2.INTER_AREA)
-    seen = cv2.warpPerspective(np.full(old.shape, 255, np.uint8), homography @ half, size) == 255
-    seen = cv2.erode(seen.astype(np.uint8), np.ones((15, 15), np.uint8)) > 0
-    rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
-    if seen.mean() < 0.15:
-        return None
-    reach = int(min(search_px / 2, 0.25 * min(size)))
-    y0, y1 = max(rows[0], reach), min(rows[-1], size[1] - reach)
-    x0, x1 = max(columns[0], reach), min(columns[-1], size[0] - reach)
-    if y1 - y0 < 48 or x1 - x0 < 48 or seen[y0:y1, x0:x1].mean() < 0.8:
-        return None
-    template = _band_pass(warped)[y0:y1, x0:x1]
-    window = small[y0 - reach : y1 + reach, x0 - reach : x1 + reach]
-    score = cv2.matchTemplate(window, template, cv2.TM_CCOEFF_NORMED)
-    _, peak, _, (px, py) = cv2.minMaxLoc(score)
-    blanked = score.copy()
-    blanked[max(0, py - 4) : py + 5, max(0, px - 4) : px + 5] = -1
-    if peak < 0.12 or peak < 1.3 * blanked.max():
-        return None
-    shift = np.eye(3)
-    shift[:2, 2] = 2.0 * (px - reach), 2.0 * (py - reach)
-    return shift @ predicted
-
-
-def _band_pass(gray: MatLike) -> Floats32:
-    image = gray.astype(np.float32)
-    return np.asarray(
-        cv2.GaussianBlur(image, (0, 0), 1.0) - cv2.GaussianBlur(image, (0, 0), 8.0), np.float32
     )
 
 
