@@ -52,8 +52,8 @@ import numpy as np
 
 from provenance import commit, machine, note_scoring
 from sorvolo.geometry.geodesy import LocalFrame
+from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.homography import apply_homography, fit_similarity
-from sorvolo.geometry.level_ground import footprint
 from sorvolo.lab.evaluation.frame_rows import map_frames
 from sorvolo.lab.simulation.flight import SimulatedFlight, simulate_flight
 from sorvolo.lab.simulation.flight_files import (

@@ -35,8 +35,8 @@ from sorvolo.geometry.box_overlap import iou_matrix
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import utm_epsg
 from sorvolo.geometry.grid import SiteGrid
+from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.homography import site_from_image_homography
-from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose
 from sorvolo.geometry.summary import calibration_bins
 from sorvolo.geometry.sun import direction_from_angles

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from sorvolo.errors import GeometryError
 from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.ground import footprint, ground_from_pixels, ground_from_rays
 from sorvolo.geometry.homography import apply_homography, fit_similarity, site_from_image_homography
-from sorvolo.geometry.level_ground import footprint, ground_from_pixels, ground_from_rays
 from sorvolo.geometry.pose import NADIR_CAMERA_NORTH_UP, Pose, site_from_gimbal_rotation
 
 CAMERA = Camera(960, 540, 800, 805, 470, 275)

@@ -14,8 +14,8 @@ import pytest
 
 from sorvolo.cli.main import main
 from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.homography import apply_homography, site_from_image_homography
-from sorvolo.geometry.level_ground import footprint
 from sorvolo.lab.simulation.flight import SimulatedFlight, simulate_flights
 from sorvolo.lab.simulation.flight_files import write_camera, write_photo
 from sorvolo.lab.simulation.settings import (

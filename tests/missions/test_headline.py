@@ -15,8 +15,8 @@ from sorvolo.capture.clock_offset import OffsetEstimate
 from sorvolo.cli.main import main
 from sorvolo.errors import InputError
 from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.homography import site_from_image_homography
-from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
 from sorvolo.lab.simulation.flight_files import video_writer
 from sorvolo.missions.compare.report import views_notices

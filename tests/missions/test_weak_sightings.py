@@ -4,8 +4,8 @@ import numpy as np
 
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.homography import site_from_image_homography
-from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
 from sorvolo.missions.flight.map_objects import FrameDetections, ObjectFinder
 from sorvolo.survey.mosaic import PlacedFrame, Status

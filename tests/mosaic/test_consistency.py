@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.homography import site_from_image_homography
-from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import NADIR_CAMERA_NORTH_UP, Pose
 from sorvolo.mosaic.consistency import Consistency, Stated, consistency
 from sorvolo.mosaic.flight_figures import flight_figures

@@ -6,8 +6,8 @@ import pytest
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.geometry.grid import SiteGrid
+from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.homography import site_from_image_homography
-from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
 from sorvolo.mosaic.placing import canvas_frame, map_m_per_px
 from sorvolo.survey.mosaic import PlacedFrame, Status

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.homography import apply_homography, fit_similarity, site_from_image_homography
-from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
 from sorvolo.mosaic.graph_settings import PoseGraphSettings
 from sorvolo.mosaic.planar import KnownKeyframe, PlanarMapper

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.ground import footprint, ground_from_pixels
 from sorvolo.geometry.homography import (
     apply_homography,
     fit_similarity,
     pose_from_homography,
     site_from_image_homography,
 )
-from sorvolo.geometry.level_ground import footprint, ground_from_pixels
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
 from sorvolo.mosaic.graph_settings import PoseGraphSettings
 from sorvolo.mosaic.pose_graph import PoseGraph, pose_from_link

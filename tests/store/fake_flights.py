@@ -17,8 +17,8 @@ from fake_changes import fake_change
 
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic, utm_epsg
+from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.homography import site_from_image_homography
-from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue_place import is_site

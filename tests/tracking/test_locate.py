@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sorvolo.geometry.camera import Camera
-from sorvolo.geometry.level_ground import footprint
+from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.pose import Pose, rotation_from_vector, site_from_gimbal_rotation
 from sorvolo.lab.simulation.flight import simulate_flight
 from sorvolo.lab.simulation.settings import (

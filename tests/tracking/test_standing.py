@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.homography import site_from_image_homography
-from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
 from sorvolo.survey.mosaic import PlacedFrame, Status
 from sorvolo.survey.objects import CLASSES, TYPICAL_SIZE_M, Detections

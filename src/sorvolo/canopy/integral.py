@@ -14,8 +14,9 @@ from scipy.ndimage import gaussian_filter, median_filter
 
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, Floats32, Mask, Numbers
+from sorvolo.geometry.ground import laid_pixels
 from sorvolo.heights.lattice import Lattice
-from sorvolo.heights.views import View, inside, laid_pixels
+from sorvolo.heights.views import View, inside
 
 Picture = Callable[[int], Floats32]
 """The picture of view k as `levelled` gives it, (H, W) of a thermal camera or (H, W, 3) in colour."""
@@ -77,7 +78,7 @@ def lay(view: View, picture: Floats32, lattice: Lattice, floor_m: Floats32 | flo
         warp = pixels_from_cells(view, lattice, floor_m)
         laid = cv2.warpPerspective(picture, warp, size, flags=flags, borderValue=border)
     else:
-        x, y = laid_pixels(view, lattice.site_from_cells, floor_m)
+        x, y = laid_pixels(view.camera, view.site_from_camera, lattice.site_from_cells, floor_m)
         laid = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderValue=border)
     return np.asarray(_banded(laid), np.float32)
 

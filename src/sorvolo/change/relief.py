@@ -6,8 +6,9 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Bytes, Floats, Floats32, Mask, Matrix3, PointsM, Vector3, frozen
+from sorvolo.geometry.arrays import Bytes, Floats32, Mask, Matrix3, PointsM, Vector3, frozen
 from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.ground import hidden, laid_pixels
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.geometry.pose import Pose
 
@@ -15,7 +16,6 @@ _COARSER = 4  # pixels of a raster, either way, for which one line of sight is f
 _HIDES_M = 0.3  # what rises less above a line of sight hides nothing
 _STEEP_M, _WALL_M = 1.5, 0.6  # what rises so much within this is no ground that pictures share
 _STEPS = 8  # of a ray to the surface
-_LONGER = 1.15  # times: each step along a line of sight
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,30 +57,19 @@ class OrthoSurface:
         so that by walls they may end beside it; NaN beyond it."""
         ends_m = eye_m + rays * ((np.median(self.up_m) - eye_m[2]) / rays[:, 2:])
         for _ in range(_STEPS):
-            up_m = self._at(ends_m[None, :, :2])[0]
+            cells = apply_homography(self.cells_from_site, ends_m[:, :2])
+            up_m = self._at(*cells.astype(np.float32).T[:, None])[0]
             ends_m = eye_m + rays * ((up_m - eye_m[2]) / rays[:, 2])[:, None]
-        affine = self.cells_from_site
-        cells = ends_m[:, :2] @ affine[:2, :2].T + affine[:2, 2]
+        cells = apply_homography(self.cells_from_site, ends_m[:, :2])
         inside = ((cells >= 0) & (cells < self.up_m.shape[::-1])).all(axis=1)
-        return np.where(inside[:, None], ends_m, np.nan)
+        return np.where(np.asarray(inside)[:, None], ends_m, np.nan)
 
     def lay(
         self, site_from_raster: Matrix3, size: tuple[int, int], camera: Camera, pose: Pose
     ) -> tuple[Floats32, Floats32, Mask]:
         """Where the ground of a raster's pixels lies in the picture of a camera without distortion, x and y (h, w), and
         whether the camera sees it there: it is in the picture, no wall, and nothing stands between."""
-        turn = pose.rotation.T
-        project = camera.matrix @ np.column_stack([turn, -turn @ pose.translation_m])
-        level = project[:, [0, 1, 3]] @ site_from_raster
-        columns, rows = (np.arange(each, dtype=np.float32) for each in size)
-        weight = _form(site_from_raster[2], columns, rows) * self.under(site_from_raster, size)
-        x, y, z = (
-            _form(line, columns, rows) + np.float32(up) * weight
-            for line, up in zip(level, project[:, 2])
-        )
-        ahead = z * np.sign(site_from_raster[2, 2]) > 1e-6
-        with np.errstate(divide="ignore", invalid="ignore"):
-            x, y = (np.where(ahead, each / z, np.float32(-1e6)) for each in (x, y))
+        x, y = laid_pixels(camera, pose, site_from_raster, self.under(site_from_raster, size))
         inside = (
             (x > -0.5) & (x < camera.width_px - 0.5) & (y > -0.5) & (y < camera.height_px - 0.5)
         )
@@ -91,40 +80,23 @@ class OrthoSurface:
 
     def _hidden(self, site_from_raster: Matrix3, size: tuple[int, int], eye_m: Vector3) -> Mask:
         """(h, w) whether something stands between the ground of a raster's pixels and a camera."""
-        coarse = max(2, size[0] // _COARSER), max(2, size[1] // _COARSER)
-        ground_m = _grounds(site_from_raster, size, coarse)
-        up_m = self._at(ground_m)
-        away_m = eye_m[:2] - ground_m
-        far_m = np.maximum(np.linalg.norm(away_m, axis=2), 1e-3)
-        along, climb = away_m / far_m[..., None], (float(eye_m[2]) - up_m) / far_m
-        highest_m = float(self.up_m.max()) - float(up_m.min())
-        reach_m = min(highest_m / max(float(climb.min()), 1e-3), float(far_m.max()))
-        hidden, step_m = np.zeros(up_m.shape, bool), 2 * self._cell_m
-        while step_m < reach_m:
-            rises_m = self._at(ground_m + along * step_m) - (up_m + climb * step_m)
-            hidden |= (rises_m > _HIDES_M) & (step_m < far_m)
-            step_m *= _LONGER
-        whole = cv2.resize(hidden.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+        places = [
+            (np.arange(count) + 0.5) * side / count - 0.5
+            for side in size
+            for count in [max(2, side // _COARSER)]
+        ]
+        columns, rows = np.meshgrid(*places)
+        cells_from_raster = self.cells_from_site @ site_from_raster
+        cells = apply_homography(
+            cells_from_raster, np.column_stack([columns.ravel(), rows.ravel()])
+        )
+        x, y = np.nan_to_num(cells, nan=1e9).astype(np.float32).T.reshape(2, *columns.shape)
+        eye = np.append(apply_homography(self.cells_from_site, eye_m[None, :2])[0], eye_m[2])
+        found = hidden(self.up_m, x, y, self._at(x, y), eye, _HIDES_M)
+        whole = cv2.resize(found.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
         return np.asarray(whole > 0)
 
-    def _at(self, places_m: PointsM) -> Floats32:
-        """(h, w) heights at places (h, w, 2)."""
-        affine = self.cells_from_site
-        x, y = ((places_m @ row[:2] + row[2]).astype(np.float32) for row in affine[:2])
+    def _at(self, x: Floats32, y: Floats32) -> Floats32:
+        """(h, w) heights at columns and rows."""
         up_m = cv2.remap(self.up_m, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(up_m, np.float32)
-
-
-def _form(line: Floats, columns: Floats32, rows: Floats32) -> Floats32:
-    """(h, w) a linear form (3,) of a raster's columns (w,) and rows (h,)."""
-    a, b, c = (np.float32(each) for each in line)
-    return np.asarray(a * columns[None, :] + (b * rows[:, None] + c), np.float32)
-
-
-def _grounds(site_from_image: Matrix3, size: tuple[int, int], asked: tuple[int, int]) -> PointsM:
-    """(h, w, 2) the ground places of an image's pixels, at `asked` (width, height) places across it."""
-    x = (np.arange(asked[0]) + 0.5) * size[0] / asked[0] - 0.5
-    y = (np.arange(asked[1]) + 0.5) * size[1] / asked[1] - 0.5
-    columns, rows = np.meshgrid(x, y)
-    found = apply_homography(site_from_image, np.column_stack([columns.ravel(), rows.ravel()]))
-    return np.nan_to_num(found, nan=1e9).reshape(*columns.shape, 2)

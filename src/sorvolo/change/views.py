@@ -39,8 +39,8 @@ from sorvolo.geometry.arrays import (
 )
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
+from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.homography import apply_homography, pose_from_homography, resized
-from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose
 from sorvolo.registration.lens import Undistorter
 from sorvolo.survey.findings import ComparedView, ViewStatus

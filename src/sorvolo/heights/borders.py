@@ -15,10 +15,11 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, Mask, Rows
+from sorvolo.geometry.ground import laid_pixels
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.sweep import SweepSettings, choose_views, likeness_on
 from sorvolo.heights.terrain import filled
-from sorvolo.heights.views import View, inside, laid_pixels
+from sorvolo.heights.views import View, inside
 
 _CAPACITY = 1000  # of the cut, which counts in whole numbers, for a likeness of 1
 _WAYS = tuple(  # to the eight neighbours, down and right, and what a tie to each weighs
@@ -154,7 +155,7 @@ def _mean_picture(
     for number in chosen:
         view, picture = views[number], pictures(number)
         camera = view.camera.resized(picture.shape[1], picture.shape[0])
-        x, y = laid_pixels(replace(view, camera=camera), lattice.site_from_cells, up_m)
+        x, y = laid_pixels(camera, view.site_from_camera, lattice.site_from_cells, up_m)
         seen = inside(np.stack([x, y], axis=-1), camera)
         total += np.where(seen, cv2.remap(picture.astype(np.float32), x, y, cv2.INTER_LINEAR), 0)
         count += seen

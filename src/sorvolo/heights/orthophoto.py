@@ -7,8 +7,9 @@ import numpy as np
 
 from sorvolo.geometry.arrays import Floats32, ImageRGB, ImageRGBA, Mask, Matrix3
 from sorvolo.geometry.grid import SiteGrid, TileIndex
+from sorvolo.geometry.ground import hidden, laid_pixels
 from sorvolo.heights.lattice import Lattice
-from sorvolo.heights.views import View, ground_outlines_m, laid_pixels
+from sorvolo.heights.views import View, ground_outlines_m
 from sorvolo.mosaic.blending import (
     ALIGN_PX,
     LAYER_APRON_PX,
@@ -92,7 +93,7 @@ def choose_photos(lattice: Lattice, up_m: Floats32, views: Sequence[View]) -> Wi
         seen = cv2.medianBlur(visible(window, heights, view).view(np.uint8), 5) > 0
         # (H, W) how well a view shows each cell, 0 (not at all) to 1: from above, and not at the
         # picture's border.
-        u, v = laid_pixels(view, window.site_from_cells, heights)
+        u, v = laid_pixels(view.camera, view.site_from_camera, window.site_from_cells, heights)
         across = (u - (view.camera.width_px - 1) / 2) / (view.camera.width_px / 2)
         down = (v - (view.camera.height_px - 1) / 2) / (view.camera.height_px / 2)
         eye = window.cells_from_site(view.site_from_camera.translation_m[None, :2])[0]
@@ -113,32 +114,13 @@ def choose_photos(lattice: Lattice, up_m: Floats32, views: Sequence[View]) -> Wi
 
 def visible(lattice: Lattice, up_m: Floats32, view: View) -> Mask:
     """(H, W) which cells of a height model without holes nothing of it hides from a view."""
-    eye = view.site_from_camera.translation_m
-    at = lattice.cells_from_site(eye[None, :2])[0]
+    eye_m = view.site_from_camera.translation_m
+    at = lattice.cells_from_site(eye_m[None, :2])[0]
     column, row = np.meshgrid(
         np.arange(lattice.width, dtype=np.float32), np.arange(lattice.height, dtype=np.float32)
     )
-    dx, dy = np.float32(at[0]) - column, np.float32(at[1]) - row
-    far = np.maximum(np.hypot(dx, dy), 1e-3)
-    dx, dy = dx / far, dy / far
-    climb = (np.float32(eye[2]) - up_m) / far  # metres a cell on the way to the camera
-    highest = float(up_m.max())
-    margin = _HIDDEN_CELLS * lattice.cell_m
-    steepest = float(np.min(climb))
-    reach = min((highest - float(up_m.min())) / max(steepest, 1e-3), float(far.max()))
-    hidden = np.zeros(up_m.shape, bool)
-    step = 2.0
-    while step < reach:
-        seen = cv2.remap(
-            up_m,
-            column + dx * step,
-            row + dy * step,
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
-        hidden |= (seen > up_m + climb * step + margin) & (step < far)
-        step = max(step + 1.0, step * 1.06)
-    return ~hidden
+    eye = np.append(at, eye_m[2])
+    return ~hidden(up_m, column, row, up_m, eye, _HIDDEN_CELLS * lattice.cell_m)
 
 
 class _Painter:
@@ -232,8 +214,10 @@ class _Painter:
                 min(side, -(-(each + LAYER_APRON_PX) // ALIGN_PX) * ALIGN_PX)
                 for each in (left + width, top + height)
             )
+            view = self._views[number]
             u, v = laid_pixels(
-                self._views[number],
+                view.camera,
+                view.site_from_camera,
                 self._site_from_grid @ shift @ _shift(x0, y0),
                 up_m[y0:y1, x0:x1],
             )

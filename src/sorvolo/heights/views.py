@@ -8,16 +8,14 @@ import numpy as np
 from sorvolo.errors import GeometryError
 from sorvolo.geometry.arrays import (
     Floats,
-    Floats32,
     Mask,
-    Matrix3,
     PointsM,
     PointsPx,
     Vector3,
     frozen,
 )
 from sorvolo.geometry.camera import Camera
-from sorvolo.geometry.level_ground import footprint
+from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.pose import Pose
 
 
@@ -69,25 +67,6 @@ def overlaps(views: list[View], samples: int = 12) -> Floats:
                     inside(other.pixels_from_site(ground), other.camera).sum() / samples**2
                 )
     return shares
-
-
-def laid_pixels(view: View, site_from_pixels: Matrix3, up_m: Floats32) -> tuple[Floats32, Floats32]:
-    """(H, W) float32 picture x and y of raster pixels on their heights."""
-    turn = view.site_from_camera.rotation.T
-    project = view.camera.matrix @ np.column_stack(
-        [turn, -turn @ view.site_from_camera.translation_m]
-    )
-    level = project[:, :2] @ site_from_pixels[:2] + np.outer(project[:, 3], [0, 0, 1])
-    columns = np.arange(up_m.shape[1], dtype=np.float32)
-    rows = np.arange(up_m.shape[0], dtype=np.float32)
-    x, y, z = (
-        np.float32(a) * columns[None, :]
-        + (np.float32(b) * rows[:, None] + np.float32(c))
-        + np.float32(up) * up_m
-        for (a, b, c), up in zip(level, project[:, 2])
-    )
-    z = np.where(z > 1e-6, z, np.float32(np.nan))
-    return np.nan_to_num(x / z, nan=-1e6), np.nan_to_num(y / z, nan=-1e6)
 
 
 def inside(pixels: PointsPx, camera: Camera) -> Mask:

@@ -10,8 +10,8 @@ from scipy.sparse.linalg import SuperLU
 
 from sorvolo.geometry.arrays import Floats, Mask, Matrix3, PointsM, Rows
 from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.homography import pose_from_homography, site_from_image_homography
-from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
 from sorvolo.mosaic.bundle import (
     NO_GROUND,

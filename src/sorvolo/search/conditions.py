@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sorvolo.geometry.arrays import Floats, Floats16, ImageRGB, Mask, PointsM, Vector3, frozen
 from sorvolo.geometry.camera import Camera
-from sorvolo.geometry.level_ground import footprint, is_on_ground
+from sorvolo.geometry.ground import footprint, is_on_ground
 from sorvolo.geometry.pose import Pose
 
 _Grey = NDArray[np.float32]

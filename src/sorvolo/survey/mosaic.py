@@ -17,7 +17,7 @@ from sorvolo.geometry.arrays import (
 )
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import LocalFrame
-from sorvolo.geometry.level_ground import is_on_ground
+from sorvolo.geometry.ground import is_on_ground
 from sorvolo.geometry.pose import Pose
 from sorvolo.survey.flight import CameraPrior
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sorvolo.geometry.arrays import Floats, Mask, PointsM
-from sorvolo.geometry.level_ground import footprint
+from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.pose import Pose, rotation_from_vector
 from sorvolo.survey.flight import CameraModel, CameraPrior, Frame
 from sorvolo.survey.objects import Detections, Sighting, Track

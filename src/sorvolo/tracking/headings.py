@@ -9,8 +9,8 @@ import numpy as np
 
 from sorvolo.geometry.arrays import Floats, ImageRGB, Matrix3, PointsM, PointsPx
 from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.ground import ground_from_pixels
 from sorvolo.geometry.homography import apply_homography
-from sorvolo.geometry.level_ground import ground_from_pixels
 from sorvolo.geometry.pose import Pose, rotation_from_vector, site_from_gimbal_rotation
 from sorvolo.registration.place_search import SmallView, second_from_first, small_view
 from sorvolo.survey.flight import CameraPrior, Frame

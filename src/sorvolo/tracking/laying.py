@@ -8,8 +8,8 @@ import numpy as np
 
 from sorvolo.geometry.arrays import Floats, Mask, PointsM
 from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.ground import ground_from_pixels
 from sorvolo.geometry.homography import pose_from_homography
-from sorvolo.geometry.level_ground import ground_from_pixels
 from sorvolo.geometry.pose import Pose
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import PlacedFrame, Status

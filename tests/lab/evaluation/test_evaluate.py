@@ -15,8 +15,8 @@ from sorvolo.cli.evaluate import evaluate_app
 from sorvolo.errors import InputError, StoreError
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic, Projection
+from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.homography import apply_homography, site_from_image_homography
-from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import NADIR_CAMERA_NORTH_UP, Pose
 from sorvolo.lab.evaluation.changes import evaluate_changes
 from sorvolo.lab.evaluation.mosaic import evaluate_mosaic

@@ -18,7 +18,7 @@ from PIL import Image
 from sorvolo.capture.telemetry import read_telemetry
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.geodesy import Projection
-from sorvolo.geometry.level_ground import ground_from_pixels
+from sorvolo.geometry.ground import ground_from_pixels
 from sorvolo.lab.simulation.flight import SimulatedFlight, simulate_flights
 from sorvolo.lab.simulation.presets import preset, preset_names
 from sorvolo.lab.simulation.rendering import render_labels

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.geodesy import Geodetic
-from sorvolo.geometry.level_ground import footprint
+from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.pose import site_from_gimbal_rotation
 from sorvolo.geometry.sun import sun_direction
 from sorvolo.lab.simulation.flight import simulate_flight, simulate_flights

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sorvolo.geometry.level_ground import footprint, ground_from_pixels
+from sorvolo.geometry.ground import footprint, ground_from_pixels
 from sorvolo.lab.simulation.flight import SimulatedFlight, simulate_flight
 from sorvolo.lab.simulation.ground import PaintedGround, orthophoto_ground
 from sorvolo.lab.simulation.ground_painting import GroundRaster

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import Matrix3, PointsM, floats
+from sorvolo.geometry.ground import is_on_ground
 from sorvolo.geometry.homography import apply_homography
-from sorvolo.geometry.level_ground import is_on_ground
 from sorvolo.lab.evaluation.change_metrics import (
     VIDEO_VIEWS,
     ComparedGround,

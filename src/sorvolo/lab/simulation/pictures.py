@@ -13,7 +13,7 @@ from numpy.random import Generator
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.geometry.camera import Camera
-from sorvolo.geometry.level_ground import footprint, ground_from_pixels
+from sorvolo.geometry.ground import footprint, ground_from_pixels
 from sorvolo.geometry.polygons import polygon_area
 from sorvolo.geometry.pose import Pose, site_from_body_nadir_rotation
 from sorvolo.lab.simulation.flight import line_kernel

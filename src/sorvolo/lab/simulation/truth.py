@@ -9,7 +9,7 @@ import numpy as np
 from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGBA, PointsM
 from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.geometry.grid import SiteGrid, TileIndex
-from sorvolo.geometry.level_ground import footprint
+from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.polygons import convex_hull, gap
 from sorvolo.geometry.pose import Pose, gimbal_angles_from_rotation
 from sorvolo.lab.simulation.flight import SimulatedFlight, has_changed

@@ -20,7 +20,7 @@ from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import PointsM, Vector3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame, utm_epsg
-from sorvolo.geometry.level_ground import footprint, is_on_ground
+from sorvolo.geometry.ground import footprint, is_on_ground
 from sorvolo.geometry.pose import Pose
 from sorvolo.geometry.sun import sun_direction
 from sorvolo.geometry.track import known_points

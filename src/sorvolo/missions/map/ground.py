@@ -7,8 +7,8 @@ import numpy as np
 
 from sorvolo.errors import GeometryError, InputError
 from sorvolo.geometry.arrays import Matrix3
+from sorvolo.geometry.ground import is_on_ground
 from sorvolo.geometry.homography import apply_homography
-from sorvolo.geometry.level_ground import is_on_ground
 from sorvolo.heights.views import View, fix_from_residual, ground_outlines_m
 from sorvolo.missions.flight.report import LEVEL, MapShape
 from sorvolo.missions.flight.result_cache import ResultCache

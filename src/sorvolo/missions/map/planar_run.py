@@ -13,7 +13,7 @@ from sorvolo.capture.source import LiveSource
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, ImageRGB, Matrix3
 from sorvolo.geometry.camera import Camera
-from sorvolo.geometry.level_ground import footprint, is_on_ground
+from sorvolo.geometry.ground import footprint, is_on_ground
 from sorvolo.heights.figures import camera_warnings
 from sorvolo.missions.flight.control import FlightControl
 from sorvolo.missions.flight.log import Ending, FlightLog, Stage, nothing_placed

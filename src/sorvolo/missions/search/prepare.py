@@ -12,8 +12,8 @@ from sorvolo.capture.decoding import PHOTO_SUFFIXES, cut_out_picture
 from sorvolo.capture.source import Source, open_sources
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import Floats
+from sorvolo.geometry.ground import footprint, is_on_ground
 from sorvolo.geometry.homography import pose_from_homography
-from sorvolo.geometry.level_ground import footprint, is_on_ground
 from sorvolo.heights.field import above_ground
 from sorvolo.missions.flight.detector_protocol import FindsObjects, ObjectDetector
 from sorvolo.missions.flight.map_objects import open_detector, why_not_searched
