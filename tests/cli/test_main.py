@@ -251,6 +251,17 @@ def test_simulate_leaves_no_option_unheard(
     assert not (tmp_path / "made").exists()
 
 
+def test_a_plan_names_where_it_lies(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Longitude before latitude planned a flight in another country without a word."""
+    for order, place in ((slice(None), "41.890500, 12.600500"), (slice(None, None, -1), "12.6005")):
+        corners = [("41.890", "12.600"), ("41.891", "12.600"), ("41.891", "12.601")]
+        corners.append(("41.890", "12.601"))
+        (tmp_path / "area.txt").write_text("".join(f"{' '.join(c[order])}\n" for c in corners))
+        area = str(tmp_path / "area.txt")
+        assert cli.main(["plan", "--camera", "aov=62", "--area", area]) == 0
+        assert place in capsys.readouterr().out
+
+
 def test_json_is_pure(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["plan", "--camera", "aov=62", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["height_m"] > 0

@@ -275,4 +275,6 @@ def test_the_command_lists_and_prints_json(root: Path, capsys) -> None:
     assert main(["archive", "find", str(root), "--at", at(3.0, 4.5)]) == 0
     assert "car (a-o1" in capsys.readouterr().out.replace("\n", "")
     assert main(["archive", "find", str(root), "--at", "0,0"]) == 0
-    assert "no flight" in capsys.readouterr().out
+    assert "no flight saw this place at that time\n" in capsys.readouterr().out
+    assert main(["archive", "find", str(root), "--at", at(3.0, 4.5), "--class", "auto"]) == 0
+    assert "or none found auto there" in capsys.readouterr().out  # flights did see it

@@ -97,14 +97,15 @@ def find_command(
     if as_json:
         print_json({"root": str(root), "at": at, "flights": found})
     else:
-        _show(found, Console())
+        _show(found, Console(), classes)
 
 
-def _show(found: Sequence["FoundFlight"], console: Console) -> None:
+def _show(found: Sequence["FoundFlight"], console: Console, classes: str | None) -> None:
     from sorvolo.store.exports.plain import time_words
 
     if not found:
-        console.print("no flight saw this place at that time")
+        of_class = f", or none found {classes} there" if classes else ""
+        console.print(escape(f"no flight saw this place at that time{of_class}"))
         return
     table = new_table("flown", "site", "flight", "by", "frames", "best frame", "found there")
     for flight in found:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from sorvolo.cli.options import Area, AsJson, Camera, DjiDrone, FlightHeight, Model, option, size_px
 from sorvolo.cli.printing import Console, facts_table, print_json
 from sorvolo.errors import SettingsError
+from sorvolo.survey.wording import area_text
 
 if TYPE_CHECKING:
     from sorvolo.geometry.planning import FlightPlan
@@ -70,6 +71,7 @@ def plan(
     Example without an area: sorvolo plan --camera aov=78.8 --size 1920x1080 --task detection
     """
     from sorvolo.capture.areas import read_area
+    from sorvolo.geometry.coordinates import place_text
     from sorvolo.geometry.planning import Task
     from sorvolo.missions import plan_flight as planning
 
@@ -90,21 +92,24 @@ def plan(
     if out and area is None:
         raise SettingsError("--out writes waypoints over an area: give --area FILE as well")
     chosen = planning.camera_to_plan_with(camera, size_px(size))
-    answers, flight = planning.answer_questions(chosen, settings), None
+    answers, flight, place = planning.answer_questions(chosen, settings), None, ""
     if area is not None:
         outline = read_area(area)
+        centre = outline.centre  # a longitude given first is seen here
+        place = f"{area_text(outline.area_m2)} around {place_text(centre.latitude_deg, centre.longitude_deg)}"
         flight = planning.plan_over(outline, answers, settings)
         for path in out or []:
             planning.write_plan(path, flight, outline, dji_drone=dji_drone)
     if as_json:
         print_json(_as_json(answers, flight, out or []))
     else:
-        _show(answers, flight, out or [], settings, through_trees)
+        _show(answers, flight, place, out or [], settings, through_trees)
 
 
 def _show(
     answers: "FlightAnswers",
     flight: "FlightPlan | None",
+    place: str,
     out: list[Path],
     settings: "PlanSettings",
     hidden: float | None,
@@ -161,6 +166,7 @@ def _show(
     if flight is not None:
         path = f"{flight.distance_m:,.0f} m, {flight.duration_s / 60:.1f} min without take-off and return"
         rows += [
+            ("area", place),
             ("passes", f"{len(flight.passes_m)}, at {flight.strip_bearing_deg:.0f} deg and back"),
             ("photos", f"{flight.photo_count:,}"),
             ("path", path),
