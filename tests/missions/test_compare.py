@@ -20,7 +20,7 @@ from sorvolo.capture.source import opened_sources
 from sorvolo.change.reference import ReferenceMap
 from sorvolo.change.views import FlightCamera, ViewMaker, ViewOutcome
 from sorvolo.cli.main import main
-from sorvolo.errors import InputError, SettingsError, StoreError
+from sorvolo.errors import InputError, SettingsError, SorvoloWarning, StoreError
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.lab.evaluation.changes import evaluate_changes
@@ -256,6 +256,16 @@ def test_a_flight_from_before_the_map_turns_all_changes_round_and_states_so(flow
         pass
     headline = report(tmp_path, "flight1")["comparison"]["headline"]
     assert headline["quality"] == "doubtful" and "flown before the map" in headline["text"]
+
+
+def test_a_map_that_lost_its_key_frames_is_no_base_to_rely_on(flown, site):
+    """Of 37 key frames 22 were gone, and three false changes of up to 12 m stood in a clean headline."""
+    for gone in sorted((site / "flights" / "flight1" / "keyframes").rglob("*.jpg"))[::2]:
+        gone.unlink()
+    with pytest.warns(SorvoloWarning, match="are gone: left out"):
+        compare(flown, site)
+    headline = report(site)["comparison"]["headline"]
+    assert headline["quality"] == "doubtful" and "key frames are damaged" in headline["text"]
 
 
 def test_heights_made_since_are_a_reason_to_compare_again(compared, flown, tmp_path):

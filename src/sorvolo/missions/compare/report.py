@@ -35,6 +35,7 @@ _SAMPLED = 100  # frames, whose middle is looked for in their neighbours
 _DARK = 0.4  # times the map's brightness: less hides things
 _ALL_OVER = 0.1  # share of the compared ground: a day without changes has 0.01, other leaves 0.13, half snow 0.4
 _OTHER_GROUND = 0.5  # share of the compared ground that areas cover: more is no list of changes
+_MANY_GONE = 0.1  # share of the map's key frames: their ground is compared with the mosaic alone
 _COARSE = 3.0  # times the flight's pixels: a map with larger ones hides what the flight shows
 
 
@@ -121,10 +122,10 @@ def comparison_summary(
     ground: Sequence[CoveredGround],
     *,
     is_local: bool,
-    is_earlier: bool,
+    doubt: str,
 ) -> dict[str, Any]:
     """The report's part on the comparison; specified in docs/formats.md. `suppressed` changes were not reported: a
-    person rejected them on an earlier flight. `is_earlier`: the flight was flown before what the map shows."""
+    person rejected them on an earlier flight. `doubt`: see `map_doubt`."""
     kinds = Counter(each.kind for each in changes)
     coverage = coverage_summary(ground, counts.ground.unplaced, counts.ground.planted)
     areas_m2 = sum(each.area_m2 for each in changes if each.kind is ChangeKind.AREA)
@@ -138,9 +139,7 @@ def comparison_summary(
         "single_view": sum(each.is_single_view for each in changes),
         "suppressed": suppressed,
         "compared_area_m2": coverage["compared_m2"],
-        "headline": comparison_headline(
-            len(changes), coverage, is_local=is_local, is_earlier=is_earlier
-        ),
+        "headline": comparison_headline(len(changes), coverage, doubt, is_local=is_local),
         "coverage": coverage | {"planted": recall_curve(counts.ground.planted)},
         "unknown_share": counts.ground.unknown_share,
         "votes": settings.votes,
@@ -196,14 +195,26 @@ def views_notices(placed: Sequence[PlacedFrame], votes: int) -> list[Notice]:
     return [Notice("few_views", usual, text)]
 
 
+def map_doubt(archive: Archive, flown_ns: int, base_version: int) -> str:
+    """Why nothing that was flown then can be compared well with a version of the map; "" where it can."""
+    versions = [each for each in archive.versions() if each.id <= base_version]
+    if any(0 < flown_ns < each.flown_ns for each in versions):
+        return "it was flown before the map, so that what appeared had left and the reverse (or a clock is wrong)"
+    gone = sum(each.count for each in archive.notices if each.code == "damaged_keyframes")
+    keyframes = len(archive.keyframes())
+    if gone > _MANY_GONE * keyframes:
+        return f"{gone} of the map's {keyframes} key frames are damaged or gone"
+    return ""
+
+
 def comparison_headline(
-    changes: int, coverage: Mapping[str, Any], *, is_local: bool, is_earlier: bool = False
+    changes: int, coverage: Mapping[str, Any], doubt: str = "", *, is_local: bool
 ) -> dict[str, str]:
     """The first line of a comparison: its `quality`, "compared" or "doubtful", and its `text`.
 
     It is doubtful when most of the ground under the views that the map shows could not be compared, or is other ground
-    now: then the number of changes proves nothing about the site; or when the flight is earlier than the map. `coverage`
-    is that of the report.
+    now: then the number of changes proves nothing about the site; or for a `doubt` about the map. `coverage` is that of
+    the report.
     """
     compared, missing = (
         area_text(coverage[name], is_local=is_local) for name in ("compared_m2", "not_compared_m2")
@@ -211,13 +222,14 @@ def comparison_headline(
     found = (
         f"{changes:,} {plural('change', changes)} in {compared}; {missing} could not be compared"
     )
-    if is_earlier:
-        doubt = "it was flown before the map, so that what appeared had left and the reverse (or a clock is wrong)"
-    elif not coverage["is_enough"]:
-        doubt = "most of the ground could not be compared"
+    if not coverage["is_enough"]:
+        doubt = doubt or "most of the ground could not be compared"
     elif coverage["other_ground_m2"] > _OTHER_GROUND * coverage["compared_m2"]:
-        doubt = "most of the ground surface changed (snow, water, ploughing?), and objects on it may be missed"
-    else:
+        doubt = (
+            doubt
+            or "most of the ground surface changed (snow, water, ploughing?), and objects on it may be missed"
+        )
+    if not doubt:
         return {"quality": "compared", "text": found}
     return {"quality": "doubtful", "text": f"not to be relied on, {doubt}: {found}"}
 

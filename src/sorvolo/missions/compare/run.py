@@ -32,6 +32,7 @@ from sorvolo.missions.compare.report import (
     comparison_warnings,
     flight_notices,
     flight_summary,
+    map_doubt,
     views_notices,
     with_height_changes,
 )
@@ -301,7 +302,6 @@ class CompareRun:
             time.monotonic() - started_s,
         )
         report["objects"], searched = self._objects.summary(search, placed, site)
-        flown_ns, versions = self._setup.flown_ns, self._archive.versions()
         comparison = comparison_summary(
             changes,
             suppressed,
@@ -311,9 +311,7 @@ class CompareRun:
             self._base_version,
             ground,
             is_local=site.is_local,
-            is_earlier=any(
-                0 < flown_ns < each.flown_ns for each in versions if each.id <= self._base_version
-            ),
+            doubt=map_doubt(self._archive, self._setup.flown_ns, self._base_version),
         )
         comparison |= {
             "headline": with_objects(report, comparison["headline"]),
