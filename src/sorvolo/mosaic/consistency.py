@@ -206,7 +206,7 @@ def _gps_doubts(figures: FlightFigures) -> list[str]:
         return []
     return [
         f"the pictures' own path and the telemetry disagree by {median_m:.0f} m (median): is this the telemetry of "
-        "this flight, and is the clock offset right?"
+        "this flight, is the clock offset right, and are latitude and longitude in their columns, with their signs?"
     ]
 
 
