@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from sorvolo.capture.sync import CameraTrack
@@ -12,18 +13,12 @@ from sorvolo.geometry.homography import fit_similarity
 # all by choice
 _LEAST_FIXES = 4  # a similarity and an offset have five unknowns
 _LEAST_FRAMES = 6
-_WIDTH = 1.5  # one sigma of the weight by nearness, in intervals of the receiver
 _STEPS = 4  # places of the smooth path in each interval
-_REACH = 6  # four sigmas
-_AROUND = 5  # of seven within two sigmas: with fewer a parabola runs away
 _LEAST_SHARE = 0.6  # of the way seen in the pictures that the log must cover at an offset
 _ALIKE = 2.0  # times the best misfit, or half a fix's sigma: an offset that fits as well
 _FREE_STEP_S = 0.5  # between offsets all over the log
 _NEAR_S = 2.0  # from the best of these: searched more closely
-_MOST_FRAMES = 400  # that a noise is learnt from
-# of the noise that neighbouring frames may have in common
-_SHARES = (0.0, 0.25, 0.5, 0.75, 0.9, 0.97)
-_MEMORIES = 6  # times in which it is forgotten: from one frame to the whole flight
+_LEAST_ALIKE = 0.05  # of misses so many frames apart: fewer show nothing
 
 
 @dataclass(frozen=True)
@@ -219,87 +214,50 @@ def _smooth_path(
     interval_s: float,
     within_s: tuple[float, float],
 ) -> tuple[Floats, PointsM]:
-    """Fixes as a path, (M,) s and (M, 2), from the one to the other time: by a parabola through the fixes around
-    each moment, weighted by nearness; as they are where these are few, and of photos, which carry one each.
+    """Fixes as a path, (M,) s and (M, 2), from the one to the other time: straight lines from fix to fix, each moment the
+    mean of two intervals around; as they are where these are few, and of photos, which carry one each.
 
-    On straight lines from fix to fix noise is halved midway between two. Where frames and fixes keep step, an offset of
-    half an interval then fits better than the true one: by 0.04 s on flights with fixes ten times a second.
+    On the lines alone noise is halved midway between two. Where frames and fixes keep step, an offset of half an
+    interval then fits better than the true one: by 0.04 s on flights with fixes ten times a second.
     """
-    if interval_s <= 0 or len(fix_s) <= 2 * _REACH:
-        return fix_s, fixes_m
     step_s = interval_s / _STEPS
     first_s, last_s = max(fix_s[0], within_s[0] - step_s), min(fix_s[-1], within_s[1] + step_s)
-    path_s = np.arange(first_s, last_s + step_s / 2, step_s)
-    if len(path_s) < 2:
+    if interval_s <= 0 or last_s - first_s < _LEAST_FIXES * interval_s:
         return fix_s, fixes_m
-    first = np.clip(np.searchsorted(fix_s, path_s) - _REACH, 0, len(fix_s) - 2 * _REACH)
-    rows = first[:, None] + np.arange(2 * _REACH)
-    along = (fix_s[rows] - path_s[:, None]) / (_WIDTH * interval_s)
-    weight = np.exp(-0.5 * along**2)
-    powers = along[..., None] ** np.arange(3)
-    normal = np.einsum("nk,nki,nkj->nij", weight, powers, powers)
-    straight_m = np.column_stack([np.interp(path_s, fix_s, fixes_m[:, k]) for k in range(2)])
-    fitted = (np.abs(along) <= 2.0).sum(axis=1) >= _AROUND
-    if fitted.any():
-        right = np.einsum("nk,nki,nkd->nid", weight, powers, fixes_m[rows])
-        straight_m[fitted] = np.linalg.solve(normal[fitted], right[fitted])[:, 0]
-    return path_s, straight_m
+    path_s = np.arange(first_s, last_s + step_s / 2, step_s)
+    lines_m = np.column_stack([np.interp(path_s, fix_s, fixes_m[:, k]) for k in range(2)])
+    window = 1, 2 * _STEPS + 1
+    return path_s, np.asarray(cv2.blur(lines_m, window, borderType=cv2.BORDER_REPLICATE))
 
 
 def _offset_sigma_s(times_s: Floats, fixes_m: PointsM, places_m: PointsM) -> float:
     """One sigma of an offset by what it leaves between N fixes and places, (N, 2) each; infinite without motion.
 
     Receivers wander, so that neighbouring frames err alike, and a strip's frames, which all pull an offset one way, are
-    worth less than their number. The noise is taken as one part new for each frame and one that is forgotten
-    exponentially; their shares and the time are weighed by the restricted likelihood of the misfits, which counts what
-    the fit has taken up (Patterson and Thompson, 1971), and the offset's variances by that weight. Of longer flights
-    some frames, evenly spread, make it too large rather than too small.
+    worth less than their number: how alike misses are, so many frames apart, is learnt from them until they no longer
+    are (Newey and West, 1987).
     """
-    miss_m = np.linalg.norm(fixes_m - places_m, axis=1)
+    size_m = np.linalg.norm(fixes_m - places_m, axis=1)
     # From which distance on a fix counts as wrong.
-    rows = np.flatnonzero(miss_m <= 3 * float(np.median(miss_m)) + 1e-9)
-    velocity_m_s = np.gradient(places_m, times_s, axis=0)[rows]
-    some = np.unique(np.linspace(0, len(rows) - 1, _MOST_FRAMES).round().astype(int))
-    rows, velocity_m_s = rows[some], velocity_m_s[some]
-    at_s, places, misses = times_s[rows], places_m[rows], (fixes_m - places_m)[rows].T.ravel()
-    similar = _similar(places)
-    taken_up, *_ = np.linalg.lstsq(similar, velocity_m_s.T.ravel(), rcond=None)
+    rows = np.flatnonzero(size_m <= 3 * float(np.median(size_m)) + 1e-9)
+    velocity_m_s = np.gradient(places_m, times_s, axis=0)[rows].T.ravel()
+    similar = _similar(places_m[rows])
+    taken_up, *_ = np.linalg.lstsq(similar, velocity_m_s, rcond=None)
     # m/s, that no similarity of the path can stand in for
-    motion = velocity_m_s.T.ravel() - similar @ taken_up
+    motion = velocity_m_s - similar @ taken_up
     if motion @ motion <= 1e-9 * len(rows) or len(motion) <= similar.shape[1] + 1:
         return float("inf")
-    model = np.column_stack([similar, motion])
-    apart_s = np.abs(at_s[:, None] - at_s)
-    likelihoods, variances = [], []
-    for memory_s in np.geomspace(float(np.median(np.diff(at_s))), at_s[-1] - at_s[0], _MEMORIES):
-        for share in _SHARES:
-            alike = (1 - share) * np.eye(len(at_s)) + share * np.exp(-apart_s / memory_s)
-            # The logarithm of the restricted likelihood of misses, (2N,), whose two axes both
-            # have the correlations `alike`, (N, N), less a constant; and the variance of one.
-            # `model` (2N, P) are the unknowns that were fitted.
-            root = np.linalg.cholesky(alike)
-            count = len(alike)
-            white_model, white = (
-                np.concatenate(
-                    [np.linalg.solve(root, each[:count]), np.linalg.solve(root, each[count:])]
-                )
-                for each in (model, misses)
-            )
-            normal = white_model.T @ white_model
-            right = white_model.T @ white
-            left_over = max(float(white @ white - right @ np.linalg.solve(normal, right)), 1e-12)
-            freedom = len(misses) - model.shape[1]
-            of_noise = 4 * float(np.log(np.diag(root)).sum())  # of both axes
-            of_model = float(np.linalg.slogdet(normal)[1])
-            likelihood = -0.5 * (freedom * float(np.log(left_over)) + of_noise + of_model)
-            noise = left_over / freedom
-            likelihoods.append(likelihood)
-            pull = motion.reshape(2, -1)
-            variances.append(
-                noise * float(np.sum(pull * (pull @ alike))) / float(motion @ motion) ** 2
-            )
-    weights = np.exp(np.array(likelihoods) - max(likelihoods))
-    return float(np.sqrt(np.average(variances, weights=weights)))
+    pull, miss_m = motion.reshape(2, -1), (fixes_m - places_m)[rows].T
+    noise = max(float(np.sum(miss_m**2)), 1e-12) / (miss_m.size - similar.shape[1] - 1)
+    alike = float(np.sum(pull**2))
+    for apart in range(1, len(rows) // 4):
+        share = float(
+            np.sum(miss_m[:, apart:] * miss_m[:, :-apart]) / max(np.sum(miss_m**2), 1e-12)
+        )
+        if share <= _LEAST_ALIKE:
+            break
+        alike += 2 * share * float(np.sum(pull[:, apart:] * pull[:, :-apart]))
+    return float(np.sqrt(noise * max(alike, np.sum(pull**2) / 2)) / (motion @ motion))
 
 
 def _similar(places_m: PointsM) -> Floats:
