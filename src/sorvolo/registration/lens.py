@@ -7,11 +7,10 @@ import cv2
 import numpy as np
 from cv2.typing import MatLike
 
-from sorvolo.geometry.arrays import Floats, Floats32, ImageRGB, Mask, PointsPx
+from sorvolo.geometry.arrays import ImageRGB, Mask
 from sorvolo.geometry.camera import Camera
 
 _VISIBLE_PX = 0.5  # at a corner: what moves no pixel by more is left as it is
-_RADII = 4096  # of the table of distortion, from the middle to the corner
 
 # times as large at most: a mean of 2 x 2 pixels is enough for what is left out between
 _AVERAGED = 2.0
@@ -45,22 +44,13 @@ class Undistorter:
     @classmethod
     def left_over(cls, camera: Camera, radial: float) -> "Undistorter | None":
         """For the distortion k that a flight found (ideal = seen (1 + k r^2)); None where it moves no pixel visibly."""
+        perfect = camera.undistorted()
+        seen = refined_camera(perfect, 1.0, radial)
         corners = np.array(
             [[x, y] for x in (0, camera.width_px - 1) for y in (0, camera.height_px - 1)]
         )
-        if (
-            np.abs(_seen_pixels(corners, camera, radial) - corners).max() < _VISIBLE_PX
-        ):  # it moves them most
-            return None
-        x = (np.arange(camera.width_px, dtype=np.float32) - np.float32(camera.cx_px)) / np.float32(
-            camera.fx_px
-        )
-        y = (np.arange(camera.height_px, dtype=np.float32) - np.float32(camera.cy_px)) / np.float32(
-            camera.fy_px
-        )
-        made = cls(camera.undistorted())
-        made._maps = _maps_of_left_over(x, y, camera, radial)
-        return made
+        moved = seen.pixels_from_points(perfect.rays_from_pixels(corners)) - corners
+        return None if np.abs(moved).max() < _VISIBLE_PX else cls(seen)  # it moves them most
 
     def undistort(self, image: ImageRGB) -> ImageRGB:
         """The picture, (H, W, 3), of the perfect lens; its edge repeated where it would see beyond the real one."""
@@ -116,39 +106,6 @@ def refined_camera(camera: Camera, focal_scale: float, radial: float, fifth: flo
         result.cy_px,
         coefficients,
     )
-
-
-def _maps_of_left_over(
-    x: Floats32, y: Floats32, camera: Camera, radial: float
-) -> tuple[MatLike, MatLike]:
-    """Where each pixel of the perfect picture, in focal lengths x (W,) and y (H,), lies in the one taken.
-
-    How much nearer to the middle depends on the radius alone, so it is found for some radii, to a millionth of a pixel.
-    """
-    radii = np.linspace(0, np.hypot(np.abs(x).max(), np.abs(y).max()), _RADII)
-    nearer = _seen_from_ideal(np.column_stack([radii, np.zeros(_RADII)]), radial)[
-        :, 0
-    ] / np.maximum(radii, 1e-12)
-    nearer[0] = 1.0
-    factor = np.interp(np.hypot(x, y[:, None]), radii, nearer).astype(np.float32)
-    across = factor * x * np.float32(camera.fx_px) + np.float32(camera.cx_px)
-    down = factor * y[:, None] * np.float32(camera.fy_px) + np.float32(camera.cy_px)
-    return cv2.convertMaps(across, down, cv2.CV_16SC2)
-
-
-def _seen_pixels(pixels: PointsPx, camera: Camera, radial: float) -> PointsPx:
-    """Where pixels (N, 2) of the perfect picture lie in the one that the camera took."""
-    focal, middle = np.array([camera.fx_px, camera.fy_px]), np.array([camera.cx_px, camera.cy_px])
-    return _seen_from_ideal((pixels - middle) / focal, radial) * focal + middle
-
-
-def _seen_from_ideal(ideal: Floats, radial: float) -> Floats:
-    """Invert ideal = seen (1 + k r^2) by Newton's method on the radius."""
-    radius = np.linalg.norm(ideal, axis=1, keepdims=True)
-    seen = radius.copy()
-    for _ in range(10):
-        seen -= (seen + radial * seen**3 - radius) / np.maximum(1 + 3 * radial * seen**2, 0.1)
-    return ideal * np.where(radius > 1e-12, seen / np.maximum(radius, 1e-12), 1.0)
 
 
 def at_size(image: ImageRGB, width_px: int, height_px: int) -> ImageRGB:
