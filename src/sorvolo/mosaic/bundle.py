@@ -11,6 +11,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from sorvolo.geometry.arrays import Floats, Mask, Rows
 from sorvolo.geometry.pose import rotation_from_vector
@@ -359,7 +360,7 @@ def _normal_equations(problem: _Problem, nodes: Nodes, shared: Floats) -> Normal
     # attitude, about the camera's own axes
     rotation = nodes.rotations[index]
     relative = nodes.prior_rotations[index].transpose(0, 2, 1) @ rotation
-    error = rotation_vector(relative) - shared[5:]
+    error = Rotation.from_matrix(relative).as_rotvec() - shared[5:]
     root = 1 / nodes.prior_sigma_rad[index]
     squared = (error * root) ** 2 / ROBUST_SIGMAS**2
     into.cost += float(np.log1p(squared).sum()) * ROBUST_SIGMAS**2
@@ -422,22 +423,3 @@ def _advance(nodes: Nodes, shared: Floats, step: Floats, position: Rows) -> tupl
 def _times_cross(rows: Floats, vector: Floats) -> Floats:
     """`rows` (..., 2, 3) times the cross-product matrix of `vector` (..., 3)."""
     return np.cross(rows, vector[..., None, :])
-
-
-def rotation_vector(rotation: Floats) -> Floats:
-    """(N, 3) rotation vectors of matrices, (N, 3, 3); good up to half a turn."""
-    axis = (
-        np.stack(
-            [
-                rotation[:, 2, 1] - rotation[:, 1, 2],
-                rotation[:, 0, 2] - rotation[:, 2, 0],
-                rotation[:, 1, 0] - rotation[:, 0, 1],
-            ],
-            axis=-1,
-        )
-        / 2
-    )
-    sine = np.linalg.norm(axis, axis=1)
-    cosine = (np.trace(rotation, axis1=1, axis2=2) - 1) / 2
-    angle = np.arctan2(sine, cosine)
-    return axis * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-12), 1.0)[:, None]

@@ -6,13 +6,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from sorvolo.geometry.arrays import Floats, Mask, Matrix3, PointsM, Rows
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import apply_homography, fit_similarity
 from sorvolo.geometry.pose import Pose
 from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
-from sorvolo.mosaic.bundle import LINKS_AT_ONCE, Linked, Nodes, Pairs, linearise, rotation_vector
+from sorvolo.mosaic.bundle import LINKS_AT_ONCE, Linked, Nodes, Pairs, linearise
 from sorvolo.mosaic.graph_settings import INDEPENDENT_PAIRS, PAIRS_PER_LINK
 from sorvolo.mosaic.ground_ties import similarity_of_most
 from sorvolo.mosaic.shelf import Shelf, ShelvedRows
@@ -289,8 +290,9 @@ def telemetry_trust(rows: NodeRows, tied: Mask, miss_m: Floats) -> Trust:
     cameras' distance from telemetry's places.
     """
     stated_m, stated_rad = rows.stated_sigma_m, rows.stated_sigma_rad
-    error_rad = rotation_vector(rows.prior_rotations.transpose(0, 2, 1) @ rows.rotations)
-    size = np.linalg.norm(error_rad, axis=1)
+    size = Rotation.from_matrix(
+        rows.prior_rotations.transpose(0, 2, 1) @ rows.rotations
+    ).magnitude()
     angled = np.isfinite(stated_rad[:, 2])
     contradicted = np.flatnonzero(
         tied & angled & (size > np.maximum(5 * stated_rad.max(axis=1), np.radians(15)))

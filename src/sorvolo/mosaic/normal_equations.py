@@ -82,7 +82,7 @@ class NormalEquations:
             (values.ravel(), (rows.ravel(), columns.ravel())),
             shape=(self._pull.size, self._pull.size),
         )
-        coupling = self._with_shared.reshape(self._pull.size, -1)
+        coupling = self._with_shared.reshape(self._pull.size, len(self._shared))
         return bmat([[cameras, coupling], [coupling.T, self._shared]], format="csc")
 
     def factorised(self, damping: float = _HELD) -> SuperLU:
