@@ -126,7 +126,10 @@ class GroundFollower:
     def contradiction(self) -> str:
         """What in the telemetry the pictures' motion contradicts; "" where nothing does, and of photos."""
         pictures = self._heading if self._check is None else self._check.pictures
-        return "" if pictures is None else contradiction(pictures.places, self._camera.camera.fx_px)
+        if pictures is None:
+            return ""
+        fx_px = self._camera.camera.fx_px
+        return contradiction(pictures.places, fx_px, knows_tilt=self._heading is None)
 
     def take(self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior) -> Taken:
         """Place a frame's detections, seen from `prior`, on the ground and give them to their tracks."""

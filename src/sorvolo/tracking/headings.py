@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sorvolo.geometry.arrays import Floats, ImageRGB, Matrix3, PointsM, PointsPx
 from sorvolo.geometry.camera import Camera
@@ -133,39 +134,65 @@ _WAY_NS = 30 * 10**9  # of a stretch in which the pictures' way is held against 
 _JUDGED_M = 10.0  # of way, rms, by either of the two: less is within the fixes' errors
 _LONGER = 1.4  # than the other a way may be, as where the ground falls; by choice
 _ASTRAY = 0.35  # of a way, rms, that does not fit the other; by choice
-_MIRROR_M = 2.0  # rms, by which a way must miss before it is taken for the other's mirror image
+_MISS_M = 1.5  # rms, by which ways must miss each other before a mirror image or another moment explains it
 _MIRRORED = "its positions are a mirror image: latitude and longitude swapped, or a sign lost"
 _APART = "its positions do not follow the pictures: a receiver that stopped, or a wrong clock"
+_LATE = "its clock is off: about {:+.1f} s more --offset fits the pictures"
+_SHIFTS_S = np.arange(-4.0, 4.01, 0.25)
+_LATE_S = 0.75  # receivers lag, and clocks of one second round, by less; by choice
+_TILT = 0.21  # of the height, on the ground: 12 degrees
 _HEIGHTS = (
     "its heights are not those above this ground (feet, a slope: give --ground-elevation or --height-model), or "
     "--camera or the zoom is another"
 )
 
 
-def contradiction(places: Sequence[SeenPlace], fx_px: float) -> str:
-    """What in a flight's telemetry the pictures' way contradicts, in words; "" where nothing does."""
-    reasons = list[str]()
+def contradiction(places: Sequence[SeenPlace], fx_px: float, *, knows_tilt: bool) -> str:
+    """What in a flight's telemetry the pictures' way contradicts, in words; "" where nothing does.
+
+    Without `knows_tilt` a camera that does not look straight down is a while ahead, or behind, all the way.
+    """
+    reasons, later_s = list[str](), list[float]()
     for _, stretch in groupby(places, lambda each: (each[0], (each[1] - places[0][1]) // _WAY_NS)):
-        _, _, seen_px, told, height_m = np.array([*stretch]).T
-        seen_m = (seen_px - seen_px.mean()) * np.median(height_m.real) / fx_px
-        told_m = told - told.mean()
+        _, time_ns, seen_px, told_m, height_m = np.array([*stretch]).T
+        up_m, times_s = float(np.median(height_m.real)), time_ns.real / 1e9
+        seen_m = seen_px * up_m / fx_px
         way_m, told_way_m = seen_m.std(), told_m.std()
-        if len(told) < 5 or max(way_m, told_way_m) < _JUDGED_M:
+        if len(told_m) < 5 or max(way_m, told_way_m) < _JUDGED_M:
             continue
-        turn = np.vdot(seen_m, told_m) / max(len(told) * way_m**2, 1e-9)
-        miss_m = (told_m - turn * seen_m).std()
-        both = np.column_stack([seen_m, seen_m.conj()])
-        fit, *_ = np.linalg.lstsq(both, told_m, rcond=None)
-        left_m = (told_m - both @ fit).std()
-        if abs(fit[1]) > 2 * abs(fit[0]) and miss_m > max(_MIRROR_M, 2 * left_m):
+        miss_m = _miss_m(seen_m, told_m)
+        centred, both = told_m - told_m.mean(), np.column_stack([seen_m, seen_m.conj()])
+        fit, *_ = np.linalg.lstsq(both - both.mean(axis=0), centred, rcond=None)
+        left_m = (centred - both @ fit).std()
+        misses_m = []
+        for shift_s in _SHIFTS_S:
+            at_s = times_s + shift_s
+            inside = (at_s >= times_s[0]) & (at_s <= times_s[-1])
+            misses_m.append(_miss_m(seen_m[inside], np.interp(at_s[inside], times_s, told_m)))
+        best_s = float(_SHIFTS_S[int(np.argmin(misses_m))])
+        gone_m = abs(np.interp(times_s + best_s, times_s, told_m) - told_m).mean()
+        is_late = abs(best_s) >= _LATE_S and gone_m > (0.0 if knows_tilt else _TILT) * up_m
+        if abs(fit[1]) > 2 * abs(fit[0]) and miss_m > max(_MISS_M, 2 * left_m):
             reasons.append(_MIRRORED)
+        elif is_late and miss_m > max(_MISS_M, 2 * min(misses_m)):
+            reasons.append(_LATE)
+            later_s.append(best_s)
         elif miss_m >= _ASTRAY * told_way_m:
             reasons.append(_APART)
         else:
             is_alike = way_m < _LONGER * told_way_m < _LONGER**2 * way_m
             reasons.append("" if is_alike else _HEIGHTS)
     worst = max(filter(None, reasons), key=reasons.count, default="")
-    return worst if 4 * reasons.count(worst) > len(reasons) else ""
+    if 4 * reasons.count(worst) <= len(reasons):
+        return ""
+    return worst.format(np.median(later_s or 0.0))
+
+
+def _miss_m(seen_m: NDArray[np.complex128], told_m: NDArray[np.complex128]) -> float:
+    """By how much, rms, places (N,) miss those that were seen, which are turned, scaled and shifted to fit them."""
+    seen_m, told_m = seen_m - seen_m.mean(), told_m - told_m.mean()
+    turn = np.vdot(seen_m, told_m) / (np.vdot(seen_m, seen_m).real + 1e-9)
+    return float(np.std(told_m - turn * seen_m))
 
 
 class HeadingFromPictures:
@@ -205,7 +232,7 @@ class HeadingFromPictures:
             east, north = prior.position_m[:2] - up_m / ahead[2] * ahead[:2]
             up_m *= frame.image.shape[1] / float(np.hypot(*(outline_px[1] - outline_px[0])))
             told_m = complex(east, north)
-            self.places.append((self._segments, time_ns, complex(x, -y), told_m, up_m))
+            self.places.append((self._segments, frame.time_ns, complex(x, -y), told_m, up_m))
         return self._heading.add(time_ns / 1e9, outline_px, prior.position_m[:2])
 
 
