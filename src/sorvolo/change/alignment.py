@@ -39,7 +39,6 @@ from sorvolo.registration.features import (
     gray_from_rgb,
     normalise_contrast,
     orb_features,
-    sift_features,
 )
 from sorvolo.registration.link import LinkCache, LinkSettings, refine
 from sorvolo.registration.matching import fit_homography, match
@@ -401,7 +400,7 @@ class Aligner:
     def _guesses(self, frame: _Frame, *, is_cheap: bool) -> Iterator[tuple[Matrix3, bool]]:
         """The ladder: site_from_image good to a few pixels, the cheapest first, and whether the last fit predicted it.
 
-        Telemetry is asked where the past is no help. The dear rungs come every fifth time: a video's next frame may be
+        Telemetry is asked where the past is no help. The dear rung comes every fifth time: a video's next frame may be
         found by its telemetry again.
         """
         new, prior = frame.even, frame.prior
@@ -420,11 +419,9 @@ class Aligner:
             rungs.append(
                 partial(self._by_features, new, features, by_telemetry, prior, is_free=True)
             )
-        if not is_cheap and self._misses % 5 == 1:
-            if by_telemetry is not None:
-                rungs.append(partial(self._by_sift, new, by_telemetry))
-            if by_telemetry is not None or not prior.knows_place:
-                rungs.append(partial(self._anywhere, features))
+        is_dear = not is_cheap and self._misses % 5 == 1
+        if is_dear and (by_telemetry is not None or not prior.knows_place):
+            rungs.append(partial(self._anywhere, features))
         for rung in rungs:
             found = rung()
             if found is not None:
@@ -532,18 +529,6 @@ class Aligner:
         )
         return self._matched(
             features, old, grid_from_image, 0.0 if is_free else search_px, site_from_image
-        )
-
-    def _by_sift(self, new: Keyframe, site_from_image: Matrix3) -> Matrix3 | None:
-        """The guess corrected by SIFT on the view that it foresees: slow, for ground that ORB is lost on."""
-        seen = self._seen(site_from_image, new.camera)
-        if seen is None:
-            return None
-        settings = _LINKS.features
-        old, found = sift_features(normalised(*seen), settings), sift_features(new.gray, settings)
-        pairs = match(found, old, None, 0.0)
-        return self._corrected(
-            found.points_px[pairs[:, 0]], old.points_px[pairs[:, 1]], site_from_image
         )
 
     def _anywhere(self, features: Features) -> Matrix3 | None:
