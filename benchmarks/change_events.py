@@ -34,11 +34,13 @@ from sorvolo.lab.evaluation.changes import as_json, evaluate_changes
 from sorvolo.lab.simulation.presets import preset
 from sorvolo.lab.simulation.settings import ImagingSettings
 from sorvolo.lab.simulation.site import simulate_site
+from sorvolo.lab.thesis.changes import ThesisComparison
 from sorvolo.missions.compare.flights import compare_flights
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.map.flights import map_flights
 
-METHODS = ("thesis", "robust")
+_PAIRS = {"thesis": ThesisComparison(), "robust": None}
+METHODS = tuple(_PAIRS)
 PRESETS = ("compare", "compare-urban", "compare-dirt", "compare-photos", "compare-none")
 RESULTS = Path(__file__).parent / "results"
 LEAST_PX = 50
@@ -177,11 +179,8 @@ def simulate(folder: Path, name: str, seed: int, options: argparse.Namespace) ->
             pass
     if not (base / "mosaic.tif").is_file():
         shutil.rmtree(base, ignore_errors=True)
-        blind = MapSettings(model="none")
-        for _ in map_flights(
-            [flight(simulation, 1)], base, blind, camera=simulation / "camera.xml"
-        ):
-            pass
+        inputs, camera = [flight(simulation, 1)], simulation / "camera.xml"
+        deque(map_flights(inputs, base, MapSettings(model="none"), camera=camera), 0)
     return simulation, base
 
 
@@ -199,7 +198,7 @@ def run_apart(method: str, simulation: Path, site: Path, limit_s: float, *, mask
 
 def run_method(method: str, masks: bool, simulation: Path, site: Path) -> None:
     """In the child: compare, then print the cost as JSON."""
-    settings = CompareSettings(method=method, model="none", writes_masks=masks)
+    settings = CompareSettings(_PAIRS[method], model="none", writes_masks=masks)
     before, started = resource.getrusage(resource.RUSAGE_SELF), time.monotonic()
     (last,) = deque(
         compare_flights([flight(simulation, 2)], site, settings, camera=simulation / "camera.xml"),

@@ -30,6 +30,7 @@ from sorvolo.lab.evaluation.map_quality import corner_errors
 from sorvolo.lab.evaluation.mosaic import evaluate_mosaic
 from sorvolo.lab.simulation.presets import preset
 from sorvolo.lab.simulation.site import simulate_site
+from sorvolo.lab.thesis.mapping import ThesisMapping
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
 
@@ -136,7 +137,7 @@ def run_method(method: str, simulation: Path, site: Path) -> None:
     if method == "opencv-scans":
         stitch_with_opencv(photos, site)
     else:
-        settings = MapSettings(method=method, model="none")
+        settings = MapSettings(ThesisMapping() if method == "thesis" else None, model="none")
         for _ in map_flights([photos], site, settings, camera=simulation / "camera.xml"):
             pass
     after = resource.getrusage(resource.RUSAGE_SELF)
