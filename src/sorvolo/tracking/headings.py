@@ -136,7 +136,10 @@ _LONGER = 1.4  # than the other a way may be, as where the ground falls; by choi
 _ASTRAY = 0.35  # of a way, rms, that does not fit the other; by choice
 _MISS_M = 1.5  # rms, by which ways must miss each other before a mirror image or another moment explains it
 _MIRRORED = "its positions are a mirror image: latitude and longitude swapped, or a sign lost"
-_APART = "its positions do not follow the pictures: a receiver that stopped, or a wrong clock"
+_APART = (
+    "its positions do not follow the pictures: a receiver that stopped, a wrong clock, or a camera "
+    "that looks elsewhere than stated"
+)
 _LATE = "its clock is off: about {:+.1f} s more --offset fits the pictures"
 _SHIFTS_S = np.arange(-4.0, 4.01, 0.25)
 _LATE_S = 0.75  # receivers lag, and clocks of one second round, by less; by choice
