@@ -32,7 +32,7 @@ from sorvolo.missions.compare.report import with_height_changes
 from sorvolo.missions.compare.run import _earlier_pictures
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.heights.measure import (
-    heights_stamp,
+    heights_stamps,
     measure_profile,
     measure_volume,
     read_field,
@@ -371,7 +371,7 @@ def test_damaged_heights_are_named_and_no_comparison_stops_at_them(
             write_contours(mapped, tmp_path / "lines.geojson", 1.0)
         with Archive.open(mapped, write=False) as archive:
             _earlier_pictures(archive, "later")
-            assert heights_stamp(archive, but="later") is None
+            assert heights_stamps(archive, but="later") == {}
             (notice,) = _without_heights(archive, "later")
             assert report.parent.name in notice.text and "sorvolo heights" in notice.text
             assert _without_heights(archive, report.parent.name) == ()

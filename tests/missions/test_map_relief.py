@@ -15,7 +15,11 @@ from sorvolo.errors import DiskFullError
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.lab.simulation.settings import LaterSettings, OutputSettings
 from sorvolo.missions.heights import run as heights_run
+from sorvolo.missions.heights.measure import read_field
 from sorvolo.missions.map import planar_run
+from sorvolo.missions.map.ground import flights_over_heights, map_surface
+from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.files import HeightFile
 
 _LEVEL = small_flight(
     6,
@@ -81,6 +85,7 @@ def _extends_over_heights(folder: Path) -> None:
     with_camera = ["--model", "none", "--camera", str(made / "camera.xml")]
     site = ["--site", str(folder / "extended"), *with_camera]
     assert main(["map", str(folder / "half"), "--heights", *site]) == 0
+    _goes_on_with_another_battery(folder)
     main(["compare", str(made / "flight2" / "photos"), *site])
     later = folder / "extended" / "flights" / "photos"
     report = json.loads((later / "report.json").read_text())
@@ -89,6 +94,34 @@ def _extends_over_heights(folder: Path) -> None:
     off_m = _cameras_off_m(folder, later, "flight2")
     off_m -= np.median(_cameras_off_m(folder, later.parent / "half", "flight1"), axis=0)
     assert len(off_m) >= 6 and np.linalg.norm(off_m, axis=1).max() < 1
+
+
+def _goes_on_with_another_battery(folder: Path) -> None:
+    """A second flight is held on the heights of the first, and a comparison is laid over those of both."""
+    made, site = folder / "made", folder / "batteries"
+    shutil.copytree(folder / "extended", site)
+    for name in _names(made / "flight1" / "photos")[4:]:
+        (folder / "rest").mkdir(exist_ok=True)
+        shutil.copy(made / "flight1" / "photos" / name, folder / "rest")
+    with_camera = ["--camera", str(made / "camera.xml"), "--model", "none", "--heights"]
+    assert main(["map", str(folder / "rest"), "--site", str(site), *with_camera]) == 0
+    with Archive.open(site, write=False) as archive:
+        flights = flights_over_heights(archive, but="")
+        assert flights == ["half", "rest"]
+        surface = map_surface(archive, flights)
+        first, second = (read_field(archive, each, HeightFile.SURFACE) for each in flights)
+        zero_m = archive.site().origin.height_m
+    assert surface is not None
+    columns, rows = np.meshgrid(*[np.arange(-30, 30, 0.5)] * 2)
+    places_m = np.column_stack([columns.ravel(), rows.ravel()])
+    earlier_m, later_m = first.at(places_m)[0], second.at(places_m)[0]
+    apart_m = np.abs(later_m - earlier_m)
+    assert np.isfinite(apart_m).sum() > 500 and np.nanmedian(apart_m) < 0.15
+    site_from_raster = np.array([[0.5, 0, -30], [0, 0.5, -30], [0, 0, 1]])
+    merged_m = surface.under(site_from_raster, columns.shape).ravel() + zero_m
+    alone = np.isnan(earlier_m) & np.isfinite(later_m)
+    assert alone.sum() > 100 and np.median(np.abs(merged_m - later_m)[alone]) < 0.05
+    assert np.nanmedian(np.abs(merged_m - earlier_m)) < 0.05
 
 
 def _names(folder: Path) -> list[str]:

@@ -1,6 +1,6 @@
 """Cameras of a flight in 3D: from the map's poses, which take the ground for level, to poses and points in space."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -228,6 +228,17 @@ class Cameras3D:
     point_views: Rows = field(default_factory=lambda: np.zeros(0, int))
     view_residuals_px: Floats = field(default_factory=lambda: np.zeros(0))
     view_pieces: Rows = field(default_factory=lambda: np.zeros(0, int))
+
+    def of(self, names: Collection[str]) -> "Cameras3D":
+        """These views of them alone, and all points."""
+        kept = np.array([each.name in names for each in self.views], bool)
+        return replace(
+            self,
+            views=tuple(each for each, is_kept in zip(self.views, kept) if is_kept),
+            lost=tuple(each for each in self.lost if each in names),
+            view_residuals_px=self.view_residuals_px[kept],
+            view_pieces=self.view_pieces[kept],
+        )
 
 
 def solve_tracks(views: Sequence[View], tracks: Tracks) -> Cameras3D:

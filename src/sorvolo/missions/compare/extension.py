@@ -3,18 +3,12 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-import cv2
-import numpy as np
-
 from sorvolo.change.map_update import grown_m2
-from sorvolo.change.relief import OrthoSurface
 from sorvolo.change.views import ViewMaker, ViewOutcome
-from sorvolo.geometry.pose import Pose
-from sorvolo.heights.cameras import Cameras3D
-from sorvolo.heights.views import inside
 from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup
+from sorvolo.missions.map.ground import MapGround
 from sorvolo.missions.map.planar_run import PlanarRun
 from sorvolo.mosaic.selection import StretchSelection
 from sorvolo.store.site.archive import Archive, FlightWriter
@@ -27,7 +21,6 @@ NIGHT = 0.25
 black."""
 
 _NEW_GROUND = 0.05  # share of a frame beyond the map: with less it is not worth a place in it
-_LEAST_POINTS, _ROUNDS, _AGREE = 100, 8, 2.5  # of a fit to the map's surface; medians off
 _OVERLAP = 0.7  # of consecutive frames, as a first flight's map is made with
 
 
@@ -97,14 +90,13 @@ class MapExtension:
         """Place the frames for good and paint them; those that extend the map. `placed` are all as they were compared:
         over a map with heights their cameras stand in space, and hold these there."""
         if self._run is not None and self._settings.updates_map:
-            surface, stands = self._views.surface, {each.name: each for each in placed.values()}
-
-            def tied(solved: Cameras3D) -> Cameras3D:
-                return solved if surface is None else on_surface(solved, stands, surface)
-
-            self._frames = tuple(
-                each for each in self._run.complete(tied) if each.status is not Status.REJECTED
-            )
+            stands = {
+                each.name: (each.camera, each.site_from_camera)
+                for each in placed.values()
+                if each.site_from_camera is not None
+            }
+            frames = self._run.complete(MapGround(self._views.surface, stands))
+            self._frames = tuple(each for each in frames if each.status is not Status.REJECTED)
         return self._frames
 
     def shown_as_well(self, placed: Mapping[int, PlacedFrame]) -> list[int]:
@@ -125,40 +117,3 @@ class MapExtension:
             self._writer.tiles,
             self._archive.site_grid(),
         )
-
-
-def on_surface(
-    solved: Cameras3D, placed: Mapping[str, PlacedFrame], surface: OrthoSurface
-) -> Cameras3D:
-    """A flight's cameras in space, moved so that its points lie where the map's surface has them.
-
-    `placed` are its frames, by name, as they stand over that surface: each sees the same points there. The similarity is
-    Umeyama's (1991) of the points that agree; cameras that see too few of them on the map stay.
-    """
-    own_m, map_m = [], []
-    for view in solved.views:
-        stand = placed[view.name]
-        if stand.site_from_camera is None:
-            continue
-        pixels = view.pixels_from_site(solved.points_m)
-        seen = inside(pixels, view.camera)
-        camera = stand.camera.undistorted().resized(view.camera.width_px, view.camera.height_px)
-        rays = camera.rays_from_pixels(pixels[seen]) @ stand.site_from_camera.rotation.T
-        met_m = surface.met(stand.site_from_camera.translation_m, rays)
-        is_on = np.isfinite(met_m[:, 0])
-        own_m.append(solved.points_m[seen][is_on])
-        map_m.append(met_m[is_on])
-    if sum(map(len, own_m)) < _LEAST_POINTS:
-        return solved
-    own, known = np.concatenate(own_m), np.concatenate(map_m)
-    agree = np.ones(len(own), bool)
-    for _ in range(_ROUNDS):
-        turn_and_shift, scale = cv2.estimateAffine3D(own[agree], known[agree], force_rotation=True)
-        turn, shift_m = turn_and_shift[:, :3], turn_and_shift[:, 3]
-        miss_m = np.linalg.norm(scale * own @ turn.T + shift_m - known, axis=1)
-        agree = miss_m < _AGREE * np.median(miss_m)
-    poses = (each.site_from_camera for each in solved.views)
-    moved = (Pose(turn @ at.rotation, scale * turn @ at.translation_m + shift_m) for at in poses)
-    views = [replace(each, site_from_camera=at) for each, at in zip(solved.views, moved)]
-    points_m = scale * solved.points_m @ turn.T + shift_m
-    return replace(solved, views=tuple(views), points_m=points_m)

@@ -33,7 +33,7 @@ from sorvolo.missions.flight.setup import (
     repeated,
 )
 from sorvolo.missions.flight.threads import read_ahead
-from sorvolo.missions.heights.measure import damaged_heights, heights_stamp, own_heights_stamp
+from sorvolo.missions.heights.measure import damaged_heights, heights_stamps, own_heights_stamp
 from sorvolo.missions.mission import FlightOutcome, mission
 from sorvolo.mosaic.selection import StretchSelection, every
 from sorvolo.paths import AnyPath, Inputs, as_path, as_text, listed
@@ -107,7 +107,7 @@ def compare_flights(
         def asked(source: Source) -> tuple[Any, ...]:
             base, _ = _base_version(archive, source)
             stamps = (
-                heights_stamp(archive, but=source.name),
+                heights_stamps(archive, but=source.name),
                 own_heights_stamp(archive, source.name),
             )
             reviews = [(each.change_id, each.verdict.value) for each in archive.reviews()]

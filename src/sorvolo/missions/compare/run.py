@@ -4,10 +4,9 @@ import time
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Self
-
-import numpy as np
 
 from sorvolo.change.alignment import Caution, FlightPlace
 from sorvolo.change.earlier_pictures import EarlierPicture, EarlierPictures, with_known_pixels
@@ -16,13 +15,10 @@ from sorvolo.change.map_update import paint_changes
 from sorvolo.change.outlines import KnownPlace
 from sorvolo.change.reconcile import reported
 from sorvolo.change.reference import ReferenceMap
-from sorvolo.change.relief import OrthoSurface
 from sorvolo.change.views import FlightCamera, ViewMaker, ViewOutcome, ViewRecord
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import ImageRGBA, Mask, Matrix3, PointsM
-from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.arrays import ImageRGBA, Mask, PointsM
 from sorvolo.geometry.summary import median_of_known
-from sorvolo.heights.terrain import closed
 from sorvolo.missions.compare.extension import MapExtension
 from sorvolo.missions.compare.flight_changes import ComparePlan, FlightChanges
 from sorvolo.missions.compare.objects import ComparisonObjects
@@ -45,7 +41,11 @@ from sorvolo.missions.flight.request import REQUEST
 from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup
-from sorvolo.missions.heights.measure import flight_with_heights, radial_of, read_field
+from sorvolo.missions.heights.measure import (
+    flight_with_heights,
+    radial_of,
+)
+from sorvolo.missions.map.ground import flights_over_heights, map_surface
 from sorvolo.registration.lens import Undistorter, refined_camera
 from sorvolo.store.exports.change_files import write_pictures
 from sorvolo.store.exports.ground_files import COVERAGE, coverage_geojson
@@ -54,7 +54,6 @@ from sorvolo.store.exports.plain import features_name, geojson_bytes
 from sorvolo.store.images import ImageCache
 from sorvolo.store.pages.flight import report_page
 from sorvolo.store.site.archive import Archive, FlightWriter
-from sorvolo.store.site.files import HeightFile
 from sorvolo.survey.findings import Change, ComparedView, Verdict, ViewStatus
 from sorvolo.survey.flight import LostFrame, Notice, PosedFrame
 from sorvolo.survey.mosaic import FrameView, PlacedFrame, Status
@@ -411,17 +410,19 @@ def _earlier_pictures(archive: Archive, superseded: str) -> EarlierPictures:
         for each in archive.sound_keyframes()
         if each.flight_id != superseded and each.status is Status.VISION
     ]
-    tall = flight_with_heights(archive, but=superseded)
-    surface, lens = None, None
-    if tall is not None and not archive.report(tall).get("shape", {"is_flat": True})["is_flat"]:
-        camera = next(each.camera for each in keyframes if each.flight_id == tall)
-        surface, lens = _painted_over(archive, tall, camera)
+    painted = flights_over_heights(archive, but=superseded)
+
+    @cache
+    def lens(
+        flight_id: str,
+    ) -> Undistorter | None:  # of what its heights found left in its pictures
+        radial = radial_of(archive, flight_id) if flight_id in painted else (0.0, 0.0)
+        camera = next(each.camera for each in keyframes if each.flight_id == flight_id)
+        return Undistorter(refined_camera(camera, 1.0, *radial)) if any(radial) else None
 
     def load(index: int) -> ImageRGBA:
-        image = archive.image(keyframes[index])
-        if lens is not None and keyframes[index].flight_id == tall:
-            image = lens.undistort(image)
-        return with_known_pixels(image)
+        image, straight = archive.image(keyframes[index]), lens(keyframes[index].flight_id)
+        return with_known_pixels(image if straight is None else straight.undistort(image))
 
     images = ImageCache(load, _CACHE_BYTES)
     return EarlierPictures(
@@ -430,21 +431,5 @@ def _earlier_pictures(archive: Archive, superseded: str) -> EarlierPictures:
             for each in keyframes
         ],
         images.get,
-        surface,
+        map_surface(archive, painted),
     )
-
-
-def _painted_over(
-    archive: Archive, flight_id: str, camera: Camera
-) -> tuple[OrthoSurface, Undistorter]:
-    """The heights that a flight's true orthophoto was painted over, and what takes the distortion off its pictures that
-    its heights found, by a camera."""
-    surface, ground = (
-        read_field(archive, flight_id, each) for each in (HeightFile.SURFACE, HeightFile.GROUND)
-    )
-    cells_from_site: Matrix3 = np.asarray(
-        np.linalg.inv(surface.lattice.site_from_cells), np.float64
-    )
-    up_m = closed(surface.lattice, surface.up_m, ground.up_m) - archive.site().origin.height_m
-    lens = Undistorter(refined_camera(camera, 1.0, *radial_of(archive, flight_id)))
-    return OrthoSurface(up_m.astype(np.float32), cells_from_site), lens

@@ -204,19 +204,21 @@ def own_heights_stamp(archive: Archive, flight_id: str) -> int | None:
 
 
 def flight_with_heights(archive: Archive, but: str) -> str | None:
-    """The newest flight, `but` one, that has heights of its present map, and a report of them that can be read."""
-    for version in reversed(archive.versions()):
-        flight_id = version.flight_id
-        keyframes = archive.keyframes(flight_id)
-        known = _read_report(archive, flight_id)
-        if (
-            flight_id != but
-            and keyframes
-            and known is not None
-            and known["run"] == run_of(keyframes)
-        ):
-            return flight_id
-    return None
+    """The newest flight of `flights_with_heights`."""
+    return next(iter(flights_with_heights(archive, but)), None)
+
+
+def flights_with_heights(archive: Archive, but: str) -> list[str]:
+    """The flights, the newest first, `but` one, that have heights of their present map, and a report of them that can be
+    read."""
+    newest_first = dict.fromkeys(each.flight_id for each in reversed(archive.versions()))
+    found = []
+    for flight_id in newest_first:
+        keyframes, known = archive.keyframes(flight_id), _read_report(archive, flight_id)
+        is_present = known is not None and keyframes and known["run"] == run_of(keyframes)
+        if flight_id != but and is_present:
+            found.append(flight_id)
+    return found
 
 
 def damaged_heights(archive: Archive, but: str) -> list[str]:
@@ -230,12 +232,12 @@ def damaged_heights(archive: Archive, but: str) -> list[str]:
     ]
 
 
-def heights_stamp(archive: Archive, but: str) -> tuple[str, int] | None:
-    """Of which flight, `but` one, the newest heights are, and when they were written (ns); None without heights."""
-    flight_id = flight_with_heights(archive, but)
-    if flight_id is None:
-        return None
-    return flight_id, archive.height_path(flight_id, HeightFile.REPORT).stat().st_mtime_ns
+def heights_stamps(archive: Archive, but: str) -> dict[str, int]:
+    """When the heights of each flight of `flights_with_heights` were written (ns)."""
+    return {
+        each: archive.height_path(each, HeightFile.REPORT).stat().st_mtime_ns
+        for each in flights_with_heights(archive, but)
+    }
 
 
 def _report(archive: Archive, flight_id: str) -> Mapping[str, Any]:

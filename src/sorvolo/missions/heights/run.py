@@ -276,8 +276,10 @@ def model_ground(
     cell_m: float | None = None,
     memo: ResultCache | None = None,
     tied: Tied = lambda solved: solved,
+    beside: Sequence[tuple[View, FlightPictures]] = (),
 ) -> Generator[HeightsUpdate, None, GroundModel]:
-    """The ground that views, each of one keyframe, see in space, yielding progress; `tied` moves their cameras first.
+    """The ground that views, each of one keyframe, see in space, yielding progress; `tied` moves their cameras first,
+    which are solved with those of the map `beside` them.
 
     What a killed run found out is taken from its `memo`. Raises InputError where views share too little for it.
     """
@@ -286,9 +288,14 @@ def model_ground(
     started_s = time.monotonic()
     _lattice(site, views, cell_m)  # too many cells end here, before minutes of work
     yield HeightsUpdate(flight_id, "cameras", 0.0)
-    gray = FlightPictures(archive, keyframes).gray
-    tracks = memo.of(last, "tracks", Tracks, lambda: find_tracks(views, gray))
-    solved = tied(solve_tracks(views, tracks))
+    own = FlightPictures(archive, keyframes)
+    seen = [*views, *(each for each, _ in beside)]
+
+    def gray(number: int) -> ImageGray:
+        return own.gray(number) if number < len(views) else beside[number - len(views)][1].gray(0)
+
+    tracks = memo.of(last, "tracks", Tracks, lambda: find_tracks(seen, gray))
+    solved = tied(solve_tracks(seen, tracks)).of({each.name for each in views})
     kept = [each for each in keyframes if each.name not in set(solved.lost)]
     pictures = FlightPictures(archive, kept, solved.radial)
     cameras_s = time.monotonic() - started_s

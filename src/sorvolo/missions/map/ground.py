@@ -1,26 +1,41 @@
 """Whether a flight's map is flat or stands on the heights of its ground, and its frames where they stand in space."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from typing import Self
 
+import cv2
 import numpy as np
 
+from sorvolo.change.relief import OrthoSurface
 from sorvolo.errors import GeometryError, InputError
 from sorvolo.geometry.arrays import Matrix3
+from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.ground import is_on_ground
 from sorvolo.geometry.homography import apply_homography
-from sorvolo.heights.views import View, fix_from_residual, ground_outlines_m
+from sorvolo.geometry.pose import Pose
+from sorvolo.heights.cameras import Cameras3D
+from sorvolo.heights.lattice import Lattice
+from sorvolo.heights.terrain import closed, filled
+from sorvolo.heights.views import View, fix_from_residual, ground_outlines_m, inside, overlaps
 from sorvolo.missions.flight.report import LEVEL, MapShape
 from sorvolo.missions.flight.result_cache import ResultCache
-from sorvolo.missions.heights.run import GroundModel, Tied, model_ground
+from sorvolo.missions.heights.measure import flights_with_heights, radial_of, read_field
+from sorvolo.missions.heights.run import FlightPictures, GroundModel, height_grid, model_ground
 from sorvolo.mosaic.graph_report import GraphReport
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import StoredKeyframe
+from sorvolo.store.site.files import HeightFile
 from sorvolo.survey.mosaic import PlacedFrame, Status
 
 # Pictures of a flight whose heights are made unasked: features of 600 take a gigabyte, and after landing
 # somebody waits for the map. By choice.
 _MOST, _MOST_LIVE = 600, 100
+_SAME_LENS = (
+    0.1  # of the focal length: pictures that differ less may be of one camera, solved otherwise
+)
+_LEAST_SHARED = 0.15  # of a picture's ground
+_LEAST_POINTS, _ROUNDS, _AGREE = 100, 8, 2.5  # of a fit to the map's surface; medians off
 _SIDE = 12  # rays a side through a picture, to the ground below it
 
 
@@ -59,12 +74,139 @@ def shape_of(
     return MapShape(False, f"the map is a true orthophoto over measured heights: {why}")
 
 
+def flights_over_heights(archive: Archive, but: str) -> list[str]:
+    """The flights, the oldest first, `but` one, whose maps are true orthophotos over heights that can be read."""
+    return [
+        each
+        for each in reversed(flights_with_heights(archive, but))
+        if not archive.report(each).get("shape", {"is_flat": True})["is_flat"]
+    ]
+
+
+def map_surface(archive: Archive, flights: Sequence[str]) -> OrthoSurface | None:
+    """The heights that flights' true orthophotos, the oldest first, were painted over, without holes: as on the map, what
+    one shows is not painted again. None without flights."""
+    if not flights:
+        return None
+    fields = [
+        [read_field(archive, each, file) for file in (HeightFile.SURFACE, HeightFile.GROUND)]
+        for each in flights
+    ]
+    lattices = [surface.lattice for surface, _ in fields]
+    ends_m = [
+        apply_homography(each.site_from_cells, np.array([[0, 0], [each.width, each.height]]))
+        for each in lattices
+    ]
+    site, corners_m = archive.site(), np.concatenate(ends_m)
+    cell_m = min(each.cell_m for each in lattices)
+    if len(fields) > 1:  # flights far apart span more cells than each has
+        cell_m = max(cell_m, Lattice.cell_for(corners_m, site.m_per_px))
+    whole = Lattice.over(corners_m, height_grid(site, cell_m))
+    cells_from_site = np.asarray(np.linalg.inv(whole.site_from_cells), np.float64)
+    up_m = np.full(whole.shape, np.nan, np.float32)
+    measured = [surface.up_m for surface, _ in fields]
+    without_holes = [closed(bare.lattice, surface.up_m, bare.up_m) for surface, bare in fields]
+    for lattice, layer in zip(lattices * 2, measured + without_holes):
+        moved = cv2.warpAffine(
+            layer,
+            (cells_from_site @ lattice.site_from_cells)[:2],
+            whole.shape[::-1],
+            borderValue=np.nan,
+        )
+        up_m = np.where(np.isfinite(up_m), up_m, moved)
+    up_m = filled(up_m, np.isfinite(up_m)) - np.float32(site.origin.height_m)
+    return OrthoSurface(up_m, cells_from_site)
+
+
+@dataclass(frozen=True, eq=False)
+class MapGround:
+    """The ground that a site's map shows over heights, None where it is flat, and what holds a new flight on it.
+
+    `stands` are pictures, by their view's name, with a camera and where it stands over the surface; `keyframes` are the
+    map's own.
+    """
+
+    surface: OrthoSurface | None
+    stands: dict[str, tuple[Camera, Pose]] = field(default_factory=dict)
+    keyframes: Sequence[StoredKeyframe] = ()
+
+    @classmethod
+    def of_map(cls, archive: Archive, but: str, keyframes: Sequence[StoredKeyframe]) -> Self:
+        """That of the newest map, without a flight; `keyframes` are the others'."""
+        flights = flights_over_heights(archive, but)
+        own = [each for each in keyframes if each.flight_id in flights]
+        return cls(map_surface(archive, flights), {}, own)
+
+    def with_map(
+        self, archive: Archive, views: Sequence[View]
+    ) -> tuple[list[View], list[tuple[View, FlightPictures]]]:
+        """A flight's views, and beside them one of each keyframe of the map that shows ground of theirs and may be of
+        their camera: with its lens all are seen. Keyframes have no fix; they stand from then on."""
+        wide = views[0].camera.fx_px / views[0].camera.width_px
+        known = []
+        for each in self.keyframes:
+            own, pose = each.camera, each.site_from_camera
+            if pose is not None and abs(own.fx_px / own.width_px / wide - 1) < _SAME_LENS:
+                name = f"{each.flight_id}/{each.name}"
+                known.append((View(name, own, pose, np.full(3, np.nan)), each))
+        shared = overlaps([*views, *(view for view, _ in known)])[: len(views), len(views) :]
+        chosen = np.argsort(-shared.max(axis=0, initial=0.0), kind="stable")[: len(views)]
+        beside = [known[k] for k in sorted(chosen) if shared[:, k].max() > _LEAST_SHARED]
+        if not beside:
+            return list(views), []
+        for view, each in beside:
+            self.stands[view.name] = each.camera, view.site_from_camera
+        lens = beside[-1][0].camera
+        sizes = [(each.camera.width_px, each.camera.height_px) for each in views]
+        seen = [replace(a, camera=lens.resized(*size)) for a, size in zip(views, sizes)]
+        return seen, [
+            (view, FlightPictures(archive, [each], radial_of(archive, each.flight_id)))
+            for view, each in beside
+        ]
+
+    def tied(self, solved: Cameras3D) -> Cameras3D:
+        """A flight's cameras in space, moved so that its points lie where the map's surface has them: those that stand see
+        the same points there.
+
+        The similarity is Umeyama's (1991) of the points that agree; cameras that see too few of them on the map stay.
+        """
+        own_m, map_m = [np.zeros((0, 3))], [np.zeros((0, 3))]
+        for view in solved.views:
+            if self.surface is None or view.name not in self.stands:
+                continue
+            camera, pose = self.stands[view.name]
+            pixels = view.pixels_from_site(solved.points_m)
+            seen = inside(pixels, view.camera)
+            same = camera.undistorted().resized(view.camera.width_px, view.camera.height_px)
+            rays = same.rays_from_pixels(pixels[seen]) @ pose.rotation.T
+            met_m = self.surface.met(pose.translation_m, rays)
+            is_on = np.isfinite(met_m[:, 0])
+            own_m.append(solved.points_m[seen][is_on])
+            map_m.append(met_m[is_on])
+        own, known = np.concatenate(own_m), np.concatenate(map_m)
+        if len(own) < _LEAST_POINTS:
+            return solved
+        agree = np.ones(len(own), bool)
+        for _ in range(_ROUNDS):
+            affine, scale = cv2.estimateAffine3D(own[agree], known[agree], force_rotation=True)
+            turn, shift_m = affine[:, :3], affine[:, 3]
+            miss_m = np.linalg.norm(scale * own @ turn.T + shift_m - known, axis=1)
+            agree = miss_m < _AGREE * np.median(miss_m)
+        poses = (each.site_from_camera for each in solved.views)
+        moved = (
+            Pose(turn @ at.rotation, scale * turn @ at.translation_m + shift_m) for at in poses
+        )
+        views = [replace(each, site_from_camera=at) for each, at in zip(solved.views, moved)]
+        points_m = scale * solved.points_m @ turn.T + shift_m
+        return replace(solved, views=tuple(views), points_m=points_m)
+
+
 def ground_of(
     archive: Archive,
     frames: Sequence[PlacedFrame],
     keyframes: Sequence[StoredKeyframe],
     memo: ResultCache,
-    tied: Tied,
+    known: MapGround,
 ) -> GroundModel | str:
     """The ground that a flight's frames see, each stored as the keyframe beside it; why there is none, in words."""
     views = [
@@ -77,7 +219,8 @@ def ground_of(
         for frame, stored in zip(frames, keyframes, strict=True)
         if stored.site_from_camera is not None
     ]
-    work = model_ground(archive, views, keyframes, memo=memo, tied=tied)
+    views, beside = known.with_map(archive, views)
+    work = model_ground(archive, views, keyframes, memo=memo, tied=known.tied, beside=beside)
     while True:
         try:
             next(work)

@@ -30,9 +30,9 @@ from sorvolo.missions.flight.request import REQUEST
 from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.flight.settings import TILES_MB, MapSettings, memory_budget_bytes
 from sorvolo.missions.flight.setup import FlightSetup, new_site
-from sorvolo.missions.heights.run import GroundModel, Tied, ground_tiles, write_heights
+from sorvolo.missions.heights.run import GroundModel, ground_tiles, write_heights
 from sorvolo.missions.map.coverage import FlightCoverage
-from sorvolo.missions.map.ground import ground_of, pieces_of, shape_of, standing_frames
+from sorvolo.missions.map.ground import MapGround, ground_of, pieces_of, shape_of, standing_frames
 from sorvolo.missions.map.painting import FlightPainter, KnownKeyframes
 from sorvolo.mosaic.base_ties import BaseReport, FoundFrame, tie_to_base
 from sorvolo.mosaic.exposure import Exposure
@@ -358,14 +358,14 @@ class PlanarRun(FlightRun):
                 keyframe_id, camera, site_from_image, residual_px
             )
 
-    def complete(self, tied: Tied) -> list[PlacedFrame]:
+    def complete(self, known: MapGround) -> list[PlacedFrame]:
         """Solve once more, find the clock offset, paint what moved: every selected frame as it ends, in their order.
 
-        Nothing is committed. Frames that came to nothing are rejected; without any other nothing is painted. `tied`
-        brings cameras in space to where the site's map has their ground.
+        Nothing is committed. Frames that came to nothing are rejected; without any other nothing is painted. `known`
+        is the map's ground.
         """
         painter, placed = self._settled(), self._placed()
-        return placed if painter is None else self._paint_ground(painter, placed, tied)[0]
+        return placed if painter is None else self._paint_ground(painter, placed, known)[0]
 
     def _settled(self) -> FlightPainter | None:
         """What paints the flight, all keyframes standing where they do in the end; None where none has a place."""
@@ -389,7 +389,7 @@ class PlanarRun(FlightRun):
         self,
         painter: FlightPainter,
         placed: list[PlacedFrame],
-        tied: Tied = lambda solved: solved,
+        known: MapGround,
     ) -> tuple[list[PlacedFrame], MapShape, GroundModel | None]:
         """Paint the map, flat or over the heights of its ground; the frames as they stand on it."""
         shape = shape_of(
@@ -406,7 +406,7 @@ class PlanarRun(FlightRun):
             frames = [each for each in placed if each.status is not Status.REJECTED]
             keyframes = [writer.keyframe(each, self.images[each.index]) for each in frames]
             with self._log.stage(Stage.HEIGHTS):
-                found = ground_of(self._archive, frames, keyframes, self._memo, tied)
+                found = ground_of(self._archive, frames, keyframes, self._memo, known)
             if isinstance(found, str):
                 shape = MapShape(True, f"the map is flat, for heights could not be made: {found}")
             else:
@@ -431,7 +431,8 @@ class PlanarRun(FlightRun):
         placed = self._placed()
         if painter is None or all(each.status is Status.REJECTED for each in placed):
             raise self._nothing_placed()
-        placed, shape, model = self._paint_ground(painter, placed)
+        known = MapGround.of_map(self._archive, self._setup.source.name, self._known.stored)
+        placed, shape, model = self._paint_ground(painter, placed, known)
         writer = self.begin()
         search = self._search(placed, model)
         with self._log.stage(Stage.REPORT):
