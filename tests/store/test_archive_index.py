@@ -229,9 +229,9 @@ def test_across_the_antimeridian(tmp_path: Path, address: str) -> None:
 @pytest.mark.parametrize(
     ("words", "match"),
     [
-        ({"at": "north pole"}, "latitude and longitude"),
-        ({"at": "91,0"}, "no place"),
-        ({"at": "nan,0"}, "no place"),
+        ({"at": "north pole"}, "no place"),
+        ({"at": "91,0"}, "off the Earth"),
+        ({"at": "nan,0"}, "off the Earth"),
         ({"at": "1,2", "first": "soon"}, "is not a date"),
         ({"at": "1,2", "within_m": 0}, "more than 0"),
         ({"at": "1,2", "first": "2026-02-01", "last": "2026-01-01"}, "in order"),

@@ -4,7 +4,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from sorvolo.errors import GeometryError
+from sorvolo.errors import SettingsError
 from sorvolo.geometry.geodesy import Projection, utm_epsg
 
 _BANDS = "CDEFGHJKLMNPQRSTUVWX"  # of latitude, 8 deg each from 80 S; the last has 12
@@ -31,15 +31,15 @@ class Coordinates(StrEnum):
 
 
 def lonlat_from_text(text: str) -> tuple[float, float]:
-    """Longitude and latitude of "41.9, 12.5" (latitude first, degrees). Raises GeometryError for anything else."""
+    """Longitude and latitude of "41.9, 12.5" (latitude first, degrees). Raises SettingsError for anything else."""
     try:
         latitude_deg, longitude_deg = (float(each) for each in text.split(","))
     except ValueError as error:
-        raise GeometryError(
+        raise SettingsError(
             f"{text!r} is no place; give LAT,LON in degrees, such as 41.9,12.5"
         ) from error
     if not (abs(latitude_deg) <= 90 and abs(longitude_deg) <= 360):
-        raise GeometryError(
+        raise SettingsError(
             f"{text!r} lies off the Earth; give latitude first, then longitude, in degrees"
         )
     return longitude_deg, latitude_deg

@@ -39,7 +39,6 @@ _JUMP_RELUCTANCE = 5.0  # ... if that explains them by so much better, a natural
 _USUAL_STEP_S = 0.2  # sightings and gaps closer in time than this count less each
 _FORGOTTEN_S = 120.0  # tentative tracks out of view
 _MOST_EVIDENCE = 6.0  # evidence beyond this does not count: what leaves must be noticed
-_ENDED = -1.5  # log likelihood of a sighting where a track ended
 _MISSED = 0.4  # for each frame without it: people by day are reported in a third of the views that show them
 _LEAST_EVIDENCE = 2.5  # odds of about two to one, where views err apart
 _LONG_S = 1.0  # two views so far apart in time are enough
@@ -318,7 +317,6 @@ class Tracker:
             self._settings.size_sigma,
             self._settings.least_size,
         )
-        fits += np.array([_ENDED if each.ended else 0.0 for each in near])[:, None]
         if seen.looks is not None:
             unknown = np.full(seen.looks.shape[1], np.nan)
             known = np.array([unknown if each.looks is None else each.looks for each in near])

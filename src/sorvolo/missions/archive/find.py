@@ -3,7 +3,8 @@
 from datetime import UTC, datetime, time, timedelta
 from pathlib import Path
 
-from sorvolo.errors import InputError, SettingsError
+from sorvolo.errors import InputError
+from sorvolo.geometry.coordinates import lonlat_from_text
 from sorvolo.store.exports.plain import moment_of
 from sorvolo.store.index.archive_index import ArchiveIndex
 from sorvolo.store.index.finding import EARLIEST_NS, LATEST_NS, FoundFlight, Place
@@ -28,12 +29,7 @@ def find_place(
     """
     if not root.is_dir():
         raise InputError(f"{root} is not a folder; give the one that holds the site folders")
-    try:
-        latitude_deg, longitude_deg = (float(each) for each in at.split(","))
-    except ValueError as error:
-        raise SettingsError(
-            f"--at {at!r}: give latitude and longitude in degrees, such as 46.5,13.25"
-        ) from error
+    longitude_deg, latitude_deg = lonlat_from_text(at)
     place = Place(
         latitude_deg,
         longitude_deg,
