@@ -256,6 +256,8 @@ def test_a_flight_from_before_the_map_turns_all_changes_round_and_states_so(flow
         pass
     headline = report(tmp_path, "flight1")["comparison"]["headline"]
     assert headline["quality"] == "doubtful" and "flown before the map" in headline["text"]
+    codes = [each["code"] for each in report(tmp_path, "flight1")["notices"]]
+    assert "earlier_flight" in codes
 
 
 def test_a_map_that_lost_its_key_frames_is_no_base_to_rely_on(flown, site):

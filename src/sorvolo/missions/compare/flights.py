@@ -180,7 +180,7 @@ def _compare_one(
 ) -> Generator[CompareUpdate]:
     started_s, source = time.monotonic(), flight.setup.source
     flight = flight.noting(
-        *repeated(archive, source, "compared"), *_without_heights(archive, source.name)
+        *repeated(archive, flight.setup, "compared"), *_without_heights(archive, source.name)
     )
     setup = flight.setup
     if settings.updates_map:

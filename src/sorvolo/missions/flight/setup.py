@@ -294,12 +294,14 @@ def new_site(setup: FlightSetup, name: str, m_per_px: float, ground_up_m: float)
     return Site(name, origin, crs, m_per_px, height_reference=reference)
 
 
-def repeated(archive: Archive, source: Source, done: str) -> tuple[Notice, ...]:
+def repeated(archive: Archive, setup: FlightSetup, done: str) -> tuple[Notice, ...]:
     """The notices of a flight that the site has already: its version is replaced, not painted over; under another
-    name the same flight counts twice."""
+    name the same flight counts twice. And of one that was flown before others of the site."""
     if not archive.has_site:
         return ()
+    source = setup.source
     versions = {each.flight_id: each.id for each in archive.versions()}
+    later = [each for each in archive.versions() if 0 < setup.flown_ns < each.flown_ns]
     notices = [
         Notice(
             "same_flight",
@@ -310,6 +312,9 @@ def repeated(archive: Archive, source: Source, done: str) -> tuple[Notice, ...]:
         for each in archive.flights()
         if each.id in versions and each.id != source.name and each.fingerprint == source.fingerprint
     ]
+    if later:
+        text = f"{source.name} was flown before {later[-1].flight_id}: the newest version may show older ground"
+        notices.append(Notice("earlier_flight", len(later), text))
     if (made := versions.get(source.name)) is not None:
         notices.append(
             Notice(

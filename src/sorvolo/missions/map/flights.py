@@ -190,7 +190,7 @@ def _map_one(
     m_per_px = archive.site().m_per_px if archive.has_site else settings.m_per_px
     check_room(flight.setup, archive, m_per_px)
     room = LiveRoom(flight.setup, archive.folder, m_per_px)
-    flight = flight.noting(*repeated(archive, source, "mapped"))
+    flight = flight.noting(*repeated(archive, flight.setup, "mapped"))
     setup, method = flight.setup, settings.method
     memo = flight.cache(archive) if method is None else ResultCache()
     finder = None
