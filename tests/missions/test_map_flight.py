@@ -21,6 +21,7 @@ from sorvolo.lab.thesis.stitching import RoiStitchingSettings
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import prepare
 from sorvolo.missions.map.flights import map_flights
+from sorvolo.missions.map.ground import MapGround
 from sorvolo.missions.map.planar_run import PlanarRun
 from sorvolo.missions.site.history import site_history
 from sorvolo.store.exports.plain import features_path
@@ -580,11 +581,13 @@ def test_a_planar_run_paints_through_a_writer_that_another_began(
         known_px = _opaque_px(archive)
         with archive.begin_flight("second", source.fingerprint, {}) as writer:
             with PlanarRun(setup, archive, MapSettings(), writer) as run:
-                assert run.begin() is writer and run.complete() == [] and not run.images
+                assert (
+                    run.begin() is writer and run.complete(MapGround(None)) == [] and not run.images
+                )
                 for frame in source.frames(lambda *_: True):
                     assert isinstance(frame, Frame)
                     run.add(PosedFrame(frame, setup.prior(frame, first=False)))
-                placed = run.complete()
+                placed = run.complete(MapGround(None))
             writer.flush()  # the run's end is not the writer's
             assert [each.status for each in placed] == [Status.VISION] * 8 and sorted(
                 run.images
