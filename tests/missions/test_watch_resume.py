@@ -7,7 +7,9 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from truth_detector import TruthDetector
 
@@ -15,10 +17,16 @@ from killed_copy import copy_as_killed
 from small_flights import simulate_into, small_flight
 from sorvolo.cli.main import main
 from sorvolo.errors import SorvoloWarning
+from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.lab.simulation.settings import OutputSettings
+from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.watch.flights import watch
+from sorvolo.missions.watch.notifier import Notifier
 from sorvolo.missions.watch.run import WatchUpdate
 from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
+from sorvolo.store.site.journal import Entry
+from sorvolo.survey.flight import Site
+from sorvolo.survey.objects import Sighting, Track
 from waiting import wait_for
 
 _EFFORT = ("seconds", "latency_s", "frames_per_second", "peak_memory_mb")
@@ -204,3 +212,42 @@ def test_what_was_printed_is_not_printed_again(
     printed = capsys.readouterr().err
     assert new and f"continuing after {_KILLED_AT} frames of a stopped run" in printed
     assert not any(f" {each}  at " in printed for each in new)
+
+
+def _track(number: int, east_m: float, frame: int, moving: bool) -> Track:
+    place_m, spread_m2, size_m = np.array([east_m, 0.0]), np.diag([4.0, 1.0]), np.array([1.0, 0.5])
+    box = np.array([10, 20, 30, 60], np.float32)
+    best = Sighting(frame, str(frame), 0, "person", 0.8, box, place_m, spread_m2, size_m)
+    path = place_m[None], np.zeros(1, np.int64)
+    seen = True, moving, 0, 10**9, 5, 1
+    return Track(number, "person", 0.8, *seen, place_m, spread_m2, np.zeros(2), size_m, best, *path)
+
+
+class _Noting(ResultCache):
+    """Keeps notes as a journal would."""
+
+    def note(self, kind: str, **values: Any) -> None:
+        self.notes.append(Entry(kind, json.loads(json.dumps(values))))
+
+
+def test_an_alert_is_known_again_by_its_sighting_or_by_what_stands_there(tmp_path: Path) -> None:
+    """A watch that left frames out announces a thing by another of them when it goes on; each alert is for one thing."""
+    memo, sent = _Noting(), tmp_path / "sent"
+    command = f"{sys.executable} -c \"open('{sent}', 'a').write('{{id}} ')\""
+    outputs = WatchOutputs(alert_command=command)
+    site = Site("field", Geodetic(46.5, 13.25), "EPSG:32633", 0.05)
+
+    def alerted(*places: tuple[int, float, int, bool]) -> list[str]:
+        """Report tracks by (id, east, frame of the best sighting, moving) in a new process; what was sent so far."""
+        notifier = Notifier("flight", "0" * 16, site, outputs, tmp_path, memo)
+        tracks = [_track(*each) for each in places]
+        notifier.report(tracks, [], {}, {})
+        notifier.close(20, 1)
+        return sorted(sent.read_text().split(), key=int)
+
+    assert alerted((1, 0.0, 5, False), (2, 90.0, 6, True)) == ["1", "2"]
+    # the same thing by another frame is known; a second one beside it, and what moves, are not
+    assert alerted((3, 1.0, 8, False)) == ["1", "2"]
+    assert alerted((4, 1.0, 8, False), (5, 1.5, 9, False)) == ["1", "2", "5"]
+    assert alerted((6, 90.0, 7, True), (7, 90.0, 6, True)) == ["1", "2", "5", "6"]
+    assert alerted((8, 50.0, 11, False)) == ["1", "2", "5", "6", "8"]

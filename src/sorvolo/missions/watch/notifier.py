@@ -5,6 +5,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.watch.alerts import Outbox, Pace, alert_command, alert_url
 from sorvolo.missions.watch.cot_sender import CotSender, cot_place
@@ -33,11 +35,7 @@ class Notifier:
         memo: ResultCache,
     ) -> None:
         self._memo = memo
-        self._sent = {
-            (note.values.get("receiver"), str(note.values.get("sighting")))
-            for note in memo.notes
-            if note.kind == "sent"
-        }
+        self._sent = [note.values for note in memo.notes if note.kind == "sent"]
         self._flight, self._uid = flight, f"sorvolo.{flight}.{fingerprint[:8]}"
         self._site, self._outputs, self._folder = site, outputs, folder
         self._pace = Pace(outputs.cot_every_s)
@@ -45,7 +43,7 @@ class Notifier:
         self._cot: Outbox[bytes] | None = None
         self._sender: CotSender | None = None
         self._broken_end: tuple[Notice, ...] = ()
-        self._alerts: dict[str, Outbox[Mapping[str, Any]]] = {}
+        self._alerts: dict[str, Outbox[tuple[Mapping[str, Any], Mapping[str, Any]]]] = {}
         if outputs.cot and not site.is_local:
             self._sender = CotSender(cot_place(outputs.cot), outputs.cot_tls)
             self._cot = Outbox(self._sender.send, code=_COT, what=f"sending to {outputs.cot}")
@@ -121,18 +119,40 @@ class Notifier:
             "crop": None if crop is None else str((self._folder / crop).resolve()),
         }
         alert["time"] = alert["last_seen"]
+        east_m, north_m = track.position_m.tolist()
+        known_by = {
+            "sighting": f"{alert['best_frame']} {alert['best_box_px']}",
+            "stands": [segment, track.label] if not track.moving else [],
+            "east_m": east_m,
+            "north_m": north_m,
+            "sigma_m": track.sigma_m,
+        }
         for receiver, outbox in self._alerts.items():
-            if (receiver, _sighting(alert)) not in self._sent:
-                outbox.put(alert)
+            if not self._was_sent(receiver, known_by, track.size_m[0] / 2):
+                outbox.put((alert, known_by))
+
+    def _was_sent(self, receiver: str, alert: Mapping[str, Any], within_m: float) -> bool:
+        """Whether a killed watch sent an alert, each for one track: by the same sighting or, where that one had left
+        frames out, of a thing of the class that stands there."""
+        sent = [each for each in self._sent if each.get("receiver") == receiver]
+        for each in sorted(sent, key=lambda one: one.get("sighting") != alert["sighting"]):
+            apart_m = np.hypot(*(alert[k] - each.get(k, np.inf) for k in ("east_m", "north_m")))
+            reach_m = 3 * np.hypot(alert["sigma_m"], each.get("sigma_m", 0)) + within_m
+            is_there = alert["stands"] and alert["stands"] == each.get("stands")
+            if each.get("sighting") == alert["sighting"] or (is_there and apart_m <= reach_m):
+                self._sent.remove(each)
+                return True
+        return False
 
     def _add_receiver(
         self, code: str, send: Callable[[Mapping[str, Any]], None], what: str
     ) -> None:
         """A receiver of alerts; what it has got is noted at once."""
 
-        def noted(alert: Mapping[str, Any]) -> None:
+        def noted(item: tuple[Mapping[str, Any], Mapping[str, Any]]) -> None:
+            alert, known_by = item
             send(alert)
-            self._memo.note("sent", receiver=code, sighting=_sighting(alert))
+            self._memo.note("sent", receiver=code, **known_by)
 
         self._alerts[code] = Outbox(noted, code=code, what=what)
 
@@ -144,8 +164,3 @@ class Notifier:
             now_ns=time.time_ns(),
             stale_s=self._outputs.cot_stale_s,
         )
-
-
-def _sighting(alert: Mapping[str, Any]) -> str:
-    """What an alert is known again by: ids differ where a live flight's frames came in another order."""
-    return f"{alert['best_frame']} {alert['best_box_px']}"
