@@ -389,9 +389,10 @@ class PlanarRun(FlightRun):
         self,
         painter: FlightPainter,
         placed: list[PlacedFrame],
-        known: MapGround,
+        known: MapGround | None = None,
     ) -> tuple[list[PlacedFrame], MapShape, GroundModel | None]:
-        """Paint the map, flat or over the heights of its ground; the frames as they stand on it."""
+        """Paint the map, flat or over the heights of its ground; the frames as they stand on it. `known` is the map's so
+        far, where not what earlier flights show."""
         shape = shape_of(
             self._mapper.report(),
             placed,
@@ -406,6 +407,9 @@ class PlanarRun(FlightRun):
             frames = [each for each in placed if each.status is not Status.REJECTED]
             keyframes = [writer.keyframe(each, self.images[each.index]) for each in frames]
             with self._log.stage(Stage.HEIGHTS):
+                known = known or MapGround.of_map(
+                    self._archive, self._setup.source.name, self._known.stored
+                )
                 found = ground_of(self._archive, frames, keyframes, self._memo, known)
             if isinstance(found, str):
                 shape = MapShape(True, f"the map is flat, for heights could not be made: {found}")
@@ -431,8 +435,7 @@ class PlanarRun(FlightRun):
         placed = self._placed()
         if painter is None or all(each.status is Status.REJECTED for each in placed):
             raise self._nothing_placed()
-        known = MapGround.of_map(self._archive, self._setup.source.name, self._known.stored)
-        placed, shape, model = self._paint_ground(painter, placed, known)
+        placed, shape, model = self._paint_ground(painter, placed)
         writer = self.begin()
         search = self._search(placed, model)
         with self._log.stage(Stage.REPORT):
