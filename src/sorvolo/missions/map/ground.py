@@ -17,7 +17,7 @@ from sorvolo.geometry.pose import Pose
 from sorvolo.heights.cameras import Cameras3D
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.terrain import closed, filled
-from sorvolo.heights.views import View, fix_from_residual, ground_outlines_m, inside, overlaps
+from sorvolo.heights.views import View, fix_from_residual, ground_outlines_m, inside
 from sorvolo.missions.flight.report import LEVEL, MapShape
 from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.heights.measure import flights_with_heights, radial_of, read_field
@@ -34,7 +34,8 @@ _MOST, _MOST_LIVE = 600, 100
 _SAME_LENS = (
     0.1  # of the focal length: pictures that differ less may be of one camera, solved otherwise
 )
-_LEAST_SHARED = 0.15  # of a picture's ground
+_LEAST_SHARED = 0.15  # of a picture's width on the ground
+_MOST_BESIDE = 100  # keyframes of the map that hold a flight; by choice
 _LEAST_POINTS, _ROUNDS, _AGREE = 100, 8, 2.5  # of a fit to the map's surface; medians off
 _SIDE = 12  # rays a side through a picture, to the ground below it
 
@@ -143,15 +144,17 @@ class MapGround:
         """A flight's views, and beside them one of each keyframe of the map that shows ground of theirs and may be of
         their camera: with its lens all are seen. Keyframes have no fix; they stand from then on."""
         wide = views[0].camera.fx_px / views[0].camera.width_px
-        known = []
+        places_m = np.array([each.site_from_camera.translation_m for each in views])
+        reach_m = (1 - _LEAST_SHARED) * float(np.median(places_m[:, 2])) / wide
+        near: list[tuple[float, View, StoredKeyframe]] = []
         for each in self.keyframes:
             own, pose = each.camera, each.site_from_camera
             if pose is not None and abs(own.fx_px / own.width_px / wide - 1) < _SAME_LENS:
-                name = f"{each.flight_id}/{each.name}"
-                known.append((View(name, own, pose, np.full(3, np.nan)), each))
-        shared = overlaps([*views, *(view for view, _ in known)])[: len(views), len(views) :]
-        chosen = np.argsort(-shared.max(axis=0, initial=0.0), kind="stable")[: len(views)]
-        beside = [known[k] for k in sorted(chosen) if shared[:, k].max() > _LEAST_SHARED]
+                apart_m = np.linalg.norm((places_m - pose.translation_m)[:, :2], axis=1).min()
+                view = View(f"{each.flight_id}/{each.name}", own, pose, np.full(3, np.nan))
+                near.append((float(apart_m), view, each))
+        nearest = sorted(near, key=lambda one: one[0])[: min(len(views), _MOST_BESIDE)]
+        beside = [(view, each) for apart_m, view, each in nearest if apart_m < reach_m]
         if not beside:
             return list(views), []
         for view, each in beside:
