@@ -35,6 +35,7 @@ from sorvolo.missions.watch.flights import watch
 from sorvolo.missions.watch.run import WatchUpdate
 from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
 from sorvolo.survey.objects import CLASSES, Detections, no_detections
+from sorvolo.tracking import headings
 
 _FLOWN = replace(
     small_flight(
@@ -127,6 +128,18 @@ def test_a_receiver_that_had_stopped_places_nothing_unless_the_drone_hovered(
 _Rows = list[dict[str, str]]
 
 
+def _rows(flown: Path) -> _Rows:
+    return list(csv.DictReader((flown / "flight1" / "flight1.csv").open()))
+
+
+def _written(rows: _Rows, log: Path) -> Path:
+    with log.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+    return log
+
+
 def _swapped(rows: _Rows) -> _Rows:
     return [row | {"Latitude": row["Longitude"], "Longitude": row["Latitude"]} for row in rows]
 
@@ -161,12 +174,7 @@ def test_telemetry_that_the_pictures_contradict_makes_no_clean_headline(
     headline: str,
 ) -> None:
     """Each ended as a right watch did: places 8 to 4,000,000 m off, stated to 1.3 m, or nobody there."""
-    rows = changed(list(csv.DictReader((flown / "flight1" / "flight1.csv").open())))
-    log = tmp_path / "log.csv"
-    with log.open("w") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+    log = _written(changed(_rows(flown)), tmp_path / "log.csv")
     written = WatchOutputs(folder=tmp_path / "watch")
     camera = flown / "camera.xml"
     list(watch(_video(flown), outputs=written, telemetry=log, camera=camera, detector=detector))
@@ -738,6 +746,15 @@ def _watched(
     return places, [row["code"] for row in _read(out / "report.json")["notices"]]
 
 
+def _turned(flown: Path, off_deg: float, part: slice, log: Path) -> Path:
+    """The video's telemetry with a part of its headings off, as a log."""
+    rows = _rows(flown)
+    for row in rows[part]:
+        for name in ("Yaw", "Gimbal:yaw"):
+            row[name] = f"{(float(row[name]) + off_deg + 180) % 360 - 180:.4f}"
+    return _written(rows, log)
+
+
 @pytest.fixture(scope="module")
 def rightly_headed(
     flown: Path, detector: TruthDetector, tmp_path_factory: pytest.TempPathFactory
@@ -751,6 +768,8 @@ def rightly_headed(
     ("off_deg", "part"),
     [
         (180.0, slice(42, 62)),
+        (180.0, slice(None)),
+        (-40.0, slice(None)),
         pytest.param(-90.0, slice(42, 62), marks=pytest.mark.long),
         (12.0, slice(None)),
     ],
@@ -764,23 +783,31 @@ def test_headings_of_a_video_that_are_far_off_are_set_right(
     tmp_path: Path,
 ) -> None:
     """The same objects in the same places; a compass that is a little off is not one of those."""
-    lines = list(csv.DictReader((flown / "flight1" / "flight1.csv").open()))
-    for line in lines[part]:
-        for name in ("Yaw", "Gimbal:yaw"):
-            line[name] = f"{(float(line[name]) + off_deg + 180) % 360 - 180:.4f}"
-    with (tmp_path / "off.csv").open("w", newline="") as file:
-        table = csv.DictWriter(file, lines[0])
-        table.writeheader()
-        table.writerows(lines)
+    log = _turned(flown, off_deg, part, tmp_path / "off.csv")
     (right, before), (found, notices) = (
         rightly_headed,
-        _watched(_video(flown), flown, detector, tmp_path / "off", tmp_path / "off.csv"),
+        _watched(_video(flown), flown, detector, tmp_path / "off", log),
     )
     assert [each[0] for each in found] == [each[0] for each in right] and right
     beside_deg = np.array([each[1:] for each in found]) - np.array([each[1:] for each in right])
     assert np.abs(beside_deg).max() < 6e-5  # 6 m: what 12 degrees are over 25 m
     assert ("headings_wrong" in notices) == (abs(off_deg) > 30)
     assert "headings_wrong" not in before
+
+
+def test_a_heading_that_shows_only_later_makes_no_clean_headline(
+    flown: Path, detector: TruthDetector, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As live, or after a hover longer than a watch looks ahead: half a turn off until then, things lie elsewhere."""
+    monkeypatch.setattr(headings, "_AHEAD_NS", 10**9)
+    log = _turned(flown, 180.0, slice(None), tmp_path / "off.csv")
+    _, notices = _watched(_video(flown), flown, detector, tmp_path / "off", log)
+    assert "headings_wrong" in notices
+    headline = _read(tmp_path / "off" / "report.json")["headline"]
+    assert (
+        "headings are far off, which showed only after" in headline["text"]
+        and not headline["complete"]
+    )
 
 
 @pytest.mark.parametrize("shown_by", [1, 2])

@@ -1,7 +1,7 @@
 """A flight's detections, frame by frame, placed and given to their tracks: on the ground, or in the picture."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +11,7 @@ from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.pose import Pose, rotation_from_vector
 from sorvolo.survey.flight import CameraModel, CameraPrior, Frame
 from sorvolo.survey.objects import Detections, Sighting, Track
+from sorvolo.survey.wording import counted
 from sorvolo.tracking.headings import (
     CompassError,
     HeadingCheck,
@@ -129,7 +130,16 @@ class GroundFollower:
         if pictures is None:
             return ""
         fx_px = self._camera.camera.fx_px
-        return contradiction(pictures.places, fx_px, knows_tilt=self._heading is None)
+        words = contradiction(pictures.places, fx_px, knows_tilt=self._heading is None)
+        if not words and self._check is not None and self._check.unturned:
+            seen = counted(self._check.unturned, "detection")
+            return f"its headings are far off, which showed only after {seen}: objects may be counted twice"
+        return words
+
+    def look_ahead(self, coming: Iterable[tuple[Frame, CameraPrior]]) -> None:
+        """Learn from a recorded video's first frames, before any is taken, whether headings are far off."""
+        if self._check is not None:
+            self._check.look_ahead(coming, self._below_m)
 
     def take(self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior) -> Taken:
         """Place a frame's detections, seen from `prior`, on the ground and give them to their tracks."""

@@ -1,7 +1,7 @@
 """Where a camera's top points: by the pictures' way without a compass, and how wrong compasses and telemetry are."""
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 
@@ -15,7 +15,7 @@ from sorvolo.geometry.homography import apply_homography
 from sorvolo.geometry.pose import Pose, rotation_from_vector, site_from_gimbal_rotation
 from sorvolo.registration.place_search import SmallView, second_from_first, small_view
 from sorvolo.survey.flight import CameraPrior, Frame
-from sorvolo.survey.objects import Detections
+from sorvolo.survey.objects import Detections, no_detections
 from sorvolo.tracking.image_motion import ImageMotion
 
 _WINDOW_S = 20.0  # of the way that is laid on the fixes
@@ -265,10 +265,10 @@ def is_checked(prior: CameraPrior) -> bool:
     return is_known and -float(prior.rotation[2, 2]) >= _LEAST_DOWN
 
 
-def is_wrong(shown: HeadingTurn, prior: CameraPrior) -> bool:
-    """Whether a heading by telemetry is one that cannot be, where pictures show this turn."""
+def is_wrong(shown: HeadingTurn, prior: CameraPrior, share: float = 1.0) -> bool:
+    """Whether a heading by telemetry is one that cannot be, where pictures show this turn; a `share` of it is enough."""
     both_deg = float(np.hypot(shown.sigma_deg, prior.attitude_sigma_deg[2]))
-    return abs(shown.turn_deg) > max(_WRONG_DEG, _WRONG_SIGMAS * both_deg)
+    return abs(shown.turn_deg) > share * max(_WRONG_DEG, _WRONG_SIGMAS * both_deg)
 
 
 def heading_deg(prior: CameraPrior) -> float:
@@ -287,6 +287,9 @@ def turned(prior: CameraPrior, turn: HeadingTurn) -> CameraPrior:
 
 _TURNS_DEG_S = 20.0  # a drone that turns faster has its heading not checked; by choice
 _CLOCK_OFF_NS = 1_000_000_000  # by which telemetry's clock may be off: so long after a turn headings are not checked
+_STILL_WRONG = 0.6  # of what makes a heading wrong at first; by choice
+_SURE_DEG = 1.5 * _LEAST_SIGMA_DEG  # a heading shown so well is judged for good; by choice
+_AHEAD_NS = 20 * 10**9  # so far a video is looked at for a heading, where the drone hovers
 _JUMP_DEG = 60.0  # from one frame to the next, against the pictures' own turning; by choice
 
 
@@ -295,7 +298,8 @@ class HeadingCheck:
 
     A heading that cannot be (`heading_check.is_wrong`) is turned to what the pictures show, and the next ones by as
     much until they show otherwise. While the drone turns nothing but a jump is judged: telemetry's clock may be off.
-    `turns_deg` are these turns, clockwise, one for each such frame.
+    `turns_deg` are these turns, clockwise, one for each such frame; `unturned` are the detections that were placed
+    before the pictures showed any heading, where the first that they showed is far off.
     """
 
     def __init__(self) -> None:
@@ -304,6 +308,22 @@ class HeadingCheck:
         self._last: tuple[int, float, float] | None = None  # time, heading, turn, as last shown
         self._steady_ns = 0  # the drone turns until then
         self.turns_deg: list[float] = []
+        self._is_judged, self._before, self.unturned = False, 0, 0
+
+    def look_ahead(
+        self, coming: Iterable[tuple[Frame, CameraPrior]], below_m: Callable[[CameraPrior], float]
+    ) -> None:
+        """Begin with the turn that the flight's first frames show together."""
+        ahead, first_ns = HeadingCheck(), -1
+        for frame, prior in coming:
+            first_ns = frame.time_ns if first_ns < 0 else first_ns
+            looks_aside = prior.knows_place and not is_checked(prior)
+            if looks_aside or frame.time_ns - first_ns > _AHEAD_NS:
+                break
+            ahead.take(frame, frame.time_ns, no_detections(()), prior, below_m(prior))
+            if ahead._is_judged:
+                break
+        self._turn = ahead._turn
 
     def take(
         self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior, below_m: float
@@ -315,7 +335,10 @@ class HeadingCheck:
         if np.isfinite(shown.sigma_deg):
             self._judge(time_ns, shown, prior)
         if self._turn is None:
+            self._before += 0 if self._is_judged else len(found)
             return prior
+        if not self.turns_deg:
+            self.unturned = self._before
         self.turns_deg.append(self._turn.turn_deg)
         return turned(prior, self._turn)
 
@@ -334,7 +357,10 @@ class HeadingCheck:
             if turns_deg_s > _TURNS_DEG_S:
                 self._steady_ns = time_ns + _CLOCK_OFF_NS
         if time_ns >= self._steady_ns:
-            self._turn = turn if is_wrong(turn, prior) else None
+            # what is turned stays so where headings go on nearly as far off
+            is_off = is_wrong(turn, prior, 1.0 if self._turn is None else _STILL_WRONG)
+            self._turn = turn if is_off else None
+            self._is_judged |= is_off or shown.sigma_deg < _SURE_DEG
         elif jump_deg > _JUMP_DEG:  # no clock that is off does that
             self._turn = turn if abs(turn.turn_deg) > _JUMP_DEG else None
 

@@ -2,8 +2,10 @@
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from copy import copy
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from statistics import median
 
@@ -17,6 +19,7 @@ from sorvolo.geometry.track import corners_around, known_points
 from sorvolo.missions.flight.sample_frames import pictures_move
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup, new_site
+from sorvolo.mosaic.selection import every
 from sorvolo.store.rasters.height_model import read_height_model
 from sorvolo.survey.flight import CameraPrior, Frame, Notice, Site
 from sorvolo.survey.mosaic import FrameView
@@ -79,6 +82,7 @@ def over_heights(
 
 
 _COMPASS_REPORTED_DEG = 2.0  # by which a compass is off: less is not worth a notice; by choice
+_AHEAD_STEP_S = 0.2  # between frames that are looked at before the watch
 CONTRADICTED = "telemetry_contradicted"
 _OF_MAPS = (
     "no_telemetry",
@@ -177,16 +181,25 @@ class GroundPlaces(Places):
         if located is not None:
             return self.follower.recall(located)
         prior = self._prior(frame)
+        if self._taken is None and not isinstance(self._setup.source, LiveSource):
+            if self._headings is None:
+                self.follower.look_ahead(self._coming(frame))
+            else:  # its heading is held against the photo after it
+                for after, its_prior in islice(self._coming(frame), 1):
+                    self._headings.see(after.image, its_prior)
         if self._headings is not None:
-            if self._taken is None and not isinstance(self._setup.source, LiveSource):
-                follows = frame.index + 1  # its heading is held against the photo after it
-                for after in self._setup.source.frames(lambda index, _: index == follows):
-                    if isinstance(after, Frame):
-                        self._headings.see(after.image, self._prior(after))
-                    break
             prior = self._headings.take(frame.image, prior)
         self._taken = frame.index, prior
         return self.follower.take(frame, time_ns, found, prior)
+
+    def _coming(self, frame: Frame) -> Iterator[tuple[Frame, CameraPrior]]:
+        """What comes after a frame; it is read apart from what the watch reads."""
+        chosen = every(_AHEAD_STEP_S)
+        for each in copy(self._setup.source).frames(
+            lambda index, time_ns: index > frame.index and chosen(index, time_ns)
+        ):
+            if isinstance(each, Frame):
+                yield each, self._prior(each)
 
     def notices(self) -> tuple[Notice, ...]:
         track, follower, found = self._setup.track, self.follower, list[Notice]()
