@@ -287,8 +287,8 @@ def turned(prior: CameraPrior, turn: HeadingTurn) -> CameraPrior:
 
 _TURNS_DEG_S = 20.0  # a drone that turns faster has its heading not checked; by choice
 _CLOCK_OFF_NS = 1_000_000_000  # by which telemetry's clock may be off: so long after a turn headings are not checked
-_STILL_WRONG = 0.6  # of what makes a heading wrong at first; by choice
-_SURE_DEG = 1.5 * _LEAST_SIGMA_DEG  # a heading shown so well is judged for good; by choice
+_OFF, _STILL_OFF = 0.6, 0.4  # of what makes a photo's heading wrong: 18 and 12 degrees; by choice
+_SURE_DEG = 1.5 * _LEAST_SIGMA_DEG  # a heading shown so well is not doubted; by choice
 _AHEAD_NS = 20 * 10**9  # so far a video is looked at for a heading, where the drone hovers
 _JUMP_DEG = 60.0  # from one frame to the next, against the pictures' own turning; by choice
 
@@ -299,7 +299,7 @@ class HeadingCheck:
     A heading that cannot be (`heading_check.is_wrong`) is turned to what the pictures show, and the next ones by as
     much until they show otherwise. While the drone turns nothing but a jump is judged: telemetry's clock may be off.
     `turns_deg` are these turns, clockwise, one for each such frame; `unturned` are the detections that were placed
-    before the pictures showed any heading, where the first that they showed is far off.
+    before the pictures showed a heading well, where what they then show is far off.
     """
 
     def __init__(self) -> None:
@@ -308,7 +308,7 @@ class HeadingCheck:
         self._last: tuple[int, float, float] | None = None  # time, heading, turn, as last shown
         self._steady_ns = 0  # the drone turns until then
         self.turns_deg: list[float] = []
-        self._is_judged, self._before, self.unturned = False, 0, 0
+        self._is_sure, self._before, self.unturned = False, 0, 0
 
     def look_ahead(
         self, coming: Iterable[tuple[Frame, CameraPrior]], below_m: Callable[[CameraPrior], float]
@@ -321,7 +321,7 @@ class HeadingCheck:
             if looks_aside or frame.time_ns - first_ns > _AHEAD_NS:
                 break
             ahead.take(frame, frame.time_ns, no_detections(()), prior, below_m(prior))
-            if ahead._is_judged:
+            if ahead._is_sure:
                 break
         self._turn = ahead._turn
 
@@ -335,7 +335,7 @@ class HeadingCheck:
         if np.isfinite(shown.sigma_deg):
             self._judge(time_ns, shown, prior)
         if self._turn is None:
-            self._before += 0 if self._is_judged else len(found)
+            self._before += 0 if self._is_sure else len(found)
             return prior
         if not self.turns_deg:
             self.unturned = self._before
@@ -357,10 +357,11 @@ class HeadingCheck:
             if turns_deg_s > _TURNS_DEG_S:
                 self._steady_ns = time_ns + _CLOCK_OFF_NS
         if time_ns >= self._steady_ns:
-            # what is turned stays so where headings go on nearly as far off
-            is_off = is_wrong(turn, prior, 1.0 if self._turn is None else _STILL_WRONG)
-            self._turn = turn if is_off else None
-            self._is_judged |= is_off or shown.sigma_deg < _SURE_DEG
+            # a way is a better witness than two photos; and what is turned stays so where the next are nearly as far off
+            is_off = is_wrong(turn, prior, _OFF if self._turn is None else _STILL_OFF)
+            if self._turn is None or shown.sigma_deg < max(_SURE_DEG, self._turn.sigma_deg):
+                self._turn = turn if is_off else None
+            self._is_sure |= shown.sigma_deg < _SURE_DEG
         elif jump_deg > _JUMP_DEG:  # no clock that is off does that
             self._turn = turn if abs(turn.turn_deg) > _JUMP_DEG else None
 
