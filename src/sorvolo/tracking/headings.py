@@ -345,17 +345,13 @@ class HeadingCheck:
     def _judge(self, time_ns: int, shown: Heading, prior: CameraPrior) -> None:
         """Decide anew by how much headings have to turn, where the frame allows it."""
         turn = HeadingTurn(shown.heading_deg - heading_deg(prior), shown.sigma_deg)
-        before, self._last = self._last, (time_ns, shown.heading_deg, turn.turn_deg)
-        jump_deg = 0.0
-        if before is not None and time_ns > before[0]:
-            turns_deg_s = (
-                abs(HeadingTurn(shown.heading_deg - before[1], 0.0).turn_deg)
-                * 1e9
-                / (time_ns - before[0])
-            )
-            jump_deg = abs(HeadingTurn(turn.turn_deg - before[2], 0.0).turn_deg)
-            if turns_deg_s > _TURNS_DEG_S:
-                self._steady_ns = time_ns + _CLOCK_OFF_NS
+        now = (time_ns, shown.heading_deg, turn.turn_deg)
+        (then_ns, *then_deg), self._last = self._last or now, now
+        turned_deg, jump_deg = (
+            abs(HeadingTurn(angle - then, 0.0).turn_deg) for angle, then in zip(now[1:], then_deg)
+        )
+        if turned_deg * 1e9 > _TURNS_DEG_S * (time_ns - then_ns):
+            self._steady_ns = time_ns + _CLOCK_OFF_NS
         if time_ns >= self._steady_ns:
             # a way is a better witness than two photos; and what is turned stays so where the next are nearly as far off
             is_off = is_wrong(turn, prior, _OFF if self._turn is None else _STILL_OFF)

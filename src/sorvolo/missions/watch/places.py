@@ -214,14 +214,10 @@ class GroundPlaces(Places):
             height = f"{track.height_kind}, over the height model's ground"
         text = f"places come from the telemetry's position, height ({height}) and {how}"
         found.append(Notice("placed_by", 1, text))
-        turns_deg = follower.turns_deg if self._headings is None else self._headings.turns_deg
-        if turns_deg:
-            shown_by, what = "the ground shows that photos share", "photo"
-            if self._headings is None:
-                shown_by, what = "their motion shows", "frame"
+        if turns_deg := (self._headings or follower).turns_deg:
             text = (
-                f"headings about {median(map(abs, turns_deg)):.0f} degrees off, as {shown_by}: corrected in "
-                f"{counted(len(turns_deg), what)}"
+                f"headings about {median(map(abs, turns_deg)):.0f} degrees off, as the pictures show: corrected in "
+                f"{counted(len(turns_deg), 'picture')}"
             )
             found.append(Notice("headings_wrong", len(turns_deg), text))
         if why_not := follower.contradiction:
