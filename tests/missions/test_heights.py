@@ -301,7 +301,7 @@ def test_measuring_names_what_is_missing(with_heights: Path, tmp_path: Path) -> 
         measure_volume(with_heights, area, since=flight)
     with pytest.raises(SettingsError, match="two places"):
         measure_profile(with_heights, ["46.8,-91.9"])
-    with pytest.raises(GeometryError, match="LAT,LON"):
+    with pytest.raises(SettingsError, match="LAT,LON"):
         measure_profile(with_heights, ["here", "there"])
     with pytest.raises(SettingsError, match="interval_m"):
         write_contours(with_heights, tmp_path / "lines.geojson", 0.0)
