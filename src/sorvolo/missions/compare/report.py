@@ -222,13 +222,10 @@ def comparison_headline(
     found = (
         f"{changes:,} {plural('change', changes)} in {compared}; {missing} could not be compared"
     )
-    if not coverage["is_enough"]:
-        doubt = doubt or "most of the ground could not be compared"
-    elif coverage["other_ground_m2"] > _OTHER_GROUND * coverage["compared_m2"]:
-        doubt = (
-            doubt
-            or "most of the ground surface changed (snow, water, ploughing?), and objects on it may be missed"
-        )
+    if not doubt and not coverage["is_enough"]:
+        doubt = "most of the ground could not be compared"
+    elif not doubt and coverage["other_ground_m2"] > _OTHER_GROUND * coverage["compared_m2"]:
+        doubt = "most of the ground surface changed (snow, water, ploughing?), and objects on it may be missed"
     if not doubt:
         return {"quality": "compared", "text": found}
     return {"quality": "doubtful", "text": f"not to be relied on, {doubt}: {found}"}

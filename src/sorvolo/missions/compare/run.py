@@ -41,12 +41,10 @@ from sorvolo.missions.flight.request import REQUEST
 from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup
-from sorvolo.missions.heights.measure import (
-    flight_with_heights,
-    radial_of,
-)
+from sorvolo.missions.heights.measure import flight_with_heights, radial_of
+from sorvolo.missions.heights.run import lens_left_over
 from sorvolo.missions.map.ground import flights_over_heights, map_surface
-from sorvolo.registration.lens import Undistorter, refined_camera
+from sorvolo.registration.lens import Undistorter
 from sorvolo.store.exports.change_files import write_pictures
 from sorvolo.store.exports.ground_files import COVERAGE, coverage_geojson
 from sorvolo.store.exports.map_pictures import picture
@@ -413,15 +411,14 @@ def _earlier_pictures(archive: Archive, superseded: str) -> EarlierPictures:
     painted = flights_over_heights(archive, but=superseded)
 
     @cache
-    def lens(
-        flight_id: str,
-    ) -> Undistorter | None:  # of what its heights found left in its pictures
-        radial = radial_of(archive, flight_id) if flight_id in painted else (0.0, 0.0)
+    def lens(flight_id: str) -> Undistorter | None:
         camera = next(each.camera for each in keyframes if each.flight_id == flight_id)
-        return Undistorter(refined_camera(camera, 1.0, *radial)) if any(radial) else None
+        return lens_left_over(camera, radial_of(archive, flight_id))
 
     def load(index: int) -> ImageRGBA:
-        image, straight = archive.image(keyframes[index]), lens(keyframes[index].flight_id)
+        keyframe = keyframes[index]
+        straight = lens(keyframe.flight_id) if keyframe.flight_id in painted else None
+        image = archive.image(keyframe)
         return with_known_pixels(image if straight is None else straight.undistort(image))
 
     images = ImageCache(load, _CACHE_BYTES)

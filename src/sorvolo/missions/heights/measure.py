@@ -205,20 +205,18 @@ def own_heights_stamp(archive: Archive, flight_id: str) -> int | None:
 
 def flight_with_heights(archive: Archive, but: str) -> str | None:
     """The newest flight of `flights_with_heights`."""
-    return next(iter(flights_with_heights(archive, but)), None)
+    return next(flights_with_heights(archive, but), None)
 
 
-def flights_with_heights(archive: Archive, but: str) -> list[str]:
+def flights_with_heights(archive: Archive, but: str) -> Iterator[str]:
     """The flights, the newest first, `but` one, that have heights of their present map, and a report of them that can be
     read."""
     newest_first = dict.fromkeys(each.flight_id for each in reversed(archive.versions()))
-    found = []
     for flight_id in newest_first:
         keyframes, known = archive.keyframes(flight_id), _read_report(archive, flight_id)
         is_present = known is not None and keyframes and known["run"] == run_of(keyframes)
         if flight_id != but and is_present:
-            found.append(flight_id)
-    return found
+            yield flight_id
 
 
 def damaged_heights(archive: Archive, but: str) -> list[str]:

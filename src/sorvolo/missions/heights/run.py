@@ -11,6 +11,7 @@ import numpy as np
 
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, ImageRGB, ImageRGBA, PointsM
+from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.geometry.pose import Pose
 from sorvolo.heights.cameras import Cameras3D, Tracks, find_tracks, solve_tracks
@@ -106,6 +107,11 @@ _SMALL_BYTES = (
 )  # of gray ones, for the sweep: about a hundred of 4000 px at the usual cells
 
 
+def lens_left_over(camera: Camera, radial: tuple[float, float]) -> Undistorter | None:
+    """What takes the distortion that heights found out of a camera's stored pictures; None where they found none."""
+    return Undistorter(refined_camera(camera, 1.0, *radial)) if any(radial) else None
+
+
 class FlightPictures:
     """Loads and corrects pictures, and keeps those last asked for by `colour`; numbers count the keyframes given."""
 
@@ -116,9 +122,7 @@ class FlightPictures:
         radial: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         self._archive, self._keyframes = archive, keyframes
-        self._lens = (
-            Undistorter(refined_camera(keyframes[0].camera, 1.0, *radial)) if any(radial) else None
-        )
+        self._lens = lens_left_over(keyframes[0].camera, radial)
         self._large = ImageCache(self._load, _LARGE_BYTES)
 
     def colour(self, number: int) -> ImageRGB:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache, partial
 from typing import Self
 
 import cv2
@@ -77,11 +78,12 @@ def shape_of(
 
 def flights_over_heights(archive: Archive, but: str) -> list[str]:
     """The flights, the oldest first, `but` one, whose maps are true orthophotos over heights that can be read."""
-    return [
+    newest_first = [
         each
-        for each in reversed(flights_with_heights(archive, but))
+        for each in flights_with_heights(archive, but)
         if not archive.report(each).get("shape", {"is_flat": True})["is_flat"]
     ]
+    return newest_first[::-1]
 
 
 def map_surface(archive: Archive, flights: Sequence[str]) -> OrthoSurface | None:
@@ -123,48 +125,52 @@ def map_surface(archive: Archive, flights: Sequence[str]) -> OrthoSurface | None
 class MapGround:
     """The ground that a site's map shows over heights, None where it is flat, and what holds a new flight on it.
 
-    `stands` are pictures, by their view's name, with a camera and where it stands over the surface; `keyframes` are the
-    map's own.
+    `stands` are pictures, by their view's name, with a camera and where it stands over the surface; `keyframes` are those
+    of the map among them.
     """
 
     surface: OrthoSurface | None
     stands: dict[str, tuple[Camera, Pose]] = field(default_factory=dict)
-    keyframes: Sequence[StoredKeyframe] = ()
+    keyframes: dict[str, StoredKeyframe] = field(default_factory=dict)
 
     @classmethod
     def of_map(cls, archive: Archive, but: str, keyframes: Sequence[StoredKeyframe]) -> Self:
         """That of the newest map, without a flight; `keyframes` are the others'."""
         flights = flights_over_heights(archive, but)
-        own = [each for each in keyframes if each.flight_id in flights]
-        return cls(map_surface(archive, flights), {}, own)
+        found = cls(map_surface(archive, flights))
+        for each in keyframes:
+            if each.flight_id in flights and each.site_from_camera is not None:
+                name = f"{each.flight_id}/{each.name}"
+                found.keyframes[name] = each
+                found.stands[name] = each.camera, each.site_from_camera
+        return found
 
     def with_map(
         self, archive: Archive, views: Sequence[View]
-    ) -> tuple[list[View], list[tuple[View, FlightPictures]]]:
+    ) -> tuple[Sequence[View], list[tuple[View, FlightPictures]]]:
         """A flight's views, and beside them one of each keyframe of the map that shows ground of theirs and may be of
-        their camera: with its lens all are seen. Keyframes have no fix; they stand from then on."""
+        their camera: with its lens all are seen. Keyframes have no fix."""
         wide = views[0].camera.fx_px / views[0].camera.width_px
         places_m = np.array([each.site_from_camera.translation_m for each in views])
         reach_m = (1 - _LEAST_SHARED) * float(np.median(places_m[:, 2])) / wide
         near: list[tuple[float, View, StoredKeyframe]] = []
-        for each in self.keyframes:
-            own, pose = each.camera, each.site_from_camera
-            if pose is not None and abs(own.fx_px / own.width_px / wide - 1) < _SAME_LENS:
+        for name, each in self.keyframes.items():
+            own, pose = self.stands[name]
+            if abs(own.fx_px / own.width_px / wide - 1) < _SAME_LENS:
                 apart_m = np.linalg.norm((places_m - pose.translation_m)[:, :2], axis=1).min()
-                view = View(f"{each.flight_id}/{each.name}", own, pose, np.full(3, np.nan))
-                near.append((float(apart_m), view, each))
+                near.append((apart_m, View(name, own, pose, np.full(3, np.nan)), each))
         nearest = sorted(near, key=lambda one: one[0])[: min(len(views), _MOST_BESIDE)]
         beside = [(view, each) for apart_m, view, each in nearest if apart_m < reach_m]
         if not beside:
-            return list(views), []
-        for view, each in beside:
-            self.stands[view.name] = each.camera, view.site_from_camera
+            return views, []
         lens = beside[-1][0].camera
-        sizes = [(each.camera.width_px, each.camera.height_px) for each in views]
-        seen = [replace(a, camera=lens.resized(*size)) for a, size in zip(views, sizes)]
+        seen = [
+            replace(each, camera=lens.resized(each.camera.width_px, each.camera.height_px))
+            for each in views
+        ]
+        radial = cache(partial(radial_of, archive))
         return seen, [
-            (view, FlightPictures(archive, [each], radial_of(archive, each.flight_id)))
-            for view, each in beside
+            (view, FlightPictures(archive, [each], radial(each.flight_id))) for view, each in beside
         ]
 
     def tied(self, solved: Cameras3D) -> Cameras3D:
@@ -222,8 +228,8 @@ def ground_of(
         for frame, stored in zip(frames, keyframes, strict=True)
         if stored.site_from_camera is not None
     ]
-    views, beside = known.with_map(archive, views)
-    work = model_ground(archive, views, keyframes, memo=memo, tied=known.tied, beside=beside)
+    seen, beside = known.with_map(archive, views)
+    work = model_ground(archive, seen, keyframes, memo=memo, tied=known.tied, beside=beside)
     while True:
         try:
             next(work)
