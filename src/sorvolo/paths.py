@@ -26,8 +26,8 @@ Inputs: TypeAlias = AnyPath | GivenFlight | Iterable[AnyPath | GivenFlight]
 """One input or several; a text is one input, never a row of letters."""
 
 
-def listed(given: Inputs) -> list[Any]:
-    """The inputs: files, folders, or addresses of live sources as texts, and flights as they are."""
+def listed(given: Any) -> list[Any]:
+    """One or several: files, folders, or addresses of live sources as texts, and all else as it is."""
     several = [given] if isinstance(given, str) or not isinstance(given, Iterable) else given
     return [os.fspath(each) if isinstance(each, str | os.PathLike) else each for each in several]
 

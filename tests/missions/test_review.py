@@ -8,9 +8,10 @@ from fake_changes import fake_change
 from fake_flights import LOCAL_SITE, SITE, frame, map_flight
 
 from sorvolo.cli.main import main
-from sorvolo.errors import InputError, StoreError
+from sorvolo.errors import InputError, NotFoundError, StoreError
 from sorvolo.geometry.coordinates import Coordinates, place_text
 from sorvolo.missions.site.review import list_changes, review_changes
+from sorvolo.store.exports.change_files import changes_geojson
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.findings import Verdict
 from sorvolo.survey.flight import Site
@@ -37,8 +38,24 @@ def test_changes_are_listed_by_flight_and_number(site: Path) -> None:
     assert [each.id for each in list_changes(site)] == ["b-1", "b-2", "c-1", "c-2"]
     assert [each.id for each in list_changes(site, "c")] == ["c-1", "c-2"]
     assert list_changes(site, "a") == []
-    with pytest.raises(InputError, match="no flight d; it has a, b, c"):
+    with pytest.raises(StoreError, match="no flight 'd', only a, b, c"):
         list_changes(site, "d")
+
+
+def test_ranks_are_a_flights_own_also_in_a_list_of_several(site: Path) -> None:
+    """As in the flights' files."""
+    review_changes(site, ["b-1"], Verdict.REJECTED)
+    with Archive.open(site, write=False) as archive:
+        listed = changes_geojson(archive.changes(), archive.site())["features"]
+    for name in ("rank", "group"):
+        files = [
+            each["properties"][name]
+            for flight in "bc"
+            for each in json.loads((site / f"flights/{flight}/changes.geojson").read_text())[
+                "features"
+            ]
+        ]
+        assert [each["properties"][name] for each in listed] == files
 
 
 def test_verdicts_are_kept_and_changed(site: Path) -> None:
@@ -61,13 +78,13 @@ def test_verdicts_are_kept_and_changed(site: Path) -> None:
         (["1"], None, "no change 1"),
         (["3"], "b", "no change 3"),
         ([], None, "no change was"),
-        (["1"], "z", "no flight z"),
+        (["1"], "z", "no flight 'z'"),
     ],
 )
 def test_an_unknown_change_is_named_and_nothing_is_changed(
     site: Path, ids: list[str], flight: str | None, words: str
 ) -> None:
-    with pytest.raises(InputError, match=words):
+    with pytest.raises((InputError, NotFoundError), match=words):
         review_changes(site, ids, Verdict.REJECTED, flight=flight)
     assert verdicts(site) == {}
 

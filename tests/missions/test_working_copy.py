@@ -17,7 +17,7 @@ from sorvolo.cli.main import main
 from sorvolo.errors import SorvoloWarning, StoreError
 from sorvolo.missions.site.copy import copy_site
 from sorvolo.missions.site.history import site_history
-from sorvolo.missions.site.review import list_changes, review_changes, withdraw_reviews
+from sorvolo.missions.site.review import list_changes, review_changes
 from sorvolo.missions.site.working_copy import fetch_site, send_site
 from sorvolo.store.copies.bucket import BucketEnd
 from sorvolo.store.copies.object_store import open_objects
@@ -116,7 +116,7 @@ def test_a_verdict_that_another_machine_withdrew_is_gone(
     (first, *_) = review_changes(here, [list_changes(here)[0].id], Verdict.CONFIRMED)
     ended(send_site(address))
     machine("two")
-    withdraw_reviews(fetched(address, writes=True), [first.id])
+    review_changes(fetched(address, writes=True), [first.id], None)
     ended(send_site(address))
     machine("one")
     assert [each.verdict for each in list_changes(fetched(address))] == [None, None]

@@ -1,21 +1,32 @@
 """Files that a browser may take away: those of the site, by id; a GeoPackage; heights along a line."""
 
+import json
+import re
 import sqlite3
 import struct
 import tempfile
+from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from xml.etree.ElementTree import canonicalize, fromstring, tostring
 
 import pytest
 import rasterio
 import shapely
+from fake_changes import fake_change
+from fake_flights import frame, image
 from pyogrio import read_dataframe
 from pyproj import CRS
 from rasterio.enums import ColorInterp
 from starlette.testclient import TestClient
+from test_objects_store import commit, search, thing
 
+from sorvolo.station.app import station_app
+from sorvolo.station.settings import StationSettings
 from sorvolo.store.exports.geopackage import write_geopackage
+from sorvolo.store.site.archive import Archive
 
+HOST = "http://127.0.0.1:8750"
 URL = "/api/sites/field/exports"
 
 
@@ -68,6 +79,62 @@ def test_geopackage_holds_what_the_map_shows(client: TestClient, tmp_path: Path)
     categories = {each.get("value"): each.get("symbol") for each in renderer.iter("category")}
     drawn = {each.get("name") for each in renderer.iter("symbol")}
     assert {row[1] for row in rows} <= set(categories) and set(categories.values()) == drawn
+
+
+def test_all_formats_state_the_same_of_each_object(tmp_path: Path) -> None:
+    """A car that a detector and a comparison saw, and one that stood before: same place, class, times, verdict."""
+    folder = tmp_path / "maps" / "field"
+    commit(folder, "a", search((thing("a-o1", 3.0, 4.0),)))
+    late_ns = 1_700_100_000 * 10**9
+    seen = {"first_seen_ns": late_ns, "last_seen_ns": late_ns + 10**9}
+    with Archive.open(folder, write=True) as archive, archive.begin_flight("b", "b", {}) as writer:
+        found = search((thing("b-o1", 3.1, 4.1, **seen), thing("b-o2", 21.0, 4.0, **seen)))
+        came = fake_change(1, "b", east_m=20.4, north_m=4.3)
+        came = replace(came, class_after="car", last_seen_ns=late_ns + 5 * 10**9, sigma_m=0.3)
+        writer.commit(
+            [frame(0)], {0: writer.save_image(0, image(0))}, {}, "", search=found, changes=[came]
+        )
+    with Archive.open(folder, write=False) as archive:
+        rows = {each["id"]: each for each in archive.findings()}
+    old, new = sorted(rows, key=lambda name: len(rows[name]["properties"]["flights"]))[::-1]
+    assert rows[new]["properties"]["origins"] == ["changed", "detected"]
+    app = station_app(StationSettings(tmp_path / "maps"))
+    with TestClient(app, base_url=HOST, client=("127.0.0.1", 5000)) as client:
+        wish = {"kind": "object", "id": new, "verdict": "rejected", "note": "a trailer"}
+        assert client.post("/api/sites/field/reviews", json=wish).status_code == 201
+        for name in ("site.gpkg", "objects.kml", "objects.gpx", "objects.geojson"):
+            (tmp_path / name).write_bytes(client.get(f"{URL}/{name}").content)
+        address = "/api/sites/field/collections/{}/items"
+        shown = [
+            client.get(address.format(name)).json()["features"] for name in ("objects", "findings")
+        ]
+    files = [json.loads((tmp_path / "objects.geojson").read_text())["features"], *shown]
+    names = ("class", "flights", "first_seen", "last_seen", "east_m", "north_m", "sigma_m")
+    for features in files:
+        assert {each["id"] for each in features} == {old, new}
+        for each in features:
+            same, stated = rows[each["id"]]["properties"], each["properties"]
+            assert [stated[name] for name in names] == [same[name] for name in names]
+            assert each["geometry"] == rows[each["id"]]["geometry"]
+            place = [stated[name] for name in ("longitude", "latitude")]
+            assert place == each["geometry"]["coordinates"]
+    for layer in ("objects", "findings"):
+        table = read_dataframe(tmp_path / "site.gpkg", layer=layer).set_index("id")
+        assert table.loc[new, ["review", "note"]].tolist() == ["rejected", "a trailer"]
+        for name, row in table.iterrows():
+            assert [row.geometry.x, row.geometry.y] == rows[name]["geometry"]["coordinates"]
+            first = datetime.fromisoformat(rows[name]["properties"]["first_seen"])
+            assert 0 <= (first - row["first_seen"]).total_seconds() < 1e-3  # as GeoPackages hold
+            assert [row["east_m"], row["sigma_m"]] == [
+                rows[name]["properties"][column] for column in ("east_m", "sigma_m")
+            ]
+    for path in ("objects.kml", "objects.gpx"):
+        texts = re.findall(
+            r"(?s)<name>(\w{12}) car</name>.*?first seen ([\d: -]+)", (tmp_path / path).read_text()
+        )
+        assert dict(texts) == {
+            name: rows[name]["properties"]["first_seen"][:19].replace("T", " ") for name in rows
+        }
 
 
 def test_the_qgis_project_finds_what_lies_beside_it(client: TestClient, tmp_path: Path) -> None:

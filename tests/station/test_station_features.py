@@ -12,7 +12,7 @@ from fake_flights import frame, image, tile
 from starlette.testclient import TestClient
 
 from sorvolo.station import crops
-from sorvolo.station.ogc_features import crop_addresses
+from sorvolo.station.reviews import crop_addresses
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.findings import Verdict
 from waiting import wait_for

@@ -212,24 +212,12 @@ def _show_changes(
 
 
 def _plain(change: "StoredChange", site: "Site") -> dict[str, Any]:
-    from sorvolo.store.exports.plain import utc_text
+    """A change as its flight's changes.geojson has it, but for its rank, with flight and place."""
+    from sorvolo.store.exports.change_files import changes_geojson
+    from sorvolo.store.exports.places import place_deg
 
-    latitude, longitude, _ = site.frame.wgs84_from_site(change.centre_m[None])
-    on_earth = (
-        {} if site.is_local else {"latitude": float(latitude[0]), "longitude": float(longitude[0])}
-    )
-    return {
-        "id": change.id,
-        "flight": change.flight_id,
-        "number": change.number,
-        "kind": change.kind.value,
-        "score": change.score,
-        "first_seen": utc_text(change.first_seen_ns),
-        "last_seen": utc_text(change.last_seen_ns),
-        "views": change.views,
-        "east_m": float(change.centre_m[0]),
-        "north_m": float(change.centre_m[1]),
-        **on_earth,
-        "review": None if change.verdict is None else change.verdict.value,
-        "note": change.note,
-    }
+    (shown,) = changes_geojson([change], site)["features"]
+    longitude, latitude = (None, None) if site.is_local else place_deg(change.centre_m, site)
+    place = {"flight": change.flight_id, "latitude": latitude, "longitude": longitude}
+    known = shown["properties"]
+    return place | {name: known[name] for name in known if name not in ("rank", "group")}

@@ -207,7 +207,7 @@ def station_app(
         video_routes(station.shelf, station.collections, station.videos),
         drawing_routes(station.drawings),
         site_deletion_routes(deletion),
-        export_routes(station.shelf, station.collections),
+        export_routes(station.shelf, station.collections, station.reviews),
         wmts_routes(station.shelf),
         stac_routes(station.shelf),
         *cog_routes(station.shelf),

@@ -30,6 +30,7 @@ from sorvolo.missions.heights.measure import measure_profile
 from sorvolo.paths import Json
 from sorvolo.station.collections import SEARCH_FOLDER, TITLES, SiteCollections
 from sorvolo.station.problems import Problem, problem_answer
+from sorvolo.station.reviews import Reviews
 from sorvolo.station.security import FOR_VIEWERS, address, needs
 from sorvolo.station.sites import SiteShelf
 from sorvolo.station.tokens import Role
@@ -234,7 +235,7 @@ class ExportFile:
     title: str
 
 
-def export_routes(shelf: SiteShelf, collections: SiteCollections) -> APIRouter:
+def export_routes(shelf: SiteShelf, collections: SiteCollections, reviews: Reviews) -> APIRouter:
     """What can be taken away, each by its id; a profile of heights."""
     router = APIRouter(prefix="/api/sites/{site}", tags=["exports"], dependencies=FOR_VIEWERS)
 
@@ -262,7 +263,10 @@ def export_routes(shelf: SiteShelf, collections: SiteCollections) -> APIRouter:
         if export_id == _GEOPACKAGE:
             if not archive.has_site:
                 raise Problem(404, "this site has no map yet, so nothing for a GeoPackage")
-            layers = {name: collections.get(site, name).features for name in TITLES}
+            layers = {
+                name: reviews.shown(site, name, collections.get(site, name).features)
+                for name in TITLES
+            }
             styles = {name: qml_of(style) for name, style in LAYER_STYLES.items()}
             with tempfile.TemporaryDirectory(prefix="sorvolo-") as folder:
                 path = Path(folder) / _GEOPACKAGE

@@ -149,7 +149,9 @@ def _feature(
     crop = ("change", changed[-1]) if changed else None
     own: Json = {}
     if of_map is not None:
-        (object_,) = objects_geojson([of_map], site, crops_from_site=True)["features"]
+        (object_,) = objects_geojson([replace(of_map, finding=found)], site, crops_from_site=True)[
+            "features"
+        ]
         own = object_["properties"]
         if of_map.thing.id not in changed:
             crop = ("object", of_map.thing.id)

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from datetime import UTC, datetime
-from urllib.parse import quote, urlencode
+from urllib.parse import urlencode
 
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import JSONResponse
@@ -25,7 +25,6 @@ _CONFORMS = [
 ]
 _GEOJSON = "application/geo+json"
 _MOST = 10_000  # features in one answer; by choice
-_REVIEWED = {"objects": "object", "changes": "change", "findings": "object"}
 Limit = Query(1000, ge=1, le=_MOST, description="Features at most.")
 Offset = Query(0, ge=0, le=10**9)
 
@@ -90,7 +89,7 @@ def feature_routes(collections: SiteCollections, reviews: Reviews) -> APIRouter:
         """Features: within a box, at a time, of classes, with a score at least, of flights, by verdict; in pages."""
         collection = collections.get(site, name)
         wanted = _places(collection, bbox)
-        features = _reviewed([collection.features[each] for each in wanted], name, site, reviews)
+        features = reviews.shown(site, name, [collection.features[each] for each in wanted])
         kept = _filtered(
             features, _interval(datetime), _words(labels), min_score, _words(flight), _words(review)
         )
@@ -106,7 +105,7 @@ def feature_routes(collections: SiteCollections, reviews: Reviews) -> APIRouter:
         ]
         if not found:
             raise Problem(404, f"{name} has no feature {feature_id[:80]!r}")
-        return GeoJsonResponse(_reviewed(found, name, site, reviews)[0])
+        return GeoJsonResponse(reviews.shown(site, name, found)[0])
 
     return router
 
@@ -216,40 +215,6 @@ def _moment(text: str) -> datetime:
 
 def _words(text: str) -> frozenset[str]:
     return frozenset(each.strip() for each in text.split(",") if each.strip())
-
-
-def _reviewed(features: Sequence[Feature], name: str, site: str, reviews: Reviews) -> list[Feature]:
-    """The features with their verdicts, where the collection is one that people judge."""
-    kind = _REVIEWED.get(name)
-    if kind is None:
-        return list(features)
-    current = reviews.current(site, kind)
-    result = []
-    for each in features:
-        review = current.get(str(each["id"]))
-        values = {
-            **each["properties"],
-            "review": review and review.verdict,
-            "review_state": review and review.state,
-            "revision": review.revision if review else 0,
-            "note": review and review.note,
-            "reviewer": review and review.who,
-            "reviewed_at": review and review.at,
-            "crops": _crops(site, kind, each),
-        }
-        result.append({**each, "properties": values})
-    return result
-
-
-def _crops(site: str, kind: str, feature: Feature) -> list[str]:
-    shown = feature["properties"].get("crop_of", (kind, str(feature["id"])))
-    return crop_addresses(site, *shown) if shown else []  # not every watch keeps pictures
-
-
-def crop_addresses(site: str, kind: str, feature_id: str) -> list[str]:
-    """Where the pictures of an object, or of a change before and after, are found."""
-    base = f"/api/sites/{quote(site, safe=':')}/crops/{kind}/{quote(feature_id, safe='')}"
-    return [f"{base}/{n}.jpg" for n in range(2 if kind == "change" else 1)]
 
 
 def _filtered(

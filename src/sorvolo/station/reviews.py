@@ -8,15 +8,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
+from urllib.parse import quote
 
 from fastapi import APIRouter, Query
 from pydantic import Field, Strict
 
 from sorvolo.errors import SorvoloError, StoreError
-from sorvolo.missions.site.review import review_changes, withdraw_reviews
+from sorvolo.missions.site.review import review_changes
 from sorvolo.paths import Json
 from sorvolo.station.collections import FINDINGS, SiteCollections
 from sorvolo.station.events import EventLog, NewEvent
+from sorvolo.station.found import Feature
 from sorvolo.station.orders import Wish
 from sorvolo.station.problems import Problem
 from sorvolo.station.security import FOR_VIEWERS, needs
@@ -28,6 +30,7 @@ from sorvolo.store.atomic import atomic_write_bytes, make_folder
 from sorvolo.survey.findings import Verdict
 
 NO_VERDICT = "none"
+_JUDGED = {"objects": "object", "changes": "change", "findings": "object"}
 _OF_WATCHES = "watches"  # in place of when the site was made, where there is none yet
 _ELSEWHERE = "sorvolo review"  # who votes by the command line
 _COLUMNS = "kind, id, revision, verdict, label, note, who, at"
@@ -94,6 +97,30 @@ class Reviews:
                 for thing, vote in elsewhere.items()
             }
         return found | {each: found[thing] for each, thing in ids.items() if thing in found}
+
+    def shown(self, site_id: str, name: str, features: Sequence[Feature]) -> list[Feature]:
+        """The features of a collection, with how the votes stand where it is one that people judge."""
+        kind = _JUDGED.get(name)
+        if kind is None:
+            return list(features)
+        current = self.current(site_id, kind)
+        result = []
+        for each in features:
+            review = current.get(str(each["id"]))
+            shown = each["properties"].get("crop_of", (kind, str(each["id"])))
+            values = {
+                **each["properties"],
+                "review": review and review.verdict,
+                "review_state": review and review.state,
+                "revision": review.revision if review else 0,
+                "note": review and review.note,
+                "reviewer": review and review.who,
+                "reviewed_at": review and review.at,
+                # not every watch keeps pictures
+                "crops": crop_addresses(site_id, *shown) if shown else [],
+            }
+            result.append({**each, "properties": values})
+        return result
 
     def history(self, site_id: str, kind: str = "", thing_id: str = "") -> list[Review]:
         """All votes of a site, newest first; of one thing. Those on an object have its finding's id."""
@@ -182,10 +209,8 @@ class Reviews:
             try:
                 for each in waiting:
                     verdict = _as_stored(each)
-                    if verdict is None:
-                        withdraw_reviews(archive.folder, [each.id])
-                    else:
-                        review_changes(archive.folder, [each.id], verdict, each.note)
+                    note = each.note if verdict else ""
+                    review_changes(archive.folder, [each.id], verdict, note)
             except StoreError:  # a mission is writing into the site: when it ends they are settled
                 self._unsettled.add(site_id)
                 return False
@@ -240,6 +265,12 @@ class Reviews:
             for alias in each["properties"][name]
         }
         return aliases | {str(each["id"]): str(each["id"]) for each in found}
+
+
+def crop_addresses(site_id: str, kind: str, feature_id: str) -> list[str]:
+    """Where the pictures of an object, or of a change before and after, are found."""
+    base = f"/api/sites/{quote(site_id, safe=':')}/crops/{kind}/{quote(feature_id, safe='')}"
+    return [f"{base}/{n}.jpg" for n in range(2 if kind == "change" else 1)]
 
 
 def _standing(thing: str, votes: Sequence[Review]) -> Review:

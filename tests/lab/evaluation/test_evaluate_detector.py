@@ -74,6 +74,26 @@ def labelled(tmp_path_factory):
     return LabelledSet("painted", CLASSES, tuple(pictures), frozenset({"small object"}))
 
 
+def test_a_detector_of_ones_own_is_measured_beside_a_model(toy, labelled):
+    """Loaded, or with `detect` alone; one detector and one set need no lists."""
+
+    class Bright:
+        classes = CLASSES
+
+        def detect(self, image):
+            return Detector.load(str(toy)).detect(image)
+
+    beside = evaluate_detector([Bright(), str(toy)], labelled, QUICK)
+    assert [arm.name for arm in beside.comparisons[0].arms] == ["Bright", "toy"]
+    (model,) = evaluate_detector(str(toy), labelled, QUICK).sets
+    assert beside.sets[0].coco.ap50 == model.coco.ap50 > 0.3
+    (loaded,) = evaluate_detector(Detector.load(str(toy)), [labelled], QUICK).sets
+    assert loaded.coco.ap50 == model.coco.ap50
+    for arms, sets in (([], labelled), ([[]], labelled), (str(toy), [])):
+        with pytest.raises(InputError, match="nothing to measure"):
+            evaluate_detector(arms, sets, QUICK)
+
+
 def test_a_model_is_measured_and_its_report_stands_alone(toy, labelled, tmp_path):
     steps = []
     evaluation = evaluate_detector([[str(toy)]], [labelled], QUICK, steps.append)

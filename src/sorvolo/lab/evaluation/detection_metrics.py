@@ -23,7 +23,7 @@ from sorvolo.geometry.box_overlap import iou_matrix
 from sorvolo.geometry.summary import CalibrationBin, calibration_bins
 from sorvolo.lab.evaluation.change_metrics import Counts
 from sorvolo.paths import Json
-from sorvolo.survey.labels import LabelledPicture, LabelledSet
+from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import Detections
 
 IOUS: Floats = np.linspace(0.5, 0.95, 10)
@@ -167,7 +167,15 @@ def match_pictures(
             ]
     truth = {
         "info": {},
-        "images": [_image(index, each) for index, each in enumerate(labelled.pictures)],
+        "images": [
+            {
+                "id": index,
+                "width": picture.width_px,
+                "height": picture.height_px,
+                "file_name": picture.path,
+            }
+            for index, picture in enumerate(labelled.pictures)
+        ],
         "categories": [{"id": k, "name": name} for k, name in enumerate(judged)],
         "annotations": annotations,
     }
@@ -370,15 +378,6 @@ def _annotation(row_id: int, picture: int, category: int, box: BoxesPx) -> Json:
     }
 
 
-def _image(index: int, picture: LabelledPicture) -> Json:
-    return {
-        "id": index,
-        "width": picture.width_px,
-        "height": picture.height_px,
-        "file_name": picture.path,
-    }
-
-
 def _indexed(dataset: Json) -> COCO:
     records = COCO()
     records.dataset = dataset
@@ -415,9 +414,8 @@ def _class_match(
     ]
     scores = np.array(list(chain.from_iterable(row["dtScores"] for row in seen)), np.float64)
     ids = chain.from_iterable(row["dtIds"] for row in seen)
-    boxes = np.array([_edges(judge.cocoDt.anns[dt]["bbox"]) for dt in ids], np.float32).reshape(
-        -1, 4
-    )
+    boxes = np.array([judge.cocoDt.anns[dt]["bbox"] for dt in ids], np.float64).reshape(-1, 4)
+    boxes[:, 2:] += boxes[:, :2]
     pictures = np.array([row["image_id"] for row in seen for _ in row["dtIds"]], np.int64)
     matched, ignored = _by_iou(seen, "dtMatches"), _by_iou(seen, "dtIgnore") > 0
     right = (matched > 0) & ~ignored
@@ -432,7 +430,7 @@ def _class_match(
         name,
         scores[order],
         pictures[order],
-        boxes[order],
+        boxes[order].astype(np.float32),
         right[:, order],
         ignored[:, order],
         found[order],
@@ -447,10 +445,6 @@ def _by_iou(rows: Sequence[Json], key: str) -> Floats:
     return np.concatenate(
         [np.zeros((len(IOUS), 0)), *(np.reshape(row[key], (len(IOUS), -1)) for row in rows)], axis=1
     )
-
-
-def _edges(bbox: Sequence[float]) -> tuple[float, float, float, float]:
-    return bbox[0], bbox[1], bbox[0] + bbox[2], bbox[1] + bbox[3]
 
 
 def _tuple(box: BoxesPx) -> tuple[float, float, float, float]:

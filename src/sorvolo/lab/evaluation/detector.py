@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Literal, Unpack
+from typing import Literal, TypeAlias, Unpack
 
 import cv2
 import numpy as np
@@ -28,6 +28,7 @@ from sorvolo.lab.evaluation.detection_scores import (
     score_set,
 )
 from sorvolo.lab.evaluation.detector_page import detector_page
+from sorvolo.missions.flight.detector_protocol import FindsObjects, as_detector
 from sorvolo.paths import AnyPath, Inputs, Json, JsonView, listed
 from sorvolo.store.atomic import atomic_write_bytes, make_folder
 from sorvolo.store.exports.plain import json_bytes
@@ -35,6 +36,9 @@ from sorvolo.survey.flight import Notice
 from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import Detections, no_detections
 from sorvolo.survey.wording import counted
+
+Models: TypeAlias = AnyPath | FindsObjects | Sequence[AnyPath | FindsObjects]
+"""One model, or the same one trained with several seeds."""
 
 _MADE_BY = "sorvolo evaluate detector"
 _FORMAT = 2
@@ -224,26 +228,29 @@ def known_classes(arms: Iterable[Iterable[str]]) -> tuple[str, ...]:
 
 
 def evaluate_detector(
-    arms: Sequence[Sequence[str]],
-    labelled: Sequence[LabelledSet],
+    arms: Models | Iterable[Models],
+    labelled: LabelledSet | Iterable[LabelledSet],
     settings: EvaluationSettings | None = None,
     progress: Callable[[EvaluationProgress], None] = lambda _: None,
 ) -> DetectorEvaluation:
     """Measure `arms[0]` on each set, and the other arms beside it.
 
-    An arm is one model, or the same one trained with several seeds: names or files of models, or detections.json of
-    earlier evaluations, which were made on the same pictures. Measured is the model that was asked for, with the one
+    An arm is one model, or the same one trained with several seeds: detectors, names or files of models, or
+    detections.json of earlier evaluations, which were made on the same pictures. Measured is the model that was asked for, with the one
     that it names for thermal frames, if any. Raises InputError for models and files that cannot be
     used, for sets that label none of a model's classes, and for those of which no picture can be read; one picture
     that cannot be read is left out for all models, and named in `notices`.
     """
     settings = settings or EvaluationSettings()
+    rows, labelled = [listed(each) for each in listed(arms)], listed(labelled)
+    if not all([rows, *rows, labelled]):
+        raise InputError("nothing to measure; give a model, and labelled pictures")
     names = [each.name for each in labelled]
     if len(set(names)) < len(names):
         raise InputError(f"two data sets have one name ({', '.join(names)}); rename a folder")
     reader = _PictureReader()
     # what every model of every arm finds in the pictures that can be read
-    seen = [[_found(place, labelled, settings, progress, reader) for place in arm] for arm in arms]
+    seen = [[_found(place, labelled, settings, progress, reader) for place in arm] for arm in rows]
     seen = [[_without(each, labelled, reader.damaged) for each in arm] for arm in seen]
     labelled = [_readable(each, reader.damaged) for each in labelled]
     first = seen[0][0]
@@ -324,19 +331,21 @@ def _held_out(labelled: LabelledSet, share: float, seed: int) -> LabelledSet:
 
 
 def _found(
-    place: str,
+    place: str | FindsObjects,
     labelled: Sequence[LabelledSet],
     settings: EvaluationSettings,
     progress: Callable[[EvaluationProgress], None],
     reader: "_PictureReader",
 ) -> FoundSets:
     """What the model of this name or file finds, or what it found by an earlier file; nothing in damaged pictures."""
-    if Path(place).suffix == ".json":
+    if isinstance(place, str) and Path(place).suffix == ".json":
         found = read_found(Path(place))
         return replace(
             found, sets={each.name: _same_pictures(place, found, each, reader) for each in labelled}
         )
-    detector = Detector.load(place, stand_in=False)
+    loaded = Detector.load(place, stand_in=False) if isinstance(place, str) else place
+    detector = as_detector(loaded)
+    name = place if isinstance(place, str) else detector.info.name
     for each in labelled:
         judged_classes(each, detector.classes)  # before an hour of looking
     sets: dict[str, FoundSet] = {}
@@ -373,7 +382,7 @@ def _found(
             )
         sets[each.name] = FoundSet(_names(each), tuple(detections), usual)
     return FoundSets(
-        Path(place).stem if Path(place).suffix == ".onnx" else place,
+        Path(name).stem if Path(name).suffix == ".onnx" else name,
         detector.classes,
         sets,
         seconds / max(count, 1),
@@ -470,7 +479,10 @@ def _same_pictures(
 def _side_by_side(
     labelled: LabelledSet, seen: Sequence[Sequence[FoundSets]], settings: EvaluationSettings
 ) -> SetComparison:
-    names = [arm[0].name + _more_seeds(len(arm) - 1) for arm in seen]
+    names = [
+        arm[0].name + (f" and {counted(len(arm) - 1, 'more seed')}" if arm[1:] else "")
+        for arm in seen
+    ]
     arms = []
     for place, (name, arm) in enumerate(zip(names, seen), start=1):
         seeds = [each.sets[labelled.name] for each in arm]
@@ -483,10 +495,6 @@ def _side_by_side(
             )
         )
     return compare_arms(labelled, arms, draws=settings.draws, seed=settings.seed)
-
-
-def _more_seeds(count: int) -> str:
-    return f" and {count} more seed{'s' if count > 1 else ''}" if count else ""
 
 
 def _worst(

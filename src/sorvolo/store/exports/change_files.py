@@ -1,6 +1,8 @@
 """The files of a comparison: changes as GeoJSON, their crops before and after, and the views' masks."""
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -34,12 +36,11 @@ def changes_geojson(changes: Iterable[StoredChange], site: Site) -> dict[str, An
     antimeridian. For a local site it is plain JSON with coordinates in pixels of the site.
     """
     stored = list(changes)
-    places = {
-        each.id: {"rank": rank, "group": group[0].id}
-        for rank, (group, each) in enumerate(
-            ((group, each) for group in grouped_changes(stored) for each in group), start=1
-        )
-    }
+    places, ranked = {}, Counter[str]()
+    for group in grouped_changes(stored):
+        for each in group:
+            ranked[each.flight_id] += 1
+            places[each.id] = {"rank": ranked[each.flight_id], "group": group[0].id}
     features = [_feature(change, site, places[change.id]) for change in stored]
     return feature_collection("changes", features, is_local=site.is_local)
 
@@ -188,7 +189,7 @@ def object_placemarks(objects: Iterable[StoredObject], site: Site) -> list[Place
     """The objects of a site with a place on Earth as placemarks."""
     placemarks = []
     for stored in objects:
-        each = stored.thing
+        each = _as_found(stored)
         words = (
             f"score {each.score:.2f} (0 to 1), {each.views} of {each.possible_views} frames, first seen "
             f"{time_words(each.first_seen_ns)}\nposition accuracy {each.sigma_m:.2f} m (1 sigma)"
@@ -217,11 +218,14 @@ def object_crops(objects: Iterable[MapObject]) -> dict[str, bytes]:
 
 def finding_feature(found: GroundFinding, site: Site) -> dict[str, Any]:
     """A finding as a point of GeoJSON; of a local site in its own pixels."""
-    place = found.position_m.tolist() if site.is_local else place_deg(found.position_m, site)
+    east_m, north_m = found.position_m.tolist()
+    place = (east_m, north_m) if site.is_local else place_deg(found.position_m, site)
     properties = {
         "id": found.id,
         "class": found.label or UNNAMED,
         "score": rounded(found.newest.score, 4),
+        "east_m": rounded(east_m, 3),
+        "north_m": rounded(north_m, 3),
         "sigma_m": rounded(found.sigma_m, 3),
         "length_m": rounded(found.newest.length_m, 2),
         "origins": sorted({each.origin.value for each in found.sightings}),
@@ -239,12 +243,27 @@ def _identity(stored: StoredObject) -> str:
     return stored.thing.id if stored.finding is None else stored.finding.id
 
 
+def _as_found(stored: StoredObject) -> MapObject:
+    """The object with class, place and times of its finding, where it has one."""
+    found = stored.finding
+    if found is None:
+        return stored.thing
+    return replace(
+        stored.thing,
+        label=found.label,
+        class_scores=found.class_scores,
+        position_m=found.position_m,
+        sigma_m=found.sigma_m,
+        first_seen_ns=found.first_ns,
+        last_seen_ns=found.last_ns,
+    )
+
+
 def _feature_object(stored: StoredObject, site: Site, crops_from_site: bool) -> dict[str, Any]:
-    each = stored.thing
+    each = _as_found(stored)
     folder = f"flights/{stored.flight_id}/" if crops_from_site else ""
     east_m, north_m = each.position_m
     found = stored.finding
-    first_ns = each.first_seen_ns if found is None else found.first_ns
     properties: dict[str, Any] = {
         "id": _identity(stored),
         "flight": stored.flight_id,
@@ -265,7 +284,7 @@ def _feature_object(stored: StoredObject, site: Site, crops_from_site: bool) -> 
         "width_m": rounded(each.width_m, 2),
         "views": each.views,
         "possible_views": each.possible_views,
-        "first_seen": utc_text(first_ns),
+        "first_seen": utc_text(each.first_seen_ns),
         "last_seen": utc_text(each.last_seen_ns),
         "flights": [stored.flight_id] if found is None else list(found.dates),
         "moving": each.moving,

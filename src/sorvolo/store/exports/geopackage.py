@@ -23,7 +23,7 @@ from sorvolo.store.pages.words import xml_of
 
 Feature = Mapping[str, Any]
 
-_TIME = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d{1,6})?(Z|[+-]\d\d:\d\d)")
+_TIME = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d{1,9})?(Z|[+-]\d\d:\d\d)")
 _APPLICATION = 0x47504B47  # "GPKG"
 _VERSION = 10300  # GeoPackage 1.3.0, as its requirement 2 writes it
 _WGS84 = 4326
