@@ -955,9 +955,109 @@ def test_a_full_browser_keeps_votes_as_long_as_the_page(opened: Watched) -> None
       Storage.prototype.setItem = () => { throw new DOMException('full', 'QuotaExceededError'); };
       votes.add({site: 'field', kind: 'change', id: 'b-0', verdict: 'confirmed', note: ''});
       Storage.prototype.setItem = set;
-      return votes.waiting.length;
+      const closing = new Event('beforeunload', {cancelable: true});
+      dispatchEvent(closing);
+      return [votes.waiting.length, closing.defaultPrevented];
     }""")
-    assert waiting == 1
+    assert waiting == [1, True]
+
+
+def test_what_is_drawn_without_the_station_waits_for_it(opened: Watched, served: Served) -> None:
+    """A person that somebody saw is not lost: it stands on the map and in the list, also after a reload."""
+    page = opened.page
+    kept = served.ask("/api/sites/field/drawings")
+    page.route("**/drawings", lambda route: route.abort())
+    page.locator("[data-panel=measure]").click()
+    page.locator("[data-tool=found]").click()
+    box = page.locator(".map-canvas").bounding_box()
+    page.mouse.click(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"])
+    waiting = page.locator(".drawn li", has_text="waits to be sent")
+    expect(waiting).to_have_count(1)
+    expect(page.locator("#link-state")).to_contain_text("1 waiting")
+    page.reload()
+    expect(waiting).to_have_count(1)
+    page.unroute_all()
+    page.reload()
+    expect(page.locator("#link-state")).to_have_text("Connected")
+    there = served.ask("/api/sites/field/drawings")
+    (marked,) = [each for each in there["features"] if each not in kept["features"]]
+    assert marked["properties"]["purpose"] == "found"
+    expect(page.locator("#sentence")).to_contain_text("1 person")
+    wish = {"revision": there["revision"], "features": kept["features"]}
+    served.ask("/api/sites/field/drawings", "PUT", wish)
+    opened.faults[:] = [each for each in opened.faults if "ERR_FAILED" not in each]
+
+
+def test_a_vote_that_is_refused_is_said_on_every_screen(opened: Watched, served: Served) -> None:
+    """Which one, and why: nothing else would tell whoever gave it while the station was away."""
+    page = opened.page
+    page.goto(f"{served.url}/#/")
+    page.locator(".card").first.wait_for()
+    page.evaluate("""async () => {
+      const {votes} = await import('/page/votes.js');
+      votes.add({site: 'field', kind: 'change', id: 'b-77', verdict: 'confirmed', note: ''});
+    }""")
+    expect(page.locator(".message.error")).to_contain_text("field, b-77: confirmed. ")
+    assert page.evaluate("localStorage.getItem('sorvolo-votes')") == "[]"
+    opened.faults[:] = [each for each in opened.faults if "404" not in each]
+
+
+def test_what_the_browser_did_not_copy_is_not_called_copied(opened: Watched) -> None:
+    """Else the place that was copied before would be sent."""
+    page = opened.page
+    page.evaluate("""() => {
+      Object.defineProperty(navigator, 'clipboard', {value: undefined});
+      document.execCommand = () => false;
+    }""")
+    page.locator("#rooms [data-panel=findings]").click()
+    page.get_by_role("button", name="Send place").click()
+    done = page.locator(".handover [role=status]")
+    expect(done).to_contain_text("Not copied")
+    expect(done.locator("pre")).to_contain_text("geo:46.4")
+    assert "Place copied" not in page.locator("body").inner_text()
+
+
+def test_times_are_the_station_s_and_days_those_that_are_shown(
+    browser: Any, served: Served
+) -> None:
+    """The browser's clock is a day behind, and it is in New Zealand, where 20:00 UTC is the next day."""
+    page = context_of(browser, timezone_id="Pacific/Auckland").new_page()
+    page.add_init_script("const now = Date.now; Date.now = () => now() - 86400000;")
+    page.goto(served.url)
+    page.locator(".card").first.wait_for()
+    now_ms, shown = page.evaluate("""async () => {
+      const {now} = await import('/page/api.js');
+      const {ALL, passing} = await import('/page/filters.js');
+      const list = [{properties: {class: 'car', first_seen: '2026-05-01T20:00:00Z', last_seen: '2026-05-01T20:00:00Z'}}];
+      const count = (more) => passing(list, {...ALL, ...more}).length;
+      return [now(), [{from: '2026-05-02'}, {to: '2026-05-02'}, {from: '2026-05-03'}, {to: '2026-05-01'}].map(count)];
+    }""")
+    assert abs(now_ms / 1000 - time.time()) < 8
+    assert shown == [1, 1, 0, 0]
+    page.context.close()
+
+
+@pytest.mark.parametrize("body", [None, "export const get = 1;"], ids=["missing", "older"])
+def test_a_page_that_did_not_come_whole_is_loaded_again(
+    browser: Any, served: Served, body: str | None
+) -> None:
+    """One file did not come, or is of another version than the rest: it does not stay at "Connecting" for ever."""
+    page = context_of(browser).new_page()
+
+    def spoil(route: Any) -> None:
+        if body is None:
+            route.abort()
+        else:
+            route.fulfill(content_type="text/javascript", body=body)
+
+    page.clock.install()
+    page.route("**/page/api.js", spoil)
+    page.goto(served.url)
+    page.get_by_text("did not come whole").wait_for()
+    page.unroute_all()
+    page.clock.fast_forward(6000)
+    page.locator(".card").first.wait_for()
+    page.context.close()
 
 
 def test_what_could_not_be_loaded_or_was_kept_is_never_the_last_word(
@@ -1347,6 +1447,11 @@ def test_what_is_shown_can_be_taken_away(opened: Watched, served: Served, tmp_pa
     page.reload()
     page.locator("[data-panel=share]").click()
     page.locator(".files a[href$=gpkg]").wait_for()
+    west = {"type": "Point", "coordinates": [-13.2503, 46.5003]}
+    person = {"id": 1, "class": "person", "score": 0.9}
+    found = {"type": "Feature", "id": 1, "properties": person, "geometry": west}
+    announce(served, "object.found", {"feature": found})
+    expect(page.locator("#sentence")).to_contain_text("2 people")
     taken = {}
     for name in ("GeoJSON", "CSV", "KMZ", "CalTopo", "TAK package"):
         with page.expect_download() as download:
@@ -1360,6 +1465,7 @@ def test_what_is_shown_can_be_taken_away(opened: Watched, served: Served, tmp_pa
     rows = taken["CSV"].read_text().splitlines()
     assert rows[0].startswith("id,what,kind,class")
     assert sum(row.startswith("b-") for row in rows) == 4
+    assert sum(",46.5003,-13.2503," in row for row in rows) == 1  # numbers, not a formula's text
     shutil.unpack_archive(taken["KMZ"], tmp_path / "kmz", "zip")
     places = check_kml(ElementTree.parse(tmp_path / "kmz" / "doc.kml").getroot())
     assert len(places) == len(features)
@@ -1420,12 +1526,12 @@ def test_an_upload_goes_on_after_a_cut_and_starts_a_mission(
     )
     cuts = []
 
-    def cut_once(route: Any) -> None:
-        if cuts or route.request.method != "PATCH":
-            route.continue_()
-        else:
+    def cut(route: Any) -> None:  # a piece, and the first two questions of how much came
+        if route.request.method == ["PATCH", "HEAD", "HEAD", ""][len(cuts)]:
             cuts.append(route.request.url)
             route.abort()
+        else:
+            route.continue_()
 
     wishes = []
 
@@ -1435,7 +1541,7 @@ def test_an_upload_goes_on_after_a_cut_and_starts_a_mission(
         wishes.append(route.request.post_data_json)
         return route.fulfill(status=201, content_type="application/json", body='{"id": "r"}')
 
-    page.route(re.compile(r"/api/uploads/\w+$"), cut_once)
+    page.route(re.compile(r"/api/uploads/\w+$"), cut)
     page.route(re.compile(r"/api/runs"), take)
     page.get_by_text("Start a mission").click()
     page.get_by_label("Files of the flight").first.set_input_files([str(video), str(track)])
@@ -1446,7 +1552,7 @@ def test_an_upload_goes_on_after_a_cut_and_starts_a_mission(
     states = {each["id"]: (each["name"], each["state"]) for each in served.ask("/api/uploads")}
     assert states[wish["input"]["upload"]] == ("f.mp4", "ready")
     assert states[wish["options"]["telemetry"]["upload"]] == ("f.csv", "ready")
-    assert cuts
+    assert len(cuts) == 3
     opened.faults[:] = [
         each for each in opened.faults if "ERR_FAILED" not in each
     ]  # the cut itself

@@ -20,8 +20,9 @@ from typer.testing import CliRunner
 
 from sorvolo.cli.main import app as command
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.station import run_process
-from sorvolo.station.app import server_config, station_app
+from sorvolo.station import run_process, security
+from sorvolo.station.app import Station, server_config, station_app
+from sorvolo.station.events import NewEvent
 from sorvolo.station.inputs import checked_stream
 from sorvolo.station.orders import SOURCE_VARIABLE, RunOrder
 from sorvolo.station.problems import Problem
@@ -353,6 +354,38 @@ def test_the_cookie_is_out_of_reach_of_scripts_and_other_sites(root: Path) -> No
     with client:
         cookie = client.post("/api/session", json={"token": token}).headers["set-cookie"]
         assert "HttpOnly" in cookie and "samesite=strict" in cookie.lower()
+
+
+@pytest.mark.parametrize("is_socket", [True, False])
+def test_a_live_channel_ends_with_its_token(
+    root: Path, monkeypatch: pytest.MonkeyPatch, *, is_socket: bool
+) -> None:
+    """Who was shut out hears nothing more of what is found."""
+    monkeypatch.setattr(security, "LOOK_AGAIN_S", 0.0)
+    client, token = guarded(root)
+    headers = {"authorization": f"Bearer {token}"}
+    station: Station = client.app.state.station  # type: ignore[attr-defined]
+
+    make_token(
+        station.state, "Ben", "view"
+    )  # a station whose last token goes is open to this machine
+
+    def shut_out() -> None:
+        revoke_token(station.state, "Ada")
+        station.events.append(NewEvent("object.found", {"secret": 1}, "field"))
+
+    with client:
+        station.events.append(NewEvent("object.found", {"at": 0}, "field"))
+        if is_socket:
+            with client.websocket_connect(f"{SOCKET}?after=0", headers=headers) as socket:
+                assert socket.receive_json()["data"] == {"at": 0}
+                shut_out()
+                with pytest.raises(WebSocketDisconnect):
+                    socket.receive_json()
+        else:
+            threading.Timer(0.5, shut_out).start()
+            heard = client.get("/api/events?after=0", headers=headers).text  # else it never ends
+            assert '"at"' in heard and "secret" not in heard
 
 
 @pytest.mark.parametrize(("role", "allowed"), [("view", {"view"}), ("review", {"view", "review"})])

@@ -278,12 +278,7 @@ def _about_routes(station: Station) -> APIRouter:
     ) -> JSONResponse:
         """Exchange a token for a cookie that scripts cannot read."""
         doorkeeper: Doorkeeper = request.scope["state"]["doorkeeper"]
-        holder = await doorkeeper.look_at(token, request.client.host if request.client else "")
-        if holder is None:
-            raise Problem(
-                401,
-                "this token is not known here, or has expired; ask who runs the station for another",
-            )
+        holder = await doorkeeper.look_at(token, request)
         answer = JSONResponse({"name": holder.name, "role": holder.role.word})
         answer.set_cookie(
             COOKIE,

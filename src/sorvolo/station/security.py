@@ -4,9 +4,8 @@ import asyncio
 import ipaddress
 import re
 import socket
+import time
 from collections import Counter
-from collections.abc import Awaitable, Callable, Iterator
-from contextlib import contextmanager
 from http.cookies import CookieError, SimpleCookie
 from typing import Any
 from urllib.parse import quote, urlsplit
@@ -24,6 +23,7 @@ from sorvolo.station.tokens import Guesses, Holder, Role, has_tokens, holder_of,
 COOKIE = "sorvolo_session"
 _MOST_BODY_BYTES = 1_000_000  # of a request; an area of 10,000 corners has half of it
 _ANYBODY = re.compile(r"/(page/.*|api/session|favicon\.ico)?")
+LOOK_AGAIN_S = 10.0  # at the token of a live channel
 _EVENTS = "/api/events"
 _SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
 _HEADERS = {
@@ -70,29 +70,44 @@ class Doorkeeper:
             )
             holder = await self._holder(connection)
             scope["state"] = {**scope.get("state", {}), "holder": holder, "doorkeeper": self}
+            if scope["type"] == "websocket" or scope["path"] == _EVENTS:
+                await self._keep_live(connection, receive, sending)
+                return
             if not scope["path"].startswith(self._upload_path):
                 receive = _limited(connection, receive)
-            with self._live_channel(connection):
-                await self._app(scope, receive, sending)
+            await self._app(scope, receive, sending)
         except Problem as problem:
-            await _refuse(scope, receive, sending, problem)
+            await problem_answer(problem)(scope, receive, sending)
 
-    @contextmanager
-    def _live_channel(self, connection: HTTPConnection) -> Iterator[None]:
-        """Count a WebSocket, or the events as text, while it is open. Raises Problem (429) for one too many."""
-        scope = connection.scope
-        if scope["type"] != "websocket" and scope["path"] != _EVENTS:
-            yield
-            return
+    async def _keep_live(self, connection: HTTPConnection, receive: Receive, send: Send) -> None:
+        """Pass on a WebSocket, or the events as text: counted while open, ended once its token is void.
+
+        Raises Problem (429) for one too many of an address.
+        """
         address = address_group(connection.client.host if connection.client else "")
         most = self._settings.limits.most_live_per_address
         if self._live[address] >= most:
             raise Problem(
                 429, f"{address} keeps {most} live channels open already; close some of its pages"
             )
+        looked_s, has_ended = time.monotonic(), False
+
+        async def sending(message: Message) -> None:
+            nonlocal looked_s, has_ended
+            if time.monotonic() - looked_s >= LOOK_AGAIN_S and not has_ended:
+                looked_s = time.monotonic()
+                try:
+                    await self._holder(connection)
+                except Problem:
+                    has_ended = True
+                    is_socket = connection.scope["type"] == "websocket"
+                    await send({"type": "websocket.close" if is_socket else "http.response.body"})
+            if not has_ended:
+                await send(message)
+
         self._live[address] += 1
         try:
-            yield
+            await self._app(connection.scope, receive, sending)
         finally:
             self._live[address] -= 1
             if not self._live[address]:
@@ -116,21 +131,15 @@ class Doorkeeper:
                 "a token is needed: send it as `Authorization: Bearer TOKEN`, or log in on the page",
                 headers={"WWW-Authenticate": "Bearer"},
             )
-        holder = await self.look_at(token, connection.client.host if connection.client else "")
-        if holder is None:
-            raise Problem(
-                401,
-                "this token is not known here, or has expired; ask who runs the station for another",
-                headers={"WWW-Authenticate": "Bearer"},
-            )
-        return holder
+        return await self.look_at(token, connection)
 
-    async def look_at(self, token: str, address: str) -> Holder | None:
-        """Whose token it is. Raises Problem (429) where the address sent too many wrong ones.
+    async def look_at(self, token: str, connection: HTTPConnection) -> Holder:
+        """Whose token it is. Raises Problem (401; 429 where the address sent too many wrong ones).
 
         Guesses at a token that there is count for its id alone, so that nobody behind the same address can keep the
         holders of other tokens out: ids are random, and only a token's holder knows its own.
         """
+        address = connection.client.host if connection.client else ""
         known_id = await asyncio.to_thread(known_id_of, self._state, token)
         source = f"{address_group(address)} {known_id}"
         if (wait_s := self._guesses.wait_s(source)) > 0:
@@ -141,6 +150,12 @@ class Doorkeeper:
             )
         holder = await asyncio.to_thread(holder_of, self._state, token)
         self._guesses.note(source, right=holder is not None)
+        if holder is None:
+            raise Problem(
+                401,
+                "this token is not known here, or has expired; ask who runs the station for another",
+                headers={"WWW-Authenticate": "Bearer"},
+            )
         return holder
 
 
@@ -285,8 +300,6 @@ def _with_headers(send: Send, settings: StationSettings) -> Send:
 
 def _limited(connection: HTTPConnection, receive: Receive) -> Receive:
     """`receive` that refuses a body of more than a megabyte, announced or not. Raises Problem (413)."""
-    if connection.scope["type"] == "websocket":
-        return receive
     too_large = Problem(
         413, f"at most {_MOST_BODY_BYTES // 1000} kB were expected; flights go to /api/uploads"
     )
@@ -305,20 +318,3 @@ def _limited(connection: HTTPConnection, receive: Receive) -> Receive:
         return message
 
     return receiving
-
-
-async def _refuse(
-    scope: Scope, receive: Receive, send: Callable[[Any], Awaitable[None]], problem: Problem
-) -> None:
-    answer = problem_answer(problem)
-    if scope["type"] == "http" or "websocket.http.response" in scope.get("extensions", {}):
-        await answer(scope, receive, send)
-    else:
-        await receive()
-        await send(
-            {
-                "type": "websocket.close",
-                "code": 4000 + problem.status % 1000,
-                "reason": problem.detail[:120],
-            }
-        )

@@ -11,12 +11,19 @@ export class Problem extends Error {
 }
 
 const UNREACHABLE = say("Check that the station runs and that this device is in its network. The page tries again by itself.");
+const NOT_DONE = say("This may not be done. Check that the station runs and that this device is in its network, then do it again.");
 
 /** Who wants to know that a token is needed. */
 export const session = new EventTarget();
 
 /** How many answers were not the station's own but kept by the service worker. */
 export const kept = { answers: 0 };
+
+const CLOCKS_AGREE_MS = 5000;
+let ahead_ms = 0; // the station's clock, of this device's, which may be days off
+
+/** The time now by the station's clock, ms. */
+export const now = () => Date.now() + ahead_ms;
 
 /** Send a request; give the JSON of the answer (null for none). Throws Problem. */
 export async function ask(method, path, body, { signal, headers = {} } = {}) {
@@ -36,9 +43,11 @@ export async function send(path, init) {
     answer = await fetch(path, { credentials: "same-origin", ...init });
   } catch (error) {
     if (error.name === "AbortError") throw error;
-    throw new Problem(0, say("The station does not answer"), UNREACHABLE);
+    throw new Problem(0, say("The station does not answer"), init?.method && init.method !== "GET" ? NOT_DONE : UNREACHABLE);
   }
+  const stated_ms = Date.parse(answer.headers.get("date"));
   if (answer.headers.has("x-kept")) kept.answers += 1;
+  else if (Math.abs(stated_ms - now()) > CLOCKS_AGREE_MS) ahead_ms = stated_ms - Date.now();
   if (answer.ok) return answer;
   const problem = await answer.json().catch(() => ({}));
   if (answer.status === 401) session.dispatchEvent(new Event("needed"));

@@ -21,6 +21,26 @@ export const stored = {
   },
 };
 
+/** A list that the browser keeps; where it keeps nothing, as long as the page, which then does not close without a question. */
+export class KeptList {
+  constructor(key) {
+    Object.assign(this, { key, memory: [], isFull: false });
+    addEventListener("beforeunload", (event) => { if (this.isFull && this.memory.length) event.preventDefault(); });
+  }
+
+  get all() {
+    if (this.isFull) return this.memory;
+    try {
+      return JSON.parse(stored.get(this.key)) ?? [];
+    } catch { return this.memory; }
+  }
+
+  keep(list) {
+    this.memory = list;
+    this.isFull = !stored.set(this.key, JSON.stringify(list));
+  }
+}
+
 class Choices extends EventTarget {
   constructor() {
     super();

@@ -1,10 +1,11 @@
 // Drawing on the map: distances, areas and height profiles; areas of interest, alert zones and waypoints, shared by all.
 
 import { get, Problem, put, siteUrl } from "./api.js";
-import { button, cross, el, fill, message, press, quiet, svg } from "./dom.js";
+import { button, cross, el, fill, message, press, quiet, report, svg } from "./dom.js";
 import { isWritten } from "./feature_card.js";
 import { say } from "./languages.js";
 import { area_m2, boundsOf, featureOf, length_m } from "./places.js";
+import { unsent, votes } from "./votes.js";
 import { waypointsFor } from "./waypoints.js";
 import * as words from "./words.js";
 
@@ -16,8 +17,11 @@ const TOOLS = {
   waypoint: [say("Waypoint"), "point", say("Tap the place to fly to.")], found: [say("Person seen"), "point", say("Tap where somebody is: a finding of the site.")],
 };
 
+const NONE = { features: [], revision: 0 };
+const REFUSED = [400, 403, 413, 422]; // by the station, for good
+
 export async function loadDrawings(screen) {
-  screen.zones ??= [];
+  show(screen, screen.drawings ?? NONE);
   if (screen.data.detail.is_new) return;
   try {
     show(screen, await get(siteUrl(screen.data.id, "drawings")));
@@ -26,13 +30,20 @@ export async function loadDrawings(screen) {
   }
 }
 
+/** Drawings of the screen's site, by whom the page belongs to, that the station does not have yet. */
+const unsentOf = ({ data }) => unsent.all.filter(({ site, who }) => site === data.id && who === votes.who).map(({ feature }) => feature);
+
 function show(screen, { features, revision }) {
-  Object.assign(screen, { zones: features, zonesRevision: revision });
+  const mine = unsentOf(screen).filter(({ id }) => !features.some((each) => each.id === id));
+  Object.assign(screen, { zones: [...features, ...mine], drawings: { features, revision } });
   screen.view?.ready.then(() => screen.view.put("drawings", screen.zones));
 }
 
 async function saveDrawings(screen, change) {
-  const save = async () => show(screen, await put(siteUrl(screen.data.id, "drawings"), { revision: screen.zonesRevision ?? 0, features: change(screen.zones ?? []) }));
+  const save = async () => {
+    const { features, revision } = screen.drawings ?? NONE;
+    show(screen, await put(siteUrl(screen.data.id, "drawings"), { revision, features: change(features) }));
+  };
   try {
     await save();
   } catch (problem) {
@@ -40,6 +51,23 @@ async function saveDrawings(screen, change) {
     await loadDrawings(screen); // somebody drew meanwhile: put ours into theirs
     await save();
   }
+}
+
+/** Send the drawings that wait; what the station refuses for good is said and dropped. */
+export async function sendDrawings(screen) {
+  const mine = unsentOf(screen);
+  if (!mine.length) return;
+  const isMine = ({ id }) => mine.some((each) => each.id === id);
+  try {
+    await saveDrawings(screen, (list) => [...list.filter((each) => !isMine(each)), ...mine]);
+  } catch (problem) {
+    if (!REFUSED.includes(problem.status)) return; // they wait
+    report(problem);
+  }
+  unsent.keep(unsent.all.filter(({ feature }) => !isMine(feature)));
+  votes.changed();
+  show(screen, screen.drawings ?? NONE);
+  if (mine.some(({ properties }) => properties.purpose === "found")) await screen.data.load(["objects"]);
 }
 
 export class Draw {
@@ -139,9 +167,11 @@ export class Draw {
     const name = purpose === "measure" ? sizeOf(geometry) : `${TOOLS[purpose][0]} ${count}`;
     const feature = { type: "Feature", id: crypto.randomUUID?.() ?? String(Date.now()), geometry, properties: { purpose, name } };
     this.take(null);
-    await saveDrawings(this.screen, (list) => [...list, feature]);
+    unsent.keep([...unsent.all, { site: this.screen.data.id, who: votes.who, feature }]);
+    votes.changed();
+    show(this.screen, this.screen.drawings ?? NONE);
+    await sendDrawings(this.screen);
     this.showList();
-    if (purpose === "found") await this.screen.data.load(["objects"]);
     if (purpose === "measure") fill(this.live, el("p.size", name));
   }
 
@@ -175,10 +205,11 @@ export class Draw {
   showList() {
     const { data } = this.screen;
     const zones = this.screen.zones ?? [];
+    const mine = unsentOf(this.screen);
     const route = zones.filter((each) => each.properties.planned);
     fill(this.list, zones.length ? el("h3", say("Drawn here")) : null, el("ul.plain.drawn", zones.filter((each) => !each.properties.planned).map((each) => el("li",
       this.may ? el("input", { type: "text", ".value": each.properties.name ?? "", "aria-label": say("Name"), maxlength: 80, on: { change: (event) => this.rename(each, event.target.value) } }) : each.properties.name,
-      el("span.soft", sizeOf(each.geometry), each.properties.by ? ` · ${words.nameOf(each.properties.by)}` : ""),
+      el("span.soft", sizeOf(each.geometry), each.properties.by ? ` · ${words.nameOf(each.properties.by)}` : "", mine.some(({ id }) => id === each.id) ? ` · ${say("waits to be sent")}` : ""),
       quiet(say("Show"), () => this.screen.view?.go(each.geometry.type === "Point" ? each.geometry.coordinates : boundsOf([each.geometry]))),
       each.properties.purpose === "interest" ? quiet(say("Filter"), () => this.narrow(each), { "aria-pressed": data.filters.area === each.geometry.coordinates[0] }) : null,
       this.may ? cross(say("Delete {name}", { name: each.properties.name ?? "" }), () => this.remove([each.id])) : null)),
@@ -198,6 +229,8 @@ export class Draw {
   }
 
   async remove(ids) {
+    unsent.keep(unsent.all.filter(({ feature }) => !ids.includes(feature.id)));
+    votes.changed();
     if (this.screen.zones.some((each) => ids.includes(each.id) && this.screen.data.filters.area === each.geometry.coordinates[0])) this.screen.data.filter({ area: null });
     await saveDrawings(this.screen, (list) => list.filter((each) => !ids.includes(each.id)));
     this.showList();

@@ -1,11 +1,11 @@
 // Share: a link, what is shown as GeoJSON, CSV, KMZ, for CalTopo and TAK; the station's own files (map, GeoPackage, reports); print.
 
-import { get, roomUrl, siteUrl } from "./api.js";
+import { get, now, roomUrl, siteUrl } from "./api.js";
 import { button, el, fill, report } from "./dom.js";
 import { lookOf, titleOf } from "./feature_card.js";
 import { say } from "./languages.js";
 import { middleOf } from "./places.js";
-import { copy } from "./share.js";
+import { copy, NOT_COPIED } from "./share.js";
 import { siteName } from "./sites.js";
 import { bytes, length, place, time, VERDICTS } from "./words.js";
 import { zip } from "./zip.js";
@@ -19,8 +19,8 @@ export function exportPanel(screen, body) {
   const files = el("div");
   const copied = el("span.soft", { role: "status" });
   const link = async () => {
-    await copy(`${location.origin}/${roomUrl(screen.data.id, screen.room)}`);
-    fill(copied, say("Link copied"));
+    const is = await copy(`${location.origin}/${roomUrl(screen.data.id, screen.room)}`);
+    fill(copied, is ? say("Link copied") : NOT_COPIED);
   };
   fill(body, el("div.row.wrap", button(say("Copy link"), link, { class: "main" }), copied),
     el("p.note", say("Who opens it needs a token of their own where the station has tokens.")), el("h3", say("What is shown")), shown,
@@ -103,7 +103,7 @@ function csv(features) {
   };
   const rows = features.map((each) => {
     const [lon, lat] = middleOf(each.geometry);
-    const values = { ...each.properties, id: each.id, what: nameOf(each), latitude: lat.toFixed(8), longitude: lon.toFixed(8), coordinates: place([lon, lat]) };
+    const values = { ...each.properties, id: each.id, what: nameOf(each), latitude: Number(lat.toFixed(8)), longitude: Number(lon.toFixed(8)), coordinates: place([lon, lat]) };
     return COLUMNS.map((name) => cell(values[name])).join(",");
   });
   return `${[COLUMNS.join(","), ...rows].join("\r\n")}\r\n`;
@@ -137,8 +137,8 @@ function kmz(features, name) {
 
 /** Features as a data package of ATAK, WinTAK and iTAK: a Cursor on Target event each. */
 function tak(features, name, site) {
-  const at = new Date().toISOString();
-  const stale = new Date(Date.now() + DAY_MS).toISOString();
+  const at = new Date(now()).toISOString();
+  const stale = new Date(now() + DAY_MS).toISOString();
   const events = features.map((each) => {
     const [lon, lat] = middleOf(each.geometry);
     const uid = `sorvolo.${site}.${each.id}`;
@@ -156,7 +156,7 @@ function tak(features, name, site) {
 async function print(screen) {
   const features = shownFeatures(screen);
   const picture = screen.view ? el("img", { alt: say("The map"), src: await screen.view.picture() }) : null;
-  const sheet = el("section.sheet", el("h1", siteName(screen.data.detail)), el("p", `${time(new Date().toISOString())}${screen.view ? ` · ${extentWords(screen)}` : ""}`), picture,
+  const sheet = el("section.sheet", el("h1", siteName(screen.data.detail)), el("p", `${time(now())}${screen.view ? ` · ${extentWords(screen)}` : ""}`), picture,
     el("table", el("thead", el("tr", [say("Id"), say("What"), say("Place"), say("Score"), say("Verdict"), say("Note")].map((each) => el("th", each)))),
       el("tbody", features.map((each) => el("tr", [each.id, each.properties.name ?? titleOf(each), place(middleOf(each.geometry), { local: screen.data.detail.is_local }), each.properties.score ? Math.round(each.properties.score * 100) : "",
         VERDICTS[each.properties.review] ?? "", each.properties.note ?? ""].map((value) => el("td", String(value))))))));

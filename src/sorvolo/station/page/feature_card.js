@@ -2,7 +2,7 @@
 
 import { choices } from "./choices.js";
 import { button, cross, el, fill, quiet } from "./dom.js";
-import { numeral, say } from "./languages.js";
+import { say } from "./languages.js";
 import { CLASSES, KINDS, OTHER_CLASS } from "./map_style.js";
 import { middleOf } from "./places.js";
 import { handover } from "./share.js";
@@ -87,7 +87,7 @@ export function picture(src, alt) {
 /** How much higher its ground lies than before, with the accuracy; null where that was not measured. */
 function risenWords({ height_change_m: risen, height_change_sigma_m: sigma }) {
   if (risen === undefined || risen === null) return null;
-  return say("{change} m (accuracy {sigma}, 1 sigma)", { change: `${risen > 0 ? "+" : ""}${numeral(risen)}`, sigma: words.length(sigma) });
+  return say("{change} (accuracy {sigma}, 1 sigma)", { change: `${risen > 0 ? "+" : ""}${words.length(risen)}`, sigma: words.length(sigma) });
 }
 
 /** What is known of a feature, as a list of terms. */

@@ -4,7 +4,7 @@ import { button } from "./dom.js";
 import { say } from "./languages.js";
 import { CLASSES, KINDS } from "./map_style.js";
 import { inRing, middleOf } from "./places.js";
-import { percent, VERDICTS } from "./words.js";
+import { dateOf, percent, VERDICTS } from "./words.js";
 
 export const ALL = { hidden: [], minScore: 0, from: "", to: "", flight: "", verdict: "all", area: null, minArea_m2: 0 };
 
@@ -23,8 +23,8 @@ function passes(feature, filters) {
   if (filters.flight && values.flight !== filters.flight && !(values.flights ?? []).includes(filters.flight)) return false;
   if (filters.verdict !== "all" && (values.review ?? "none") !== filters.verdict) return false;
   if (values.area_m2 !== undefined && values.area_m2 < filters.minArea_m2) return false;
-  if (filters.from && String(values.last_seen ?? values.first_seen ?? "") < filters.from) return false;
-  if (filters.to && String(values.first_seen ?? "") > `${filters.to}~`) return false;
+  if (filters.from && dateOf(values.last_seen ?? values.first_seen) < filters.from) return false;
+  if (filters.to && dateOf(values.first_seen) > filters.to) return false;
   return !filters.area || inRing(middleOf(feature.geometry), filters.area);
 }
 

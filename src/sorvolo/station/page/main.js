@@ -6,8 +6,8 @@ import { button, choice, dialog, el, field, fill, message, quiet, report, tick }
 import { Events } from "./events.js";
 import { LANGUAGES, say } from "./languages.js";
 import { showSites } from "./sites.js";
-import { votes } from "./votes.js";
-import { bytes, nameOf } from "./words.js";
+import { unsent, votes } from "./votes.js";
+import { bytes, nameOf, VERDICTS } from "./words.js";
 
 const main = document.getElementById("main");
 const title = document.getElementById("title");
@@ -76,7 +76,7 @@ function listen() {
   const show = () => {
     const state = station.events.state;
     linkState.className = state;
-    const { length } = votes.waiting;
+    const length = votes.waiting.length + unsent.all.length;
     fill(linkState, LINKS[state], length ? ` · ${say("{n} waiting", { n: length })}` : "");
     if (state !== "live") return;
     for (const each of document.querySelectorAll(".message.away")) each.remove();
@@ -84,6 +84,8 @@ function listen() {
   };
   show();
   votes.addEventListener("change", show);
+  votes.addEventListener("refused", ({ detail: { vote, problem } }) => message(say("This verdict was not taken: {why}", { why: problem.title }), { kind: "error",
+    todo: `${vote.site}, ${vote.id}: ${[VERDICTS[vote.verdict], vote.note].filter(Boolean).join(", ")}. ${problem.detail}`, act: screen?.refused?.(vote) ?? null }));
   station.events.addEventListener("state", show);
   station.events.addEventListener("reload", () => route());
   station.events.addEventListener("station.disk", ({ detail: { data } }) => disk(data));

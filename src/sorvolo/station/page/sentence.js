@@ -34,9 +34,9 @@ export const openOf = (...lists) => lists.flat().filter(({ properties: { review,
 
 /**
  * The parts of the sentence: {words, act, kind}. `link` is "live", "late" (kept answers are shown), "waiting" or "lost"; `loaded` "yes", "no" or "failed";
- * `runs` the site's missions, newest first; objects, changes and pod are ALL features, whatever a filter hides.
+ * `runs` the site's missions, newest first; objects, changes and pod are ALL features, whatever a filter hides; `now` by the station's clock, ms.
  */
-export function sentence({ link, loaded, runs, objects, changes, pod, versions, votes = 0, isLow = false, now = Date.now() }) {
+export function sentence({ link, loaded, runs, objects, changes, pod, versions, votes = 0, isLow = false, now = 0 }) {
   const parts = [];
   const tell = (words, act = null, kind = "") => parts.push({ words, act, kind });
   if (link !== "live") tell(say("{link}: this may be old", { link: LINKS[link] }), null, "warning");

@@ -5,16 +5,20 @@ import { button, el, fill } from "./dom.js";
 import { numeral, say } from "./languages.js";
 import { placeIn } from "./words.js";
 
-/** Copy text, also where the page is not secure and the browser has no clipboard for it. */
+export const NOT_COPIED = say("Not copied: the browser forbids it. Write it down, or take a photo of it.");
+
+/** Copy text, also where the page is not secure and the browser has no clipboard for it; whether it was copied. */
 export async function copy(text) {
   try {
     await navigator.clipboard.writeText(text);
+    return true;
   } catch {
     const box = el("textarea", { ".value": text, readonly: true });
     (document.querySelector("dialog[open]") ?? document.body).append(box);
     box.select();
-    document.execCommand("copy");
+    const isCopied = document.execCommand("copy");
     box.remove();
+    return isCopied;
   }
 }
 
@@ -32,8 +36,8 @@ export function handover(site, name, place, sigma_m = null) {
   const link = `${location.origin}/${placeUrl(site, place)}`;
   const done = el("span.soft", { role: "status" });
   const give = async (what, text) => {
-    await copy(text);
-    fill(done, say("{what} copied", { what }));
+    const is = await copy(text);
+    fill(done, is ? say("{what} copied", { what }) : [NOT_COPIED, el("pre", text)]); // else what was copied before would be sent
   };
   const send = async () => {
     const text = wordsOf(name, place, sigma_m, link);

@@ -1,11 +1,11 @@
 // The screen of one site: three rooms, Live, Findings and Compare; the map with its tools; the sentence of what is known.
 
-import { get, kept, roomUrl, siteUrl } from "./api.js";
+import { get, kept, now, roomUrl, siteUrl } from "./api.js";
 import { showStationMap } from "./base_map.js";
 import { choices } from "./choices.js";
 import { Compare } from "./compare.js";
 import { button, el, fill, message, press, quiet } from "./dom.js";
-import { Draw, loadDrawings } from "./draw.js";
+import { Draw, loadDrawings, sendDrawings } from "./draw.js";
 import { exportPanel } from "./exports.js";
 import { featureCard } from "./feature_card.js";
 import { ALL, chips } from "./filters.js";
@@ -92,7 +92,6 @@ class SiteScreen {
     this.on("review.changed", (data) => this.data.judge(data));
     this.hear(votes, "change", () => { this.data.expect(); this.data.changed(["changes", "objects"]); });
     this.hear(votes, "taken", ({ detail: { vote, answer } }) => { if (vote.site === this.data.id) this.data.judge(answer); });
-    this.hear(votes, "refused", ({ detail }) => this.refused(detail));
     this.hear(window, "dragover", (event) => event.preventDefault());
     this.hear(window, "drop", (event) => {
       event.preventDefault();
@@ -130,13 +129,12 @@ class SiteScreen {
     this.hear(this.station.events, type, ({ detail }) => { if (detail.site === this.data.id) listener(detail.data ?? {}, detail); }, during);
   }
 
-  /** A vote that the station does not take: what it has is shown again. */
-  refused({ vote, problem }) {
-    if (vote.site !== this.data.id) return;
-    const found = this.data.find(vote.id);
-    message(say("This verdict was not taken: {why}", { why: problem.title }), { kind: "error", todo: problem.detail,
-      act: found ? button(say("Show it"), () => (this.opened?.see ? this.opened.see(found) : this.data.choose(found))) : null });
+  /** A vote that the station does not take: what it has is shown again. Gives a button that shows what it was of. */
+  refused(vote) {
+    const found = vote.site === this.data.id && this.data.find(vote.id);
+    if (!found) return null;
     this.data.load([vote.kind === "change" ? "changes" : "objects"]).catch(() => {});
+    return button(say("Show it"), () => (this.opened?.see ? this.opened.see(found) : this.data.choose(found)));
   }
 
   async load() {
@@ -190,6 +188,7 @@ class SiteScreen {
   async look() {
     try {
       this.station.status = { ...this.station.status, ...await get(`/api/status?site=${encodeURIComponent(this.data.id)}`) };
+      sendDrawings(this);
       const others = this.station.status.present.filter((name) => name !== this.station.status.name);
       fill(this.people, others.length ? say("also here: {names}", { names: others.map(words.nameOf).join(", ") }) : "");
       if (this.closed || this.station.events.state !== "live") return;
@@ -203,7 +202,7 @@ class SiteScreen {
     if (this.closed) return;
     const { status, events } = this.station;
     const { objects, changes, pod } = this.data.all;
-    const parts = sentence({ link: events.state === "live" && this.isOld ? "late" : events.state, loaded: this.loaded, runs: this.runs, objects, changes, pod, versions: this.data.detail.versions, votes: votes.mine.length,
+    const parts = sentence({ link: events.state === "live" && this.isOld ? "late" : events.state, loaded: this.loaded, runs: this.runs, objects, changes, pod, versions: this.data.detail.versions, votes: votes.mine.length, now: now(),
       isLow: status.disk_floor_gb !== undefined && status.disk_free_gb < 2 * status.disk_floor_gb });
     const text = JSON.stringify(parts);
     if (text === this.told) return;

@@ -1,6 +1,6 @@
 // The start page: drones that send, with one button each; the sites; flights dropped on the page.
 
-import { ask, get, roomUrl, siteUrl } from "./api.js";
+import { ask, get, now, roomUrl, siteUrl } from "./api.js";
 import { button, dialog, el, field, fill, quiet, report } from "./dom.js";
 import { isWithin, tileColumn, tileRow } from "./places.js";
 import { DroneVideo } from "./video.js";
@@ -62,7 +62,7 @@ function siteAt(sites, telemetry) {
 function droneCard({ stream, telemetry }, video, sites, station) {
   const { latitude_deg: lat, longitude_deg: lon } = telemetry ?? {};
   const here = siteAt(sites, telemetry);
-  const site = here?.id ?? `${stream} ${new Date().toISOString().slice(0, 10)}`;
+  const site = here?.id ?? `${stream} ${new Date(now()).toISOString().slice(0, 10)}`;
   const fault = el("p.error", { role: "alert" });
   const start = async (event) => {
     const pressed = event.currentTarget;

@@ -24,34 +24,30 @@ export class Upload extends EventTarget {
 
   async send() {
     let url = stored.get(this.key);
-    let offset = url ? await this.offsetAt(url) : null;
-    if (offset === null) {
-      url = await this.create();
-      offset = 0;
-    }
+    let offset = null; // not known
     for (let tries = 0; ;) {
-      this.note(offset);
-      if (offset >= this.file.size) break;
       try {
+        if (offset === null && url) offset = await this.offsetAt(url);
+        if (offset === null) [url, offset] = [await this.create(), 0];
+        this.note(offset);
+        if (offset >= this.file.size) return await this.checked(url);
         offset = await this.piece(url, offset);
         tries = 0;
       } catch (problem) {
-        if (problem.name === "AbortError") throw problem;
         tries += 1;
         const isLost = ![0, 409, 423, 500, 502, 503, 504].includes(problem.status);
         if (isLost || tries > TRIES) throw problem;
+        offset = null;
         await pause(Math.min(500 * 2 ** tries, 15000));
-        offset = await this.offsetAt(url) ?? offset;
       }
     }
-    stored.set(this.key, null);
-    return this.checked(url);
   }
 
   /** Wait until the station looked into the file; the upload's id. Throws Problem where it refuses it. */
   async checked(url) {
     for (;;) {
       const { id, state, why, facts } = await (await send(url, { signal: this.stopped.signal })).json();
+      if (state === "refused" || state === "ready") stored.set(this.key, null);
       if (state === "refused") throw new Problem(415, say("{name} cannot be used", { name: this.file.name }), why);
       if (state === "ready" && facts?.missing_bytes) {
         message(say("{name} is cut: its last {size} are missing", { name: this.file.name, size: bytes(facts.missing_bytes) }), { kind: "warning", todo: say("What is there is used. Copy the video from the drone again to have all of it.") });
@@ -86,8 +82,8 @@ export class Upload extends EventTarget {
       const answer = await send(url, { method: "HEAD", headers: VERSION, signal: this.stopped.signal });
       return Number(answer.headers.get("upload-offset"));
     } catch (problem) {
-      if ([403, 404, 410].includes(problem.status)) stored.set(this.key, null);
-      else if (problem.status === 0 || problem.name === "AbortError") throw problem;
+      if (![403, 404, 410].includes(problem.status)) throw problem;
+      stored.set(this.key, null);
       return null;
     }
   }

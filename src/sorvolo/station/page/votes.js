@@ -1,7 +1,7 @@
-// Votes on their way: kept by this browser until the station has each of them, sent one by one in the order they were given.
+// Votes and drawings on their way: kept by this browser until the station has each of them; votes are sent one by one in the order they were given.
 
 import { post, siteUrl } from "./api.js";
-import { stored } from "./choices.js";
+import { KeptList } from "./choices.js";
 
 const KEPT = "sorvolo-votes";
 const LONGEST_WAIT_MS = 15000;
@@ -13,22 +13,18 @@ class Votes extends EventTarget {
     super();
     this.who = null; // who is logged in: votes of another person wait for that person
     this.wait_ms = 500;
-    this.memory = [];
+    this.kept = new KeptList(KEPT);
     addEventListener("online", () => this.send());
     addEventListener("storage", ({ key }) => { if (key === KEPT) this.changed(); });
   }
 
   /** All votes that the station does not have yet, the oldest first; those of other tabs, too. */
   get waiting() {
-    if (this.isFull) return this.memory;
-    try {
-      return JSON.parse(stored.get(KEPT)) ?? [];
-    } catch { return this.memory; }
+    return this.kept.all;
   }
 
   keep(list) {
-    this.memory = list;
-    this.isFull = !stored.set(KEPT, JSON.stringify(list)); // then they are kept as long as the page
+    this.kept.keep(list);
     this.changed();
   }
 
@@ -80,3 +76,6 @@ class Votes extends EventTarget {
 }
 
 export const votes = new Votes();
+
+/** New drawings that the station does not have yet: {site, who, feature}. */
+export const unsent = new KeptList("sorvolo-drawings");

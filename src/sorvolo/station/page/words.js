@@ -64,6 +64,8 @@ function said(iso, how, zone = " UTC", unknown = "–") {
 
 export const time = (iso) => said(iso, { dateStyle: "medium", timeStyle: "short" });
 export const clock = (iso) => said(iso, { timeStyle: "medium" });
+/** Its date as 2026-05-01, to be compared; "" where it is not known. */
+export const dateOf = (iso) => (iso ? new Date(iso).toLocaleDateString("sv-SE", { timeZone: choices.get("clock") === "utc" ? "UTC" : undefined }) : "");
 export const day = (iso) => said(iso, { dateStyle: "medium" }, "", say("undated"));
 
 const metres = (value, digits) => String(Math.round(value)).padStart(digits, "0");
