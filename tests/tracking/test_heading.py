@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from sorvolo.tracking.headings import CompassError, Heading, HeadingFromMotion
+from sorvolo.survey.flight import CameraPrior
+from sorvolo.tracking.headings import (
+    CompassError,
+    Heading,
+    HeadingFromMotion,
+    HeadingTurn,
+    heading_deg,
+)
 
 _M_PER_PX = 0.05
 
@@ -57,9 +64,8 @@ def test_a_straight_way_in_any_direction(heading_deg: float) -> None:
     way_m = np.outer(np.arange(60) * 0.5, [0.6, -0.8])  # the camera need not look where it flies
     reported = _fly(np.full(60, heading_deg), way_m)
     assert reported[3].sigma_deg == np.inf  # two metres are no way yet
-    assert (
-        _apart_deg(reported[-1].heading_deg, heading_deg) < 0.01 and reported[-1].sigma_deg == 4.0
-    )
+    assert _apart_deg(reported[-1].heading_deg, heading_deg) < 0.01
+    assert 4.0 < reported[-1].sigma_deg < 8.0  # fixes that wander by a metre on a way of 30 m
 
 
 def test_turns_are_followed() -> None:
@@ -91,7 +97,7 @@ def test_hovering_gives_nothing_and_a_cut_begins_anew() -> None:
     for number in range(60):
         place_m = np.array([0.0, 0.5 * number])
         last = finder.add(number / 10, _outline(0.0, place_m, 0.0, np.zeros(2)), place_m)
-    assert last.sigma_deg < 5
+    assert last.sigma_deg < 8
     finder.lose()
     assert (
         finder.add(
@@ -101,23 +107,20 @@ def test_hovering_gives_nothing_and_a_cut_begins_anew() -> None:
     )
 
 
-@pytest.mark.parametrize("off_deg", [-4.0, 0.0, 3.0])
-def test_a_wrong_compass_shows_in_the_way_that_the_ground_takes(off_deg: float) -> None:
-    """Of the slip that the heading makes a tracker's shift follows half, with noise."""
-    compass, random = CompassError(), np.random.default_rng(4)
-    camera_m, shift_m = np.zeros(2), np.zeros(2)
-    for frame in range(150):
-        step_m = 0.2 * 8.0 * np.array([np.cos(0.02 * frame), np.sin(0.02 * frame)])
-        camera_m = camera_m + step_m
-        left_rad = np.radians(off_deg - compass.clockwise_deg)
-        shift_m = shift_m + 0.5 * left_rad * np.array([-step_m[1], step_m[0]])
-        compass.add(0.2 * frame, camera_m, shift_m + random.normal(0, 0.05, 2))
-    assert abs(compass.clockwise_deg - off_deg) < max(0.5, 0.6 * abs(off_deg))
-    assert compass.clockwise_deg * off_deg >= 0
+@pytest.mark.parametrize("off_deg", [-12.0, 2.0, 8.0, 175.0])
+def test_a_wrong_compass_is_corrected_by_what_is_sure(off_deg: float) -> None:
+    """Noise of the stated size about a small error corrects less than it, about a large one nearly all."""
+    error, random = CompassError(), np.random.default_rng(4)
+    for _ in range(300):
+        error.add(HeadingTurn(-off_deg + random.normal(0, 2), 2.0), 0.2, anew=False)
+    prior = CameraPrior(np.zeros(3), np.ones(3), np.diag([1.0, -1.0, -1.0]), np.full(3, 5.0))
+    left_deg = off_deg + heading_deg(error.corrected(prior))
+    assert abs(left_deg) < (2.01 if abs(off_deg) <= 2 else 1.2)
+    assert error.sigma_deg == pytest.approx(2.0)
 
 
-def test_hovering_shows_nothing_of_the_compass() -> None:
-    compass, random = CompassError(), np.random.default_rng(5)
-    for frame in range(200):
-        compass.add(0.2 * frame, random.normal(0, 0.3, 2), random.normal(0, 1.0, 2))
-    assert abs(compass.clockwise_deg) < 0.5
+def test_a_compass_that_jumps_is_followed_at_once() -> None:
+    error = CompassError()
+    for turn_deg, anew in ((3.0, False), (4.0, False), (170.0, True)):
+        error.add(HeadingTurn(turn_deg, 2.0), 0.2, anew=anew)
+    assert error.turn.turn_deg == pytest.approx(170.0)

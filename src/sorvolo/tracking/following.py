@@ -8,12 +8,11 @@ import numpy as np
 
 from sorvolo.geometry.arrays import Floats, Mask, PointsM
 from sorvolo.geometry.ground import footprint
-from sorvolo.geometry.pose import Pose, rotation_from_vector
+from sorvolo.geometry.pose import Pose
 from sorvolo.survey.flight import CameraModel, CameraPrior, Frame
 from sorvolo.survey.objects import Detections, Sighting, Track
 from sorvolo.survey.wording import counted
 from sorvolo.tracking.headings import (
-    CompassError,
     HeadingCheck,
     HeadingFromPictures,
     contradiction,
@@ -96,7 +95,6 @@ class GroundFollower:
         self._tracker = Tracker(settings)
         self._heading = None if knows_heading else HeadingFromPictures()
         self._check = HeadingCheck() if knows_heading and is_video else None
-        self._compass = CompassError()
         self._path: list[Floats] = []
         self.unlocated: Counter[str] = Counter()
 
@@ -114,14 +112,9 @@ class GroundFollower:
         return self.unlocated[IMPOSSIBLE_SIZE]
 
     @property
-    def compass_clockwise_deg(self) -> float:
-        """How far too far clockwise the compass reads, by what stands."""
-        return self._compass.clockwise_deg
-
-    @property
     def turns_deg(self) -> Sequence[float]:
         """By how much, clockwise, headings of a video's frames were turned that were far off, a number each."""
-        return () if self._check is None else self._check.turns_deg
+        return () if self._check is None else self._check.error.turns_deg
 
     @property
     def contradiction(self) -> str:
@@ -178,8 +171,6 @@ class GroundFollower:
             footprint_m=located.outline_m,
         )
         if located.camera_m is not None:
-            if self._heading is None:
-                self._compass.add(located.time_ns / 1e9, located.camera_m, self._tracker.shift_m)
             if len(self._path) < _MOST_DRONE_PLACES:
                 self._path.append(located.camera_m)
         return _taken(located, update)
@@ -203,11 +194,8 @@ class GroundFollower:
         if self._heading is not None:
             return self._heading.take(frame, time_ns, found, prior, self._below_m(prior))
         if self._check is not None:
-            prior = self._check.take(frame, time_ns, found, prior, self._below_m(prior))
-        site_from_read = rotation_from_vector(
-            np.array([0.0, 0.0, np.radians(self._compass.clockwise_deg)])
-        )
-        return replace(prior, rotation=site_from_read @ prior.rotation)
+            return self._check.take(frame, time_ns, found, prior, self._below_m(prior))
+        return prior
 
     def _below_m(self, prior: CameraPrior) -> float:
         """The ground's height below the camera; 0 where it is not known."""

@@ -2,13 +2,13 @@
 
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import Floats, ImageRGB, Matrix3, PointsM, PointsPx
+from sorvolo.geometry.arrays import Floats, Matrix3, PointsM, PointsPx
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.ground import ground_from_pixels
 from sorvolo.geometry.homography import apply_homography
@@ -20,15 +20,9 @@ from sorvolo.tracking.image_motion import ImageMotion
 
 _WINDOW_S = 20.0  # of the way that is laid on the fixes
 _LEAST_M = 6.0  # of way, rms: less is within the fixes' own errors
-_LEAST_SIGMA_DEG = 4.0  # however well ways and pictures fit
+_WANDER_M = 1.0  # of the fixes' error along a way: it turns the way, and fits all the same
+_LEAST_SIGMA_DEG = 4.0  # however well two photos fit
 _STEPS_PER_ERROR = 8.0  # neighbouring fixes, and neighbouring frames' tilts, err alike
-
-_STRETCH_S = 2.0  # of the way that one check looks back
-_LEAST_WAY_M = 15.0  # a shorter one counts less: the fixes wander
-_GAIN_PER_S = 0.3  # of what is seen
-_LEARNS_S = 15.0  # after that the way back over the map moves the shift
-_MOST_DEG = 15.0  # corrected at most: a compass that is off by more is broken
-_BROKEN_S = 10.0  # a gap in time after which it begins anew
 
 
 @dataclass(frozen=True)
@@ -84,47 +78,10 @@ class HeadingFromMotion:
         reach_m = abs(turn) * spread_px
         miss_m = float(np.sqrt(np.mean(np.abs(fixes - turn * seen) ** 2)))
         count = max(1.0, len(seen) / _STEPS_PER_ERROR)
-        sigma_deg = float(np.degrees(np.arctan2(miss_m, reach_m * np.sqrt(count))))
+        aside_m = np.hypot(miss_m / np.sqrt(count), _WANDER_M)
+        sigma_deg = float(np.degrees(np.arctan2(aside_m, reach_m)))
         heading_deg = float(np.degrees(-np.angle(turn) + self._turned_rad)) % 360
-        sigma_deg = max(sigma_deg, _LEAST_SIGMA_DEG)
         return Heading(heading_deg, sigma_deg if reach_m > 2 * miss_m else float("inf"))
-
-
-class CompassError:
-    """How wrong a compass is, from what the ground seems to do while the camera flies over it; only `add` changes it.
-
-    Places laid with a heading that is wrong by an angle are turned about the camera; as it flies on, all that stands
-    seems to move sideways, by this angle times its way. A tracker takes that for the frames' common shift, of which it
-    follows a part: so the shift's way is held against the camera's and what they agree on is taken off bit by bit, less
-    and less: on the way back over a map that was begun with the wrong heading the shift shows nothing of the compass.
-    """
-
-    def __init__(self) -> None:
-        self.clockwise_deg, self._learnt_s = 0.0, 0.0
-        self._points: deque[tuple[float, Floats, Floats]] = deque()
-
-    def add(self, time_s: float, camera_m: Floats, shift_m: Floats) -> float:
-        """Take in one frame: where its camera was and the shift of its sightings, (2,) east and north.
-
-        Returns by how much the compass reads too far clockwise, as known by now, in degrees.
-        """
-        if self._points and not 0 <= time_s - self._points[-1][0] < _BROKEN_S:
-            self._points.clear()
-        self._points.append((time_s, camera_m, shift_m.copy()))
-        _, camera_before_m, shift_before_m = self._points[0]
-        way_m, slip_m = camera_m - camera_before_m, shift_m - shift_before_m
-        if time_s - self._points[0][0] < _STRETCH_S:
-            return self.clockwise_deg
-        self._points.popleft()
-        way_m2 = float(way_m @ way_m)
-        # against the fixes' own wander a short way shows little
-        seen_rad = float(way_m[0] * slip_m[1] - way_m[1] * slip_m[0]) / (way_m2 + _LEAST_WAY_M**2)
-        frame_s = time_s - self._points[-2][0] if len(self._points) > 1 else 0.0
-        gain = _GAIN_PER_S * min(frame_s, 1.0) * float(np.exp(-self._learnt_s / _LEARNS_S))
-        self._learnt_s += frame_s * way_m2 / (way_m2 + _LEAST_WAY_M**2)
-        change_deg = gain * float(np.degrees(seen_rad))
-        self.clockwise_deg = float(np.clip(self.clockwise_deg + change_deg, -_MOST_DEG, _MOST_DEG))
-        return self.clockwise_deg
 
 
 SeenPlace = tuple[int, int, complex, complex, float]
@@ -171,7 +128,8 @@ def contradiction(places: Sequence[SeenPlace], fx_px: float, *, knows_tilt: bool
         for shift_s in _SHIFTS_S:
             at_s = times_s + shift_s
             inside = (at_s >= times_s[0]) & (at_s <= times_s[-1])
-            misses_m.append(_miss_m(seen_m[inside], np.interp(at_s[inside], times_s, told_m)))
+            then_m = np.interp(at_s[inside], times_s, told_m)
+            misses_m.append(_miss_m(seen_m[inside], then_m) if len(then_m) > 4 else np.inf)
         best_s = float(_SHIFTS_S[int(np.argmin(misses_m))])
         gone_m = abs(np.interp(times_s + best_s, times_s, told_m) - told_m).mean()
         is_late = abs(best_s) >= _LATE_S and gone_m > (0.0 if knows_tilt else _TILT) * up_m
@@ -265,10 +223,10 @@ def is_checked(prior: CameraPrior) -> bool:
     return is_known and -float(prior.rotation[2, 2]) >= _LEAST_DOWN
 
 
-def is_wrong(shown: HeadingTurn, prior: CameraPrior, share: float = 1.0) -> bool:
-    """Whether a heading by telemetry is one that cannot be, where pictures show this turn; a `share` of it is enough."""
+def is_wrong(shown: HeadingTurn, prior: CameraPrior) -> bool:
+    """Whether a heading is one that cannot be, where pictures show this turn."""
     both_deg = float(np.hypot(shown.sigma_deg, prior.attitude_sigma_deg[2]))
-    return abs(shown.turn_deg) > share * max(_WRONG_DEG, _WRONG_SIGMAS * both_deg)
+    return abs(shown.turn_deg) > max(_WRONG_DEG, _WRONG_SIGMAS * both_deg)
 
 
 def heading_deg(prior: CameraPrior) -> float:
@@ -285,30 +243,72 @@ def turned(prior: CameraPrior, turn: HeadingTurn) -> CameraPrior:
     return replace(prior, rotation=rotation, attitude_sigma_deg=sigma_deg)
 
 
+_REMEMBERED_S = 20.0  # of what was shown; by choice
+
+
+@dataclass
+class CompassError:
+    """By how much headings by telemetry have to turn clockwise: the mean of what pictures showed lately.
+
+    A compass's errors have no known spread, so that a mean of T with a sigma of s is shrunk by what s alone explains: to
+    T (1 - s²/T²), or 0 (James and Stein's positive part). `turns_deg` are the turns of what was corrected.
+    """
+
+    turns_deg: list[float] = field(default_factory=list)
+    _shown: complex = 0j  # sums of turns, inverse variances and weights
+    _known: float = 0.0
+    _weight: float = 0.0
+
+    @property
+    def sigma_deg(self) -> float:
+        """How well it is known; infinite while nothing was shown."""
+        return float(np.sqrt(self._weight / self._known)) if self._weight else float("inf")
+
+    @property
+    def turn(self) -> HeadingTurn:
+        """The mean as it is."""
+        return HeadingTurn(float(np.degrees(np.angle(self._shown))), self.sigma_deg)
+
+    def add(self, shown: HeadingTurn, elapsed_s: float, *, anew: bool) -> None:
+        """Take in what a picture shows, so long after the last one; `anew` forgets those before."""
+        kept = 0.0 if anew else float(np.exp(-elapsed_s / _REMEMBERED_S))
+        weight = max(elapsed_s, _LEAST_ELAPSED_S) / shown.sigma_deg**2
+        self._shown = kept * self._shown + weight * np.exp(1j * np.radians(shown.turn_deg))
+        self._known = kept * self._known + weight / shown.sigma_deg**2
+        self._weight = kept * self._weight + weight
+
+    def corrected(self, prior: CameraPrior) -> CameraPrior:
+        """The prior, turned by what is sure."""
+        turn = self.turn
+        kept = 1 - (turn.sigma_deg / (abs(turn.turn_deg) + 1e-9)) ** 2
+        if kept <= 0:
+            return prior
+        self.turns_deg.append(kept * turn.turn_deg)
+        return turned(prior, HeadingTurn(kept * turn.turn_deg, turn.sigma_deg))
+
+
+_LEAST_ELAPSED_S = 0.1  # the first one weighs as much; by choice
 _TURNS_DEG_S = 20.0  # a drone that turns faster has its heading not checked; by choice
 _CLOCK_OFF_NS = 1_000_000_000  # by which telemetry's clock may be off: so long after a turn headings are not checked
-_OFF, _STILL_OFF = 0.6, 0.4  # of what makes a photo's heading wrong: 18 and 12 degrees; by choice
-_SURE_DEG = 1.5 * _LEAST_SIGMA_DEG  # a heading shown so well is not doubted; by choice
-_AHEAD_NS = 20 * 10**9  # so far a video is looked at for a heading, where the drone hovers
+_AHEAD_NS = 30 * 10**9  # so far a recording is looked at before it begins; by choice
+_SURE_DEG = 1.7  # a heading shown so well needs no further look ahead; by choice
+_FAR_OFF_DEG = 15.0  # what was placed before such a turn showed is doubted; by choice
 _JUMP_DEG = 60.0  # from one frame to the next, against the pictures' own turning; by choice
 
 
 class HeadingCheck:
-    """A video's headings held against the motion that its pictures show, where the camera looks about straight down.
+    """A video's headings corrected by the motion that its pictures show, where the camera looks about straight down.
 
-    A heading that cannot be (`heading_check.is_wrong`) is turned to what the pictures show, and the next ones by as
-    much until they show otherwise. While the drone turns nothing but a jump is judged: telemetry's clock may be off.
-    `turns_deg` are these turns, clockwise, one for each such frame; `unturned` are the detections that were placed
-    before the pictures showed a heading well, where what they then show is far off.
+    While the drone turns nothing but a jump is judged: telemetry's clock may be off. `unturned` are the detections that
+    were placed before the pictures showed a heading that is far off.
     """
 
     def __init__(self) -> None:
         self.pictures = HeadingFromPictures(over_guesses=False)
-        self._turn: HeadingTurn | None = None
+        self.error = CompassError()
         self._last: tuple[int, float, float] | None = None  # time, heading, turn, as last shown
         self._steady_ns = 0  # the drone turns until then
-        self.turns_deg: list[float] = []
-        self._is_sure, self._before, self.unturned = False, 0, 0
+        self._unjudged, self.unturned = 0, 0
 
     def look_ahead(
         self, coming: Iterable[tuple[Frame, CameraPrior]], below_m: Callable[[CameraPrior], float]
@@ -321,29 +321,28 @@ class HeadingCheck:
             if looks_aside or frame.time_ns - first_ns > _AHEAD_NS:
                 break
             ahead.take(frame, frame.time_ns, no_detections(()), prior, below_m(prior))
-            if ahead._is_sure:
+            if ahead.error.sigma_deg < _SURE_DEG:
                 break
-        self._turn = ahead._turn
+        self.error = replace(ahead.error, turns_deg=[])
 
     def take(
         self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior, below_m: float
     ) -> CameraPrior:
-        """The prior, turned where its heading is wrong; `below_m` is the ground's height."""
+        """The prior with its heading corrected; `below_m` is the ground's height."""
         shown = self.pictures.heading(frame, time_ns, found, prior, below_m)
         if not is_checked(prior):
             return prior
         if np.isfinite(shown.sigma_deg):
             self._judge(time_ns, shown, prior)
-        if self._turn is None:
-            self._before += 0 if self._is_sure else len(found)
-            return prior
-        if not self.turns_deg:
-            self.unturned = self._before
-        self.turns_deg.append(self._turn.turn_deg)
-        return turned(prior, self._turn)
+        turn = self.error.turn
+        if not np.isfinite(turn.sigma_deg):
+            self._unjudged += len(found)
+        elif not self.error.turns_deg and abs(turn.turn_deg) > max(_FAR_OFF_DEG, turn.sigma_deg):
+            self.unturned = self._unjudged
+        return self.error.corrected(prior)
 
     def _judge(self, time_ns: int, shown: Heading, prior: CameraPrior) -> None:
-        """Decide anew by how much headings have to turn, where the frame allows it."""
+        """Take in what a frame's way shows of the compass, where the frame allows it."""
         turn = HeadingTurn(shown.heading_deg - heading_deg(prior), shown.sigma_deg)
         now = (time_ns, shown.heading_deg, turn.turn_deg)
         (then_ns, *then_deg), self._last = self._last or now, now
@@ -352,29 +351,14 @@ class HeadingCheck:
         )
         if turned_deg * 1e9 > _TURNS_DEG_S * (time_ns - then_ns):
             self._steady_ns = time_ns + _CLOCK_OFF_NS
-        if time_ns >= self._steady_ns:
-            # a way is a better witness than two photos; and what is turned stays so where the next are nearly as far off
-            is_off = is_wrong(turn, prior, _OFF if self._turn is None else _STILL_OFF)
-            if self._turn is None or shown.sigma_deg < max(_SURE_DEG, self._turn.sigma_deg):
-                self._turn = turn if is_off else None
-            self._is_sure |= shown.sigma_deg < _SURE_DEG
-        elif jump_deg > _JUMP_DEG:  # no clock that is off does that
-            self._turn = turn if abs(turn.turn_deg) > _JUMP_DEG else None
+        has_jumped = jump_deg > _JUMP_DEG  # no clock that is off does that
+        if has_jumped or time_ns >= self._steady_ns:
+            self.error.add(turn, (time_ns - then_ns) / 1e9, anew=has_jumped)
 
 
 _MOST_SIGMA_DEG = 20.0  # a heading shown less well is not used; by choice
 # a photo that shows nothing shares its predecessor's error if their headings are as alike
 _ALIKE_DEG = 45.0
-
-
-@dataclass(frozen=True, eq=False)
-class _Last:
-    """The photo before: what is kept of it, its prior as telemetry has it, and turned right, and by how much."""
-
-    view: SmallView
-    prior: CameraPrior
-    right: CameraPrior
-    turn: HeadingTurn | None = None
 
 
 class PhotoHeadings:
@@ -384,41 +368,40 @@ class PhotoHeadings:
     whatever its heading. Where the new photo shows that place, the direction to it from the new camera must be the
     same: the turn about the vertical by which it is not is the heading's error. (Angles of a gimbal that are wrong by
     half a turn, for a whole strip, occur in real flights.) The first photo is held against the one after it, which
-    `see` is given before. `turns_deg` are the turns, clockwise, of the photos that were corrected.
+    `see` is given before.
     """
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
-        self._last: _Last | None = None
-        self.turns_deg: list[float] = []
+        self._last: tuple[int, SmallView, CameraPrior] | None = None
+        self._right: CameraPrior | None = None  # the last one's
+        self.error = CompassError()
 
-    def see(self, image: ImageRGB, prior: CameraPrior) -> None:
+    def see(self, frame: Frame, prior: CameraPrior) -> None:
         """Hold the next photo given to `take` against this one."""
-        self._last = _Last(small_view(image), prior, prior) if is_checked(prior) else None
+        self._last = None
+        if is_checked(prior):
+            self._last, self._right = (frame.time_ns, small_view(frame.image), prior), prior
 
-    def take(self, image: ImageRGB, prior: CameraPrior) -> CameraPrior:
-        """A photo's prior, with the heading that its picture shows where telemetry's is wrong, else as it is."""
-        if not is_checked(prior):
-            self._last = None
+    def take(self, frame: Frame, prior: CameraPrior) -> CameraPrior:
+        """A photo's prior, its heading corrected by what its picture and those before show."""
+        last, right = self._last, self._right
+        self.see(frame, prior)
+        if last is None or right is None or self._last is None:
             return prior
-        view = small_view(image)
-        turn = None if self._last is None else self._turn(view, prior, self._last)
-        right = prior
-        if turn is not None:
-            self.turns_deg.append(turn.turn_deg)
-            right = turned(prior, turn)
-        self._last = _Last(view, prior, right, turn)
-        return right
-
-    def _turn(self, view: SmallView, prior: CameraPrior, before: _Last) -> HeadingTurn | None:
-        """The turn of a photo that shows, or shares, a wrong heading; None where it stays as it is."""
-        here_from_before = second_from_first(before.view, view)
-        if here_from_before is None:
-            return _carried(before, prior)
-        shown = self._shown(prior, before.right, before.view.size_px, here_from_before)
-        if shown is None:
-            return _carried(before, prior)
-        return shown if is_wrong(shown, prior) else None
+        (then_ns, before, other), view = last, self._last[1]
+        here_from_before = second_from_first(before, view)
+        shown = None
+        if here_from_before is not None:
+            shown = self._shown(prior, right, before.size_px, here_from_before)
+        if shown is not None:
+            beside = HeadingTurn(shown.turn_deg - self.error.turn.turn_deg, shown.sigma_deg)
+            elapsed_s = abs(frame.time_ns - then_ns) / 1e9
+            self.error.add(shown, elapsed_s, anew=is_wrong(beside, prior))
+        elif abs(HeadingTurn(heading_deg(prior) - heading_deg(other), 0).turn_deg) > _ALIKE_DEG:
+            return prior
+        self._right = self.error.corrected(prior)
+        return self._right
 
     def _shown(
         self,
@@ -449,18 +432,6 @@ class PhotoHeadings:
     def _on_ground(self, pixels: PointsPx, prior: CameraPrior) -> PointsM:
         """(2,) where a pixel, (1, 2), lies on the level ground."""
         return ground_from_pixels(self._camera, Pose(prior.rotation, prior.position_m), pixels)[0]
-
-
-def _carried(before: _Last, prior: CameraPrior) -> HeadingTurn | None:
-    """The turn of the photo before, for one with about the same heading by telemetry: it is wrong by the same."""
-    if before.turn is None:
-        return None
-    cosine = (np.trace(before.prior.rotation.T @ prior.rotation) - 1) / 2
-    if np.degrees(np.arccos(np.clip(cosine, -1, 1))) > _ALIKE_DEG:
-        return None
-    return HeadingTurn(
-        before.turn.turn_deg, float(np.hypot(before.turn.sigma_deg, prior.attitude_sigma_deg[2]))
-    )
 
 
 def _bearing_deg(east_north_m: PointsM) -> float:

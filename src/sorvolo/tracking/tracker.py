@@ -151,11 +151,6 @@ class Tracker:
             merged,
         )
 
-    @property
-    def shift_m(self) -> PointsM:
-        """(2,) how far sightings now lie beside their places in the map."""
-        return self._shift.mean_m
-
     def tracks(self) -> list[Track]:
         """All tracks as they are known now, tentative ones as well, in order of their ids."""
         return [each.track(self._shift.variance_m2(each.id)) for each in self._followed]

@@ -81,7 +81,7 @@ def over_heights(
     return setup, ground_m
 
 
-_COMPASS_REPORTED_DEG = 2.0  # by which a compass is off: less is not worth a notice; by choice
+_COMPASS_REPORTED_DEG = 5.0  # by which headings are off: less is not worth a notice; by choice
 _AHEAD_STEP_S = 0.2  # between frames that are looked at before the watch
 CONTRADICTED = "telemetry_contradicted"
 _OF_MAPS = (
@@ -186,9 +186,9 @@ class GroundPlaces(Places):
                 self.follower.look_ahead(self._coming(frame))
             else:  # its heading is held against the photo after it
                 for after, its_prior in islice(self._coming(frame), 1):
-                    self._headings.see(after.image, its_prior)
+                    self._headings.see(after, its_prior)
         if self._headings is not None:
-            prior = self._headings.take(frame.image, prior)
+            prior = self._headings.take(frame, prior)
         self._taken = frame.index, prior
         return self.follower.take(frame, time_ns, found, prior)
 
@@ -214,20 +214,16 @@ class GroundPlaces(Places):
             height = f"{track.height_kind}, over the height model's ground"
         text = f"places come from the telemetry's position, height ({height}) and {how}"
         found.append(Notice("placed_by", 1, text))
-        if turns_deg := (self._headings or follower).turns_deg:
+        turns_deg = self._headings.error.turns_deg if self._headings else follower.turns_deg
+        if turns_deg and (off_deg := median(map(abs, turns_deg))) > _COMPASS_REPORTED_DEG:
             text = (
-                f"headings about {median(map(abs, turns_deg)):.0f} degrees off, as the pictures show: corrected in "
+                f"headings about {off_deg:.0f} degrees off, as the pictures show: corrected in "
                 f"{counted(len(turns_deg), 'picture')}"
             )
             found.append(Notice("headings_wrong", len(turns_deg), text))
         if why_not := follower.contradiction:
             text = f"the pictures' motion contradicts the telemetry: {why_not}"
             found.append(Notice(CONTRADICTED, 1, text))
-        clockwise_deg = follower.compass_clockwise_deg
-        if abs(clockwise_deg) > _COMPASS_REPORTED_DEG:
-            side = "clockwise" if clockwise_deg > 0 else "counter-clockwise"
-            text = f"the compass reads about {abs(clockwise_deg):.0f} degrees too far {side}: corrected by what stands"
-            found.append(Notice("compass_off", 1, text))
         for reason, count in follower.unlocated.most_common():
             if reason != IMPOSSIBLE_SIZE:
                 text = f"{counted(count, 'detection')} without a place on the ground: {reason}"
