@@ -46,7 +46,7 @@ from sorvolo.station.events import NewEvent
 from sorvolo.station.messages import Hello, Kind, Message, MessageSample
 from sorvolo.station.runs import Run
 from sorvolo.station.sites import site_summary
-from sorvolo.station.tokens import make_token
+from sorvolo.station.tokens import make_token, revoke_token
 from sorvolo.store.exports.change_files import crop_names
 from sorvolo.store.images import jpeg_from_image, png_from_rgba
 from sorvolo.store.site.archive import Archive
@@ -543,6 +543,12 @@ def test_a_reload_in_the_field_shows_what_was_known_and_keeps_verdicts(
         page.reload(wait_until="commit")  # now by way of the worker, which keeps what comes
         page.locator(KNOWN).wait_for()
         page.wait_for_load_state("networkidle")
+        page.locator("#rooms [data-panel=findings]").click()
+        taken = page.locator(".strip button.open").last.get_attribute("data-id")
+        page.locator(f".strip button[data-id='{taken}']").click()
+        with page.expect_response(re.compile("collections/findings")):
+            page.keyboard.press("c")
+        page.wait_for_load_state("networkidle")
         link.cut()
         page.reload(wait_until="commit")
         page.locator(KNOWN).wait_for()
@@ -550,7 +556,7 @@ def test_a_reload_in_the_field_shows_what_was_known_and_keeps_verdicts(
         mark = "fetch('/api/sites/field').then(each => each.headers.get('x-kept'))"
         assert page.evaluate(mark) == "1"
         page.locator("#rooms [data-panel=findings]").click()
-        page.locator(".strip button").first.wait_for()
+        page.locator(f".strip button.confirmed[data-id='{taken}']").wait_for()
         chosen = page.locator(".strip [aria-current]").get_attribute("data-id")
         page.keyboard.press("c")
         expect(page.locator("#link-state")).to_contain_text("1 in attesa")
@@ -2154,6 +2160,18 @@ def test_a_station_with_tokens_asks_who_comes(
         page.clock.fast_forward(5500)
         page.wait_for_timeout(300)
         expect(page.get_by_label("Token")).to_have_count(0)
+        page.get_by_role("button", name="Log in").click()
+        page.get_by_label("Token").fill(token)
+        page.get_by_role("dialog").get_by_role("button", name="Log in").click()
+        page.locator(".card a").click()
+        page.locator(KNOWN).wait_for()
+        revoke_token(station.station.state, "Ann")
+        page.clock.fast_forward(11_000)
+        page.get_by_label("Token").wait_for()
+        page.keyboard.press("Escape")  # nothing of the site stays on the screen
+        page.get_by_text("You are not logged in").wait_for()
+        for each in ("#sentence", "#title", "#rooms", "#messages"):
+            expect(page.locator(each)).to_be_empty()
         assert [each for each in watched.faults if "401" not in each] == []
         page.context.close()
 

@@ -139,13 +139,13 @@ export class Live {
     this.screen.goTo(feature);
   }
 
-  /** A person was found, by whatever mission: one banner, which stays until it is closed. */
+  /** A person was found, by whatever mission: one banner for each mission, which stays until it is closed. */
   person(feature, local, run) {
     const mission = this.of(run);
     mission.people = (mission.people ?? 0) + 1;
-    this.banner?.remove();
+    mission.banner?.remove(); // another mission's stays: it is of another flight
     const place = local || !feature.geometry ? say("without a place on Earth") : words.place(middleOf(feature.geometry));
-    this.banner = message(mission.people > 1 ? say("{n} people found, the last:", { n: mission.people }) : say("Person found"), { kind: "alert person", todo: place,
+    mission.banner = message(mission.people > 1 ? say("{n} people found, the last:", { n: mission.people }) : say("Person found"), { kind: "alert person", todo: place,
       act: local || !feature.geometry ? null : button(say("Show"), () => this.showFound(watched(feature, run))) });
     if (choices.get("sound")) beep();
   }

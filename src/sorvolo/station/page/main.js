@@ -171,6 +171,7 @@ function showLogin() {
     declined = true;
     screen?.close?.();
     screen = null;
+    for (const each of [rooms, title, known, document.getElementById("messages")]) fill(each); // nothing of the sites stays
     blank(say("You are not logged in"), say("This station shows its sites to those who have a token."), button(say("Log in"), showLogin, { class: "main" }));
   });
   input.focus();

@@ -9,7 +9,7 @@ import { thereOf } from "./sentence.js";
 import { cropsOf, newestFirst, peopleFirst } from "./site_data.js";
 import { mayNot } from "./sites.js";
 import { Upload } from "./upload.js";
-import { bytes, clock, dateOf, duration, nameOf, time } from "./words.js";
+import { bytes, clock, dateOf, day, duration, nameOf, time } from "./words.js";
 import { zipOfFiles } from "./zip.js";
 
 const KINDS = {
@@ -52,7 +52,7 @@ export class Missions {
     if (state === this.told) return;
     this.told = state;
     fill(this.finds, found.map((each) => el("li", button([cropsOf(each).length ? picture(cropsOf(each).at(-1), "") : null,
-      el("span.name", badge(each), titleOf(each), el("span.soft", each.properties.first_seen ? ` ${(dateOf(each.properties.first_seen) === dateOf(now()) ? clock : time)(each.properties.first_seen)}` : ""))], () => this.screen.live.showFound(each), { data: { id: each.id } }))));
+      el("span.name", badge(each), titleOf(each), el("span.soft", each.properties.first_seen ? ` ${(dateOf(each.properties.first_seen) === dateOf(now()) ? clock : day)(each.properties.first_seen)}` : ""))], () => this.screen.live.showFound(each), { data: { id: each.id } }))));
   }
 
   form() {

@@ -29,6 +29,7 @@ const TOOLS = { layers: [say("Layers"), layersPanel, "layers"], measure: [say("M
 const ALL_PANELS = { ...ROOMS, ...TOOLS };
 const STOPS = ["half", "full", "peek"]; // of the sheet that a panel is on a phone
 const STATUS_MS = 10000;
+const RENEW_MS = 1500; // after the last verdict
 
 /** Show a site; gives what closes it. */
 export async function showSite(frame, station, id, view, at = null) {
@@ -89,9 +90,9 @@ class SiteScreen {
     this.on("run.progress", (data, { run }) => { const found = this.runs.find(({ id }) => id === run); if (found) { found.progress = data; this.opened?.running?.(); this.tell(); } });
     this.on("site.gone", () => this.gone());
     this.hear(events, "state", ({ detail }) => { if (detail === "live") this.check(); this.tell(); });
-    this.on("review.changed", (data) => this.data.judge(data));
+    this.on("review.changed", (data) => { this.data.judge(data); this.renew(); });
     this.hear(votes, "change", () => { this.data.expect(); this.data.changed(["changes", "objects"]); });
-    this.hear(votes, "taken", ({ detail: { vote, answer } }) => { if (vote.site === this.data.id) this.data.judge(answer); });
+    this.hear(votes, "taken", ({ detail: { vote, answer } }) => { if (vote.site === this.data.id) { this.data.judge(answer); this.renew(); } });
     this.hear(window, "dragover", (event) => event.preventDefault());
     this.hear(window, "drop", (event) => {
       event.preventDefault();
@@ -170,7 +171,8 @@ class SiteScreen {
     const before = kept.answers;
     try {
       await load();
-      Object.assign(this, { loaded: "yes", isOld: kept.answers > before });
+      this.loaded = "yes";
+      this.data.isOld = kept.answers > before;
     } catch (problem) {
       this.loaded = "failed";
       throw problem;
@@ -193,8 +195,15 @@ class SiteScreen {
       fill(this.people, others.length ? say("also here: {names}", { names: others.map(words.nameOf).join(", ") }) : "");
       if (this.closed || this.station.events.state !== "live") return;
       if (this.station.status.name !== votes.who) location.reload(); // another tab changed it
-      if (this.loaded === "failed" || this.isOld) await this.reload();
+      if (this.loaded === "failed" || this.data.isOld) await this.reload();
     } catch { /* the sentence states it */ }
+  }
+
+  /** What was judged goes into what the service worker keeps, too: a reload without the station shows it. */
+  renew() {
+    if (!navigator.serviceWorker?.controller) return;
+    clearTimeout(this.renewing);
+    this.renewing = setTimeout(() => { for (const name of ["objects", "changes"]) this.data.ask(name).catch(() => {}); }, RENEW_MS);
   }
 
   /** State what is known, in a sentence whose parts lead to it. */
@@ -202,7 +211,7 @@ class SiteScreen {
     if (this.closed) return;
     const { status, events } = this.station;
     const { objects, changes, pod } = this.data.all;
-    const parts = sentence({ link: events.state === "live" && this.isOld ? "late" : events.state, loaded: this.loaded, runs: this.runs, objects, changes, pod, versions: this.data.detail.versions, votes: votes.mine.length, now: now(),
+    const parts = sentence({ link: events.state === "live" && this.data.isOld ? "late" : events.state, loaded: this.loaded, runs: this.runs, objects, changes, pod, versions: this.data.detail.versions, votes: votes.mine.length, now: now(),
       isLow: status.disk_floor_gb !== undefined && status.disk_free_gb < 2 * status.disk_floor_gb });
     const text = JSON.stringify(parts);
     if (text === this.told) return;
@@ -345,6 +354,7 @@ class SiteScreen {
 
   close() {
     this.closed = true;
+    clearTimeout(this.renewing);
     this.opened?.close?.();
     this.live.close();
     this.video.close();

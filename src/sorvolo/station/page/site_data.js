@@ -1,6 +1,6 @@
 // The data of one site in the page: features as loaded and as live events change them, filters, what is chosen.
 
-import { features, get, siteUrl } from "./api.js";
+import { features, get, kept, siteUrl } from "./api.js";
 import { ALL, passing } from "./filters.js";
 import { votes } from "./votes.js";
 
@@ -16,20 +16,27 @@ export class SiteData extends EventTarget {
     this.filters = { ...ALL };
     this.chosen = null;
     this.turns = {}; // of loading, by name: an answer that a later one has overtaken is not shown
+    this.isOld = false; // something of it was kept by the service worker, and not the station's answer
     this.versions = null; // [from, to] of a comparison that narrows the changes
   }
 
   async load(names = NAMES) {
+    const before = kept.answers;
     await Promise.all(names.map(async (name) => {
       const mine = this.turns[name] = (this.turns[name] ?? 0) + 1;
-      const kept = (await features(this.id, name === "objects" ? "findings" : name)).filter(({ properties }) => properties.class !== "thing"); // that is among the changes
+      const stated = (await this.ask(name)).filter(({ properties }) => properties.class !== "thing"); // that is among the changes
       if (mine !== this.turns[name]) return;
-      for (const { properties } of kept) if (properties.review === "none") properties.review = null; // withdrawn: open again
-      const watched = this.all[name].filter((each) => each.properties.watched && !kept.some((other) => isOf(other, each.id)));
-      this.all[name] = [...kept, ...watched]; // what a running watch has just found is not in its file yet
+      for (const { properties } of stated) if (properties.review === "none") properties.review = null; // withdrawn: open again
+      const watched = this.all[name].filter((each) => each.properties.watched && !stated.some((other) => isOf(other, each.id)));
+      this.all[name] = [...stated, ...watched]; // what a running watch has just found is not in its file yet
     }));
+    this.isOld ||= kept.answers > before;
     this.expect();
     this.changed(names);
+  }
+
+  ask(name) {
+    return features(this.id, name === "objects" ? "findings" : name);
   }
 
   async loadDetail() {

@@ -121,10 +121,10 @@ async function showDeletion(site) {
 }
 
 /** What stands in the place of what a person may not do. */
-export const mayNot = (role = "operator") => el("p.note", role === "operator" ? say("View only. Ask the team lead for operator access.") : say("View only. Ask the team lead for reviewer access."));
+export const mayNot = (role = "operator") => el("p.note", role === "operator" ? say("To start missions, ask the team lead for operator access.") : say("View only. Ask the team lead for reviewer access."));
 
-/** A site as its list and title name it: its folder below the root. */
-export const siteName = (site) => (site.id.includes(":") ? site.id.replaceAll(":", " / ") : site.name);
+/** A site as its list and title name it: its folder below the root, since two may have been made under one name. */
+export const siteName = ({ id }) => id.replaceAll(":", " / ");
 
 /** The tiles over the site's box, laid so that the box fills the picture. */
 function preview(site) {
