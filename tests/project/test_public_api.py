@@ -102,3 +102,34 @@ def test_errors_name_arguments_in_python_and_options_in_commands(
 def test_no_error_of_python_asks_for_an_option() -> None:
     with pytest.raises(sorvolo.SettingsError, match=r"\(every\) or .*\(frames_per_second\)"):
         sorvolo.WatchSettings(every=2, frames_per_second=3)
+
+
+def test_what_cannot_be_is_named_and_nothing_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    picture = np.zeros((48, 64, 3), np.uint8)
+    seconds = [(0.0, picture), (1.5, picture)]  # as nanoseconds 0 and 1
+    car = sorvolo.WatchSettings(classes="car")  # type: ignore[arg-type]
+    flight = sorvolo.frames([(0, picture), (10**9, picture)])
+    for work, words in (
+        (lambda: sorvolo.frames(seconds), "give pairs of a time, whole nanoseconds"),
+        (lambda: sorvolo.frames([picture, picture]), "give pairs of a time"),
+        (lambda: sorvolo.map_flights(picture, "site").result(), "ndarray is no input"),
+        (lambda: sorvolo.watch([None]).result(), "a NoneType is no input"),
+        (lambda: sorvolo.watch(flight, detector="default").result(), "'default' is no detector"),
+        (lambda: sorvolo.watch(flight, car).result(), r"give several: \('car',\)"),
+        (lambda: sorvolo.Archive.open("nowhere", write=False), "no site at nowhere"),
+    ):
+        with pytest.raises(sorvolo.SorvoloError, match=words) as raised:
+            work()
+        assert "--" not in str(raised.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_report_of_an_unknown_flight_is_none(tmp_path: Path) -> None:
+    with (
+        sorvolo.Archive.open(tmp_path / "site", write=True) as archive,
+        pytest.raises(sorvolo.StoreError, match="has no flight 'nope', only none"),
+    ):
+        archive.report("nope")

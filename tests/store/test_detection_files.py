@@ -132,7 +132,7 @@ def test_lines_become_points(tmp_path: Path) -> None:
         lines.append([])
     rows = [json.loads(line) for line in (tmp_path / "detections.jsonl").read_text().splitlines()]
     assert rows[0] == {
-        "frame": "3",
+        "frame": 3,
         "time": "2026-05-28T20:26:40.000000Z",
         "class": "person",
         "score": 0.8123,

@@ -94,6 +94,7 @@ def test_files_of_a_flight_and_of_the_site(tmp_path: Path) -> None:
     assert list(own) == list(whole) == ["a-o1", "a-o2"]
     assert own["a-o1"]["class"] == "car"
     assert own["a-o2"]["length_m"] is None
+    assert own["a-o1"]["best_frame"] == 3  # as frames.geojson numbers a video's
     assert whole["a-o1"]["east_m"] == 3.0
     assert own["a-o1"]["first_seen"] == "2023-11-14T22:13:20.000000Z"
     north = json.loads((tmp_path / "objects.geojson").read_text())["features"][0]["geometry"][

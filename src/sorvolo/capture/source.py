@@ -1,6 +1,7 @@
 """Inputs as flights: what a mission receives for each video, folder of photos or set of photos."""
 
 import hashlib
+import operator
 import os
 import re
 import threading
@@ -256,7 +257,14 @@ def frames(
 
     Example: `map_flights(frames([(time_ns, image), ...], camera="aov=78.8", telemetry="log.csv"), "site")`
     """
-    kept = [(int(time_ns), np.ascontiguousarray(image)) for time_ns, image in pictures]
+    try:
+        kept = [
+            (operator.index(time_ns), np.ascontiguousarray(image)) for time_ns, image in pictures
+        ]
+    except (TypeError, ValueError) as error:  # seconds among them, which would be cut to whole ones
+        raise InputError(
+            f"{name}: {error}; give pairs of a time, whole nanoseconds, and a picture"
+        ) from error
     sizes = {image.shape for _, image in kept}
     if any(each.dtype != np.uint8 for _, each in kept) or {(*s[:2], 3) for s in sizes} != sizes:
         raise InputError(f"{name}: the frames are no RGB pictures: give uint8 (height, width, 3)")
@@ -282,7 +290,12 @@ def frames(
 
 def demand_inputs(inputs: Iterable[Any]) -> None:
     """Raise InputError for an input that is neither there, nor a live source's address, nor a package's or a program's."""
-    for text in (str(each) for each in inputs if not isinstance(each, GivenFrames)):
+    for given in (each for each in inputs if not isinstance(each, GivenFrames)):
+        if not isinstance(given, str | os.PathLike):
+            raise InputError(
+                f"a {type(given).__name__} is no input; give a path, an address or `sorvolo.frames`"
+            )
+        text = str(given)
         is_there = text and (Path(text).is_file() or Path(text).is_dir())
         if not (is_there or is_live_address(text) or text.partition(":")[0] in added("sources")):
             raise InputError(_nothing_at(text))

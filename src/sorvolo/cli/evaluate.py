@@ -2,7 +2,7 @@
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.table import Table
@@ -255,25 +255,13 @@ def _show_masks(console: Console, flight: str, masks: "MaskScores") -> None:
 
 def _show_events(console: Console, flight: str, scores: "EventScores", map_shift_m: float) -> None:
     table = Table("events", "to find", "found", "named right", "late", "reported twice", "false")
-    for name, kind in scores.by_kind.items():
+    rows: dict[str, Any] = {**scores.by_kind, "all": scores}
+    for name, kind in rows.items():
         numbers = kind.must_find, kind.found, kind.named_right, kind.late, kind.twice, kind.false
-        if any(numbers):
+        if kind is scores:
+            table.add_section()
+        if any(numbers) or kind is scores:
             table.add_row(name, *map(str, numbers))
-    table.add_section()
-    table.add_row(
-        "all",
-        *map(
-            str,
-            (
-                scores.must_find,
-                scores.found,
-                scores.named_right,
-                scores.late,
-                scores.twice,
-                scores.false,
-            ),
-        ),
-    )
     console.print(table)
     console.print(
         f"{flight}: found {_share(scores.found_share)}; {scores.false_per_hectare:.2f} false per hectare "

@@ -1,7 +1,7 @@
 """`sorvolo models`: the detection models that are installed."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -9,7 +9,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from sorvolo.cli.options import AsJson, argument, option
+from sorvolo.cli.options import AsJson, argument, names, option
 from sorvolo.cli.printing import FAILED, Console, facts_table, new_table, print_json
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.paths import Json, JsonView
@@ -46,18 +46,9 @@ def list_models(
     if as_json:
         print_json(rows)
         return
-    _show_rows([row for row in rows if "error" not in row])
-    for row in rows:
-        if "error" in row:  # below the table: no column is wide enough for the reason
-            typer.echo(f"{row['name']} cannot be used: {row['error']}")
-    if not rows:
-        typer.echo(f"no models are installed; put your own into {models_folder()}")
-    _show_hidden()
-
-
-def _show_rows(rows: Sequence[JsonView]) -> None:
+    sound = [row for row in rows if "error" not in row]
     table = new_table("name", "preset", "classes", "light", "numbers", "MB", "file")
-    for row in rows:
+    for row in sound:
         table.add_row(
             escape(row["name"]),
             escape(row["preset"]),
@@ -67,8 +58,14 @@ def _show_rows(rows: Sequence[JsonView]) -> None:
             f"{row['bytes'] / 1e6:.1f}",
             "with the package" if row["is_packaged"] else escape(row["path"]),
         )
-    if rows:
+    if sound:
         Console().print(table)
+    for row in rows:
+        if "error" in row:  # below the table: no column is wide enough for the reason
+            typer.echo(f"{row['name']} cannot be used: {row['error']}")
+    if not rows:
+        typer.echo(f"no models are installed; put your own into {models_folder()}")
+    _show_hidden()
 
 
 def _show_hidden() -> None:
@@ -189,8 +186,7 @@ def import_file(
     from sorvolo.detection.models import import_model
     from sorvolo.detection.session import read_info
 
-    named = [each.strip() for each in classes.split(",") if each.strip()] or None
-    known = import_model(file, name, layout, named)
+    known = import_model(file, name, layout, names(classes) or None)
     info = read_info(known.path)
     asked = f"; with --classes also: {', '.join(info.on_request)}" if info.on_request else ""
     typer.echo(

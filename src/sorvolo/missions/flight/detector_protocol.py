@@ -149,7 +149,11 @@ class PlainDetector:
 
 
 def as_detector(given: FindsObjects) -> ObjectDetector:
-    """A detector as missions use it; of what has `detect` alone, a `PlainDetector`."""
+    """A detector as missions use it; of what has `detect` alone, a `PlainDetector`. Raises SettingsError for others."""
+    if not hasattr(given, "detect"):
+        raise SettingsError(
+            f"{given!r} is no detector: it has no `detect`; give for instance sorvolo.Detector.load()"
+        )
     if hasattr(given, "info"):
         return cast(ObjectDetector, given)
     return PlainDetector(given)

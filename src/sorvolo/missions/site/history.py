@@ -142,18 +142,6 @@ def export_version(
     Returns the version. Raises SettingsError for another ending, InputError when there was no map, its flight has no
     heights or the file's folder does not exist, StoreError on a full disk.
     """
-    _check_target(path)
-    with Archive.open(site, write=False) as archive:
-        complete = archive.versions()
-        if not complete:
-            raise InputError(f"{site} has no map yet; map a flight into it first")
-        version = complete[-1] if at is None else find_version(archive, at)
-        _write_map(archive, version, path, compress)
-    return version
-
-
-def _check_target(path: Path) -> None:
-    """Raises SettingsError or InputError where no map can be written to the path."""
     if path.suffix.lower() not in _ENDINGS:
         raise SettingsError(
             f"{path.name}: the map is written as .tif, .png, .kmz, .mbtiles or .pdf, its heights as .laz; give a name with such an ending"
@@ -164,6 +152,13 @@ def _check_target(path: Path) -> None:
         )
     if path.is_dir():
         raise InputError(f"{path} is a folder, a file was needed; choose another name")
+    with Archive.open(site, write=False) as archive:
+        complete = archive.versions()
+        if not complete:
+            raise InputError(f"{site} has no map yet; map a flight into it first")
+        version = complete[-1] if at is None else find_version(archive, at)
+        _write_map(archive, version, path, compress)
+    return version
 
 
 def _write_map(archive: Archive, version: VersionEntry, path: Path, compress: str) -> None:

@@ -16,7 +16,7 @@ from sorvolo.build import build
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.stream import LiveStream
 from sorvolo.capture.source import LiveSource, Source, demand_inputs, open_sources
-from sorvolo.errors import InputError, SettingsError, SorvoloWarning
+from sorvolo.errors import InputError, SorvoloWarning
 from sorvolo.geometry.arrays import ImageGray, PointsM
 from sorvolo.missions.flight.detector_protocol import (
     FindsObjects,
@@ -24,6 +24,7 @@ from sorvolo.missions.flight.detector_protocol import (
     as_detector,
     load_detector,
 )
+from sorvolo.missions.flight.map_objects import check_classes
 from sorvolo.missions.flight.request import live_request, request_of
 from sorvolo.missions.flight.result_cache import ResultCache, go_on
 from sorvolo.missions.flight.settings import MapSettings
@@ -169,10 +170,7 @@ def _checked_detector(
         check_host(cot_place(outputs.cot))
         outputs.cot_tls.context()
     finder = load_detector(settings.model) if detector is None else as_detector(detector)
-    if unknown := sorted(set(settings.classes) - set(finder.classes)):
-        raise SettingsError(
-            f"the model knows no {unknown[0]!r}; it knows {', '.join(finder.classes)}"
-        )
+    check_classes(finder, settings.classes)
     return finder
 
 

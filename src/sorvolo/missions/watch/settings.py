@@ -45,13 +45,6 @@ class WatchSettings:
             raise SettingsError(f"the least score must lie in 0 to 1, got {self.least_score}")
         if isinstance(self.tiles, int) and not 64 <= self.tiles <= 16_384:
             raise SettingsError(f"tiles must be 64 to 16384 px wide, got {self.tiles}")
-        self._check_frames()
-        check_enough(self.enough_looked_at)
-        if self.height_model and self.ground_elevation_m is not None:
-            raise SettingsError("give a height model or the ground's elevation, not both")
-        check_telemetry(self.offset_s, self.ground_elevation_m)
-
-    def _check_frames(self) -> None:
         if self.every is not None and self.frames_per_second is not None:
             raise SettingsError(
                 "give every N-th frame (--every) or this many frames a second (--fps), not both"
@@ -62,6 +55,10 @@ class WatchSettings:
             raise SettingsError(
                 f"frames a second must lie in 0.001 to 1000, got {self.frames_per_second}"
             )
+        check_enough(self.enough_looked_at)
+        if self.height_model and self.ground_elevation_m is not None:
+            raise SettingsError("give a height model or the ground's elevation, not both")
+        check_telemetry(self.offset_s, self.ground_elevation_m)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,14 @@ from sorvolo.geometry.arrays import Boxes, Floats, ImageGray, ImageRGB, Mask
 from sorvolo.geometry.polygons import signed_area
 from sorvolo.store.atomic import atomic_write_bytes, make_folder
 from sorvolo.store.exports.places import Placemark, place_deg, ring
-from sorvolo.store.exports.plain import feature, feature_collection, rounded, time_words, utc_text
+from sorvolo.store.exports.plain import (
+    feature,
+    feature_collection,
+    frame_number,
+    rounded,
+    time_words,
+    utc_text,
+)
 from sorvolo.store.images import png_from_rgba
 from sorvolo.store.site.change_records import StoredChange, StoredObject, grouped_changes
 from sorvolo.survey.findings import Change, Verdict
@@ -290,7 +297,7 @@ def _feature_object(stored: StoredObject, site: Site, crops_from_site: bool) -> 
         "moving": each.moving,
         "velocity_m_s": [rounded(speed, 3) for speed in each.velocity_m_s] if each.moving else None,
         "class_scores": {name: rounded(share, 4) for name, share in each.class_scores.items()},
-        "best_frame": each.best_frame,
+        "best_frame": frame_number(each.best_frame),
         "crop": f"{folder}{CROPS}/{crop_name(each.id)}",
     }
     geometry = {"type": "Point", "coordinates": coordinates}

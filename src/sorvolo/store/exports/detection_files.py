@@ -28,6 +28,7 @@ from sorvolo.store.exports.plain import (
     feature,
     feature_collection,
     features_name,
+    frame_number,
     json_bytes,
     plain_json,
     rounded,
@@ -158,7 +159,7 @@ def detection_row(
 ) -> dict[str, Any]:
     """One detection for `detections.jsonl` (docs/formats.md); without a sighting it has no place on the ground."""
     row: dict[str, Any] = {
-        "frame": frame.name,
+        "frame": frame_number(frame.name),
         "time": utc_text(time_ns),
         "class": name,
         "score": rounded(score, 4),
@@ -216,7 +217,7 @@ def track_properties(track: Track, site: Site) -> dict[str, Any]:
         "moving": track.moving,
         "velocity_m_s": [rounded(east, 3), rounded(north, 3)] if track.moving else None,
         "class_scores": {name: rounded(share, 4) for name, share in track.class_scores.items()},
-        "best_frame": track.best.frame_name,
+        "best_frame": frame_number(track.best.frame_name),
         "best_box_px": [rounded(float(edge), 1) for edge in track.best.box_px],
     }
 
@@ -289,20 +290,20 @@ def written_crop(folder: Path, track_id: int) -> str | None:
 def _refuse_others(folder: Path, source: str, fingerprint: str, *, may_be_there: bool) -> None:
     """Raise StoreError for a folder with anything but a watch of this source, which `may_be_there`."""
     if folder.exists() and not folder.is_dir():
-        raise StoreError(f"{folder} is a file; give a folder with --out")
+        raise StoreError(f"{folder} is a file; choose another folder (--out)")
     if not folder.is_dir() or all(each.name == _LOCK for each in folder.iterdir()):
         return
     earlier = _mark_of(folder)
     if earlier is None:
         raise StoreError(
-            f"{folder} is not empty and holds no earlier watch; give another folder with --out"
+            f"{folder} is not empty and holds no earlier watch; choose another (--out)"
         )
     if not may_be_there or (earlier.get("source"), earlier.get("fingerprint")) != (
         source,
         fingerprint,
     ):
         raise StoreError(
-            f"{folder} holds a watch of {earlier.get('source')}, which stays; give another folder with --out"
+            f"{folder} holds a watch of {earlier.get('source')}, which stays; choose another folder (--out)"
         )
 
 

@@ -13,6 +13,7 @@ from sorvolo.store.exports.places import longitude_latitude, place_deg, ring
 from sorvolo.store.exports.plain import (
     feature,
     feature_collection,
+    frame_number,
     geojson_bytes,
     rounded,
     utc_text,
@@ -41,8 +42,6 @@ def frames_geojson(placed: Sequence[PlacedFrame], site: Site) -> dict[str, Any]:
 
 
 def _frame(frame: PlacedFrame, site: Site) -> dict[str, Any]:
-    # a video's frames are named by their index, photos by their file
-    is_indexed = frame.name == str(frame.index)
     longitude_deg = latitude_deg = height_m = up_m = yaw_deg = pitch_deg = roll_deg = np.nan
     local = {}
     if frame.site_from_camera is not None:
@@ -54,7 +53,7 @@ def _frame(frame: PlacedFrame, site: Site) -> dict[str, Any]:
         else:
             longitude_deg, latitude_deg = place_deg(frame.site_from_camera.translation_m, site)
     properties = {
-        "frame": frame.index if is_indexed else frame.name,
+        "frame": frame_number(frame.name),
         "time": utc_text(frame.time_ns),
         "status": frame.status.value,
         "reason": frame.reason,

@@ -156,6 +156,11 @@ def rounded(number: float, digits: int) -> float | None:
     return round(float(number), digits) if np.isfinite(number) else None
 
 
+def frame_number(name: str) -> int | str:
+    """A frame as all files name it: a video's by its index, a photo by its file."""
+    return int(name) if name.isdecimal() and str(int(name)) == name else name
+
+
 def name_safe(name: str) -> str:
     """The name with everything but letters, digits, dash and underscore replaced by an underscore."""
     return "".join(letter if letter.isalnum() or letter in "-_" else "_" for letter in name)

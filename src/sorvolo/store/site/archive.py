@@ -119,9 +119,7 @@ class Archive:
         """
         folder = Path(folder)
         if not (write and makes) and not is_site(folder):
-            raise NotFoundError(
-                f"no site at {folder}; make one with: sorvolo map INPUT --site {folder}"
-            )
+            raise NotFoundError(f"no site at {folder}; `sorvolo map` makes one")
         if not write:
             # those are read link by link
             refuse_traps(folder, skipped=frozenset({"tiles", "keyframes"}))
@@ -593,7 +591,11 @@ class Archive:
             records.note_files(connection, hashes)
 
     def report(self, flight_id: str) -> Mapping[str, Any]:
-        """A flight's report.json; empty when somebody took it away or broke it, of which a warning tells."""
+        """A flight's report.json; empty when somebody took it away or broke it, of which a warning tells.
+
+        Raises NotFoundError for a flight that the site has not.
+        """
+        self._known(flight_id)
         return self._document(f"flights/{checked_name(flight_id, 'flight')}/report.json")
 
     def features(self, folder: str, name: str, *, is_local: bool | None = None) -> FeatureList:
