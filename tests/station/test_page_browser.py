@@ -2181,18 +2181,29 @@ def served_votes(station: Served) -> int:
     return int(station.station.state.rows("SELECT count(*) AS count FROM reviews")[0]["count"])
 
 
+SMALL = """() => {
+  const aimedAt = (each) => each.matches('[type=checkbox]') ? each.closest('label') : each;
+  return [...document.querySelectorAll('button:not(.link), select, a.button, summary, input')].map(aimedAt)
+    .filter((each) => each.checkVisibility() && !each.closest('.film, .skip'))
+    .filter((each) => [each.offsetWidth, each.offsetHeight].some((px) => px > 0 && px < 44))
+    .map((each) => `${each.offsetWidth} x ${each.offsetHeight} ${each.outerHTML.slice(0, 80)}`);
+}"""
+
+
 def test_everybody_can_use_it(browser: Any, served: Served) -> None:
-    """axe-core finds nothing serious on any screen, light and dark; a phone shows no part beside its edge."""
+    """axe-core finds nothing serious on any screen, light and dark; a phone shows no part beside its edge and none too
+    small for a finger."""
     context = context_of(browser, viewport={"width": 390, "height": 780})
     watched = Watched(context, served.url)
     watched.page.goto(served.url)
     watched.page.locator(".card").wait_for()
     watched.page.evaluate(AXE)
-    found = {"sites": serious(watched.page)}
+    found = {"sites": serious(watched.page) + watched.page.evaluate(SMALL)}
     show(watched, served)
     for panel in PANELS:
         watched.page.locator(f"[data-panel={panel}]").first.click()
         watched.page.wait_for_timeout(150)
+        found[f"{panel}, small"] = watched.page.evaluate(SMALL)
         within = "document" if panel == PANELS[0] else ".panel"  # what is around it stays the same
         found[panel] = serious(watched.page, within)
         watched.page.emulate_media(color_scheme="dark")

@@ -40,8 +40,8 @@ export class MapView {
     });
     this.map.on("error", (event) => { if (event.error && event.error.status !== 404) console.warn(event.error.message); });
     if (!bare) {
-      this.map.addControl(new maplibre.NavigationControl({ visualizePitch: false }), "top-right");
       if (isSecureContext) this.map.addControl(new maplibre.GeolocateControl({ positionOptions: { enableHighAccuracy: true }, trackUserLocation: true }), "top-right");
+      this.map.addControl(new maplibre.NavigationControl({ visualizePitch: false }), "top-right");
       this.scale = new maplibre.ScaleControl({ unit: choices.get("units") });
       this.map.addControl(this.scale, "bottom-right");
     }
