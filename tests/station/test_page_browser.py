@@ -672,6 +672,26 @@ def test_two_drones_have_a_pane_each(served: Served, opened: Watched) -> None:
         assert sorted(panes.all_inner_texts()) == ["north", "south"]
 
 
+def test_a_drone_that_does_not_say_where_it_is_any_more_is_not_on_the_map(
+    served: Served, opened: Watched
+) -> None:
+    page = opened.page
+    page.evaluate("""async () => {
+      const {MapView} = await import('/page/map_view.js');
+      const put = MapView.prototype.put;
+      MapView.prototype.put = function (name, features) { window[`put_${name}`] = features.length; put.call(this, name, features); };
+    }""")
+    flown = MessageSample(time.time_ns(), {"latitude_deg": 46.5, "longitude_deg": 13.25})
+    with greeted(served, "lost", "e" * 16) as drone:
+        drone.send(Message(Kind.TELEMETRY, 1, 0, flown.to_json().encode()).to_bytes())
+        wait_for(lambda: page.evaluate("window.put_drone === 1"))
+        page.evaluate(
+            "() => { const now = performance.now.bind(performance); performance.now = () => now() + 11000; }"
+        )
+        wait_for(lambda: page.evaluate("window.put_drone === 0"))
+        drone.send(Message(Kind.END, 0, 0, b"").to_bytes())
+
+
 def test_a_map_that_grows_out_of_view_is_followed(served: Served, opened: Watched) -> None:
     far = [13.4, 46.6, 13.401, 46.601]
     with opened.page.expect_request(re.compile("/tiles/live-fa12/")):
@@ -1436,6 +1456,9 @@ def test_what_is_drawn_is_measured_and_shared(
     expect(page.locator(".drawn li")).to_have_count(before + 1)
     kept = served.ask("/api/sites/field/drawings")["features"]
     assert "interest" in {each["properties"]["purpose"] for each in kept}
+    page.locator(".drawn").get_by_role("button", name="Filter").last.click()
+    page.locator(".chips button", has_text="Only in the area of interest").click()
+    expect(page.locator(".chips button")).to_have_count(0)
     other = Watched(context_of(browser), served.url)
     show(other, served, "measure")
     other.page.locator(".drawn li").first.wait_for()
@@ -2091,6 +2114,22 @@ def varint(value: int) -> bytes:
         found.append(value & 127 | 128)
         value >>= 7
     return bytes([*found, value])
+
+
+def test_a_route_is_planned_over_ground_that_was_searched_badly_alone(opened: Watched) -> None:
+    """From the search, where there is one: to all of a hole, from one point to the nearest, to no ground that was seen well."""
+    route = opened.page.evaluate("""async () => {
+      const {waypointsFor} = await import('/page/waypoints.js');
+      const ground = (kind, west, east) => ({properties: {kind, status: kind}, geometry: {type: 'Polygon',
+        coordinates: [[[west, 0], [east, 0], [east, 1e-3], [west, 1e-3], [west, 0]]]}});
+      const data = {all: {pod: [ground('pod', 0, 1e-3), ground('hole', 1e-3, 2e-3)], coverage: [ground('hole', 0, 1e-3)]}};
+      return waypointsFor(data).map(({geometry}) => geometry.coordinates);
+    }""")
+    places = np.array(route) * 1e3
+    assert 12 <= len(places) <= 30
+    assert places[:, 0].min() > 1 and places[:, 0].max() < 2
+    assert np.ptp(places, axis=0).min() > 0.6
+    assert np.hypot(*np.diff(places, axis=0).T).max() < 0.5
 
 
 def test_coordinates_are_those_of_the_command_line(opened: Watched) -> None:

@@ -9,6 +9,7 @@ import { openOf, thereOf } from "./sentence.js";
 import * as words from "./words.js";
 
 const PLACED_FOR_MS = 3000; // a frame's place counts for so long before telemetry alone is shown
+const FORGOTTEN_MS = 10000;
 const CLOCKS_AGREE_S = 0.5;
 const WORLD_ZOOM = 6; // a map of no ground yet
 const LONGEST_DELAY_S = 600; // more is a recording, or a clock that is wrong
@@ -90,7 +91,12 @@ export class Live {
   /** What a streaming drone states of itself; a mission places it better. */
   heard(stream, telemetry) {
     const { latitude_deg: lat, longitude_deg: lon, camera_yaw_deg: camera, body_yaw_deg: body } = telemetry ?? {};
-    if (lat === undefined || lat === null || Date.now() - (this.drones.get(stream)?.placed_at ?? 0) < PLACED_FOR_MS) return;
+    const placed_ms = Date.now() - (this.drones.get(stream)?.placed_at ?? 0);
+    if (placed_ms < PLACED_FOR_MS) return;
+    if (lat === undefined || lat === null) { // nobody knows where it is now
+      if (placed_ms > FORGOTTEN_MS && this.drones.delete(stream)) this.drawSoon();
+      return;
+    }
     this.drones.set(stream, { position: [lon, lat], heading_deg: body ?? camera ?? 0 });
     this.drawSoon();
   }

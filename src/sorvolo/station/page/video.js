@@ -108,7 +108,7 @@ export class VideoWall {
   }
 }
 
-/** A drone's moving picture with what is detected in it: `pane` is its element; `heard(telemetry)` gets what it states. */
+/** A drone's moving picture with what is detected in it: `pane` is its element; `heard(telemetry)` gets what it states, null once that is old. */
 export class DroneVideo {
   constructor(stream, { heard = () => {}, leave = null } = {}) {
     Object.assign(this, { url: `/api/streams/${encodeURIComponent(stream)}`, told: heard, boxes: [], motion: new PictureMotion(), socket: null, late_s: 0 });
@@ -158,7 +158,8 @@ export class DroneVideo {
       if (!this.socket) return; // closed meanwhile
       this.ahead_us = (asked_us + Date.now() * 1000) / 2 - state.time_us;
       if (state.is_connected) {
-        this.told(state.telemetry);
+        if (state.samples !== this.samples) Object.assign(this, { samples: state.samples, sampled_at: performance.now() });
+        this.told(performance.now() - this.sampled_at < 1000 * DEAD_S ? state.telemetry : null);
         if (quiet_s > DEAD_S && this.cameAlive) this.connect();
       } else if (state.flights.at(-1)?.is_over) this.off("ended");
     } catch { /* the connection's own sign shows it */ }
