@@ -1,12 +1,13 @@
 """Frames, pictures and KMZ lie where the site has them, and name what is not known."""
 
 import json
+import re
 import time
 import zipfile
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import cv2
@@ -362,13 +363,47 @@ def test_two_maps_are_shown_on_the_same_ground_and_common_tiles_are_read_once() 
     assert not empty.rgba.any() and same.rgba.shape == empty.rgba.shape
 
 
-def test_documents_made_at_once_are_numbered_from_one_each() -> None:
-    """A map's KMZ is made beside its objects' KML, and the same map gives the same bytes."""
-    places = [
-        Placemark(f"place {k}", "", 12.5, 41.9, 0, ((12.5, 41.9), (12.6, 41.9), (12.6, 42.0)))
-        for k in range(60)
-    ]
-    alone = kml_bytes("alone", places)
-    with ThreadPoolExecutor(4) as threads:
-        together = list(threads.map(lambda _: kml_bytes("alone", places), range(16)))
-    assert set(together) == {alone}
+_KML_ORDER = (
+    "name",
+    "description",
+    "TimeStamp",
+    "styleUrl",
+    "Style",
+    *("Placemark", "GroundOverlay", "NetworkLink"),
+    *("MultiGeometry", "LineString", "Icon", "LatLonBox", "Link"),
+)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {
+            "places": [
+                Placemark("a <b>", "1\n2", 12.5, 41.9, 1_700_000_000 * 10**9, ((12.5, 41.9),) * 3),
+                Placemark("", "", 12.5, 41.9, 0),
+            ]
+        },
+        {"overlays": [("a", "files/a.png", (1.0, 2.0, 3.0, 4.0), b"")]},
+        {"line": [(1, 2), (3, 4)], "height_m": 30.0, "description": "{}"},
+        {"link": "http://station/objects.kml?a=1&b=2"},
+    ],
+)
+def test_kml_is_as_its_schema_has_it(content: dict[str, Any]) -> None:
+    """ogckml22.xsd by hand: features' elements in its order, ids that are names and there once, styles that exist.
+
+    Each form was held against the schema itself, by fastkml.
+    """
+    document = ElementTree.fromstring(kml_bytes("t & u", **content))[0]
+    names = [each.tag.rpartition("}")[2] for each in document]
+    assert names[0] == "name" and names == sorted(names, key=_KML_ORDER.index)
+    ids = [each.get("id", "x") for each in document.iter() if each.get("id")]
+    assert len(set(ids)) == len(ids) and all(
+        re.fullmatch(r"[A-Za-z_][\w.-]*", each) for each in ids
+    )
+    features = [each for each in document if not each.tag.endswith(("name", "Style"))]
+    assert len(features) == len(content.get("places", "1"))
+    for feature in features:
+        parts = [each.tag.rpartition("}")[2] for each in feature]
+        assert parts == sorted(parts, key=_KML_ORDER.index)
+        styles = [each.text for each in feature if each.tag.endswith("styleUrl")]
+        assert all(str(each).removeprefix("#") in ids for each in styles)

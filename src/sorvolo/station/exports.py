@@ -35,7 +35,7 @@ from sorvolo.station.security import FOR_VIEWERS, address, needs
 from sorvolo.station.sites import SiteShelf
 from sorvolo.station.tokens import Role
 from sorvolo.store.exports.geopackage import LAYER_STYLES, qgs_of, qml_of, write_geopackage
-from sorvolo.store.exports.places import network_link
+from sorvolo.store.exports.places import kml_bytes
 from sorvolo.store.exports.plain import rounded
 from sorvolo.store.nofollow import open_below
 from sorvolo.store.site.archive import Archive
@@ -278,7 +278,7 @@ def export_routes(shelf: SiteShelf, collections: SiteCollections, reviews: Revie
             return _project(site, archive, collections)
         if export_id == _LINK:
             objects = address(request, f"/api/sites/{site}/exports/objects.kml")
-            link, named = network_link(site, objects), _as_file(f"{_plain_name(site)}.kml")
+            link, named = kml_bytes(site, link=objects), _as_file(f"{_plain_name(site)}.kml")
             return Response(link, media_type=_KML, headers=named)
         found = next((each for each in export_files(archive) if each.id == export_id), None)
         if found is None or _size(archive, found) is None:

@@ -12,7 +12,7 @@ from sorvolo.geometry.arrays import ImageRGBA, PointsPx
 from sorvolo.geometry.geodesy import Projection
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.store.atomic import atomic_path, atomic_write_bytes
-from sorvolo.store.exports.places import kml_from_one, near_longitudes, wrapped_deg
+from sorvolo.store.exports.places import kml_bytes, near_longitudes, wrapped_deg
 from sorvolo.store.exports.plain import name_safe
 from sorvolo.store.images import png_from_rgba, shrink, unweighted, weighted
 
@@ -236,14 +236,9 @@ def _write_kmz(small: Picture, site_grid: SiteGrid, name: str, path: Path) -> No
             if not rgba[..., 3].any():
                 continue
             file = f"files/{name_safe(name)}_{row}_{column}.png"
+            box = wrapped_deg(box[0]), box[1], wrapped_deg(box[2]), box[3]
             pieces.append((f"{name} {row}-{column}", file, box, png_from_rgba(rgba)))
-    with kml_from_one(name) as kml:
-        for title, file, (west, south, east, north), _ in pieces:
-            overlay = kml.newgroundoverlay(name=title)
-            overlay.icon.href = file
-            overlay.latlonbox.west, overlay.latlonbox.south = wrapped_deg(west), south
-            overlay.latlonbox.east, overlay.latlonbox.north = wrapped_deg(east), north
-        text = kml.kml(format=False)
+    text = kml_bytes(name, overlays=pieces)
     with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         # without the time at which it was made: the same map gives the same bytes
         archive.writestr(zipfile.ZipInfo("doc.kml"), text, zipfile.ZIP_DEFLATED)

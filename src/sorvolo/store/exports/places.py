@@ -1,18 +1,17 @@
 """Places of a site in WGS84, and in the words that people pass on: degrees, MGRS, UTM."""
 
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from typing import Any
 
 import gpxpy.gpx
 import numpy as np
-import simplekml
 
 from sorvolo.geometry.arrays import Floats
 from sorvolo.geometry.coordinates import Coordinates, place_text
 from sorvolo.geometry.units import DAY_NS
+from sorvolo.store.pages.words import render
 from sorvolo.survey.flight import Site
 
 SYSTEMS = {system.value: system.heading for system in Coordinates}
@@ -73,9 +72,6 @@ def degrees_words(latitude_deg: float, longitude_deg: float) -> dict[str, str]:
     }
 
 
-_NUMBERING = threading.Lock()
-
-
 @dataclass(frozen=True)
 class Placemark:
     """One place of WGS84 with its name, what stands there, and when it was seen (UTC; a clock without date counts
@@ -88,40 +84,18 @@ class Placemark:
     seen_ns: int
     outline_deg: tuple[tuple[float, float], ...] = ()
 
-
-@contextmanager
-def kml_from_one(title: str) -> Iterator[simplekml.Kml]:
-    """A document whose elements are numbered from 1, so that the same content gives the same bytes: simplekml counts
-    for the whole process, so no other thread may make one within the block."""
-    with _NUMBERING:
-        simplekml.Kml.resetidcounter()
-        yield simplekml.Kml(name=title)
+    @property
+    def when(self) -> datetime | None:
+        """When it was seen, to the second; None where no clock knew the date."""
+        seconds = self.seen_ns // 1_000_000_000
+        return datetime.fromtimestamp(seconds, UTC) if self.seen_ns >= DAY_NS else None
 
 
-def kml_bytes(title: str, placemarks: Sequence[Placemark]) -> bytes:
-    """The places as KML: a point each, and its outline where it has one."""
-    with kml_from_one(printable(title)) as document:
-        for each in placemarks:
-            folder = document.newmultigeometry(
-                name=printable(each.name), description=printable(each.description)
-            )
-            folder.newpoint(coords=[(each.longitude_deg, each.latitude_deg)])
-            if each.outline_deg:
-                folder.newpolygon(outerboundaryis=[*each.outline_deg, each.outline_deg[0]])
-            folder.style.polystyle.fill = 0
-            folder.style.linestyle.width = 3
-            folder.style.linestyle.color = simplekml.Color.red
-            if each.seen_ns >= DAY_NS:
-                folder.timestamp.when = _moment(each.seen_ns).strftime("%Y-%m-%dT%H:%M:%SZ")
-        return str(document.kml()).encode()
-
-
-def network_link(title: str, address: str) -> bytes:
-    """KML that has Google Earth load the KML at an address again and again."""
-    with kml_from_one(printable(title)) as document:
-        link = document.newnetworklink(name=printable(title)).link
-        link.href, link.refreshmode, link.refreshinterval = address, "onInterval", 30
-        return str(document.kml()).encode()
+def kml_bytes(title: str, places: Sequence[Placemark] = (), **content: Any) -> bytes:
+    """KML of places, a point each and its outline where it has one, and of what else `places.xml` knows: overlays, a
+    line, a link that Google Earth loads again and again."""
+    known: dict[str, Any] = {"places": places, "printable": printable, **content}
+    return render("places.xml", package="sorvolo.store.exports", title=title, **known).encode()
 
 
 def gpx_bytes(title: str, placemarks: Sequence[Placemark]) -> bytes:
@@ -135,14 +109,10 @@ def gpx_bytes(title: str, placemarks: Sequence[Placemark]) -> bytes:
                 longitude=round(wrapped_deg(each.longitude_deg), 8),
                 name=printable(each.name),
                 description=printable(each.description),
-                time=_moment(each.seen_ns) if each.seen_ns >= DAY_NS else None,
+                time=each.when,
             )
         )
     return document.to_xml(version="1.1").encode()
-
-
-def _moment(time_ns: int) -> datetime:
-    return datetime.fromtimestamp(time_ns // 1_000_000_000, UTC)
 
 
 def printable(text: str) -> str:

@@ -12,13 +12,11 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 from xml.etree.ElementTree import register_namespace
 
-import simplekml
-
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.geometry.planning import FlightPlan
 from sorvolo.store.atomic import atomic_write_bytes
-from sorvolo.store.exports.places import kml_from_one
+from sorvolo.store.exports.places import kml_bytes
 from sorvolo.store.exports.plain import feature
 from sorvolo.store.pages.words import xml_of
 
@@ -178,13 +176,8 @@ def _summary(plan: FlightPlan) -> _Item:
 
 
 def _kml(plan: FlightPlan, lonlat: _LonLat, name: str) -> str:
-    with kml_from_one(name) as document:
-        line = document.newlinestring(name=name, description=json.dumps(_summary(plan), indent=1))
-        line.coords = [(lon, lat, plan.height_m) for lon, lat in lonlat]
-        line.altitudemode = simplekml.AltitudeMode.relativetoground
-        line.style.linestyle.width = 3
-        line.style.linestyle.color = simplekml.Color.orange
-        return str(document.kml())
+    words = json.dumps(_summary(plan), indent=1)
+    return kml_bytes(name, line=lonlat, height_m=plan.height_m, description=words).decode()
 
 
 def _qgroundcontrol(plan: FlightPlan, lonlat: _LonLat, _name: str) -> str:
