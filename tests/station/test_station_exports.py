@@ -24,6 +24,7 @@ from test_objects_store import commit, search, thing
 from sorvolo.station.app import station_app
 from sorvolo.station.settings import StationSettings
 from sorvolo.store.exports.geopackage import write_geopackage
+from sorvolo.store.exports.plain import feature
 from sorvolo.store.site.archive import Archive
 
 HOST = "http://127.0.0.1:8750"
@@ -209,6 +210,15 @@ def test_google_earth_is_told_to_load_the_objects_again(client: TestClient, root
     for each in (answer, client.get(words["href"])):
         assert each.status_code == 200
         assert each.headers["content-type"].startswith("application/vnd.google-earth.kml+xml")
+
+
+def test_a_column_of_lengths_is_numbers_also_where_none_is_known(tmp_path: Path) -> None:
+    point = {"type": "Point", "coordinates": [13.0, 46.0]}
+    values = {"height_change_m": None, "area_m2": None, "velocity_m_s": None, "note": None}
+    write_geopackage(tmp_path / "a.gpkg", {"changes": [feature(point, values)]})
+    with sqlite3.connect(tmp_path / "a.gpkg") as file:
+        kinds = {row[1]: row[2] for row in file.execute("PRAGMA table_info(changes)")}
+    assert [kinds[name] for name in values] == ["REAL", "REAL", "TEXT", "TEXT"]
 
 
 def test_a_geopackage_leaves_nothing_behind(

@@ -28,7 +28,7 @@ from sorvolo.store.exports.map_pictures import (
     write_small_maps,
 )
 from sorvolo.store.exports.places import Placemark, kml_bytes
-from sorvolo.store.exports.plain import geojson_bytes, plain_json, utc_text
+from sorvolo.store.exports.plain import FeatureList, geojson_bytes, plain_json, utc_text
 from sorvolo.store.images import shrink, unweighted, weighted
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import Status
@@ -407,3 +407,16 @@ def test_kml_is_as_its_schema_has_it(content: dict[str, Any]) -> None:
         assert parts == sorted(parts, key=_KML_ORDER.index)
         styles = [each.text for each in feature if each.tag.endswith("styleUrl")]
         assert all(str(each).removeprefix("#") in ids for each in styles)
+
+
+def test_a_geodataframe_has_times_as_times() -> None:
+    geopandas = pytest.importorskip("geopandas")
+    rows = {"type": "Feature", "geometry": {"type": "Point", "coordinates": [13.0, 46.0]}}
+    times = ["2026-04-02T12:44:00.200000Z", "2026-04-02T12:44:01.000000001Z"]
+    table = FeatureList(
+        [rows | {"properties": {"first_seen": each}} for each in times]
+    ).to_geodataframe()
+    assert isinstance(table, geopandas.GeoDataFrame)
+    assert (table.first_seen[1] - table.first_seen[0]).value == 800_000_001
+    lost = FeatureList([rows | {"properties": {"announced": None}}]).to_geodataframe()
+    assert lost.announced.isna().all()

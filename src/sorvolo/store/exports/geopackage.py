@@ -24,6 +24,7 @@ from sorvolo.store.pages.words import xml_of
 Feature = Mapping[str, Any]
 
 _TIME = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d{1,9})?(Z|[+-]\d\d:\d\d)")
+_LENGTH = re.compile("_(m2?|px|deg)$")  # names of numbers, also where none is known
 _APPLICATION = 0x47504B47  # "GPKG"
 _VERSION = 10300  # GeoPackage 1.3.0, as its requirement 2 writes it
 _WGS84 = 4326
@@ -150,7 +151,10 @@ def _columns(features: Sequence[Feature]) -> dict[str, str]:
                 if value is not None:
                     kinds.add(_sql_type(value))
     mixed = {
-        name: "REAL" if kinds == {"INTEGER", "REAL"} else "TEXT" for name, kinds in found.items()
+        name: "REAL"
+        if kinds == {"INTEGER", "REAL"} or (not kinds and _LENGTH.search(name))
+        else "TEXT"
+        for name, kinds in found.items()
     }
     return mixed | {
         name: kind for name, kinds in found.items() if len(kinds) == 1 for kind in kinds

@@ -87,6 +87,9 @@ def feature(geometry: Any, properties: Any, **own: Any) -> dict[str, Any]:
     return {"type": "Feature", **own, "geometry": geometry, "properties": properties}
 
 
+_TIMES = {"time", "first_seen", "last_seen", "announced"}
+
+
 class FeatureList(list[dict[str, Any]]):
     """Features of GeoJSON, which libraries that know `__geo_interface__` take as they are."""
 
@@ -100,12 +103,23 @@ class FeatureList(list[dict[str, Any]]):
         return {"type": "FeatureCollection", "features": list(self)}
 
     def to_geodataframe(self) -> Any:
-        """The same as `geopandas.GeoDataFrame` (pip install "sorvolo[notebooks]")."""
-        import geopandas
+        """The same as `geopandas.GeoDataFrame` (pip install "sorvolo[notebooks]"), times as times.
 
+        Raises SettingsError where GeoPandas is not installed.
+        """
+        try:
+            import geopandas
+            import pandas
+        except ModuleNotFoundError as error:
+            raise SettingsError(
+                "a GeoDataFrame needs GeoPandas: pip install 'sorvolo[notebooks]'"
+            ) from error
         if not self:
             return geopandas.GeoDataFrame(geometry=[], crs=self._crs)
-        return geopandas.GeoDataFrame.from_features(self, crs=self._crs)
+        table = geopandas.GeoDataFrame.from_features(self, crs=self._crs)
+        for name in _TIMES.intersection(table):
+            table[name] = pandas.to_datetime(table[name], utc=True, format="ISO8601")
+        return table
 
 
 def features_name(name: str, *, is_local: bool) -> str:
