@@ -109,6 +109,15 @@ def test_all_formats_state_the_same_of_each_object(tmp_path: Path) -> None:
         shown = [
             client.get(address.format(name)).json()["features"] for name in ("objects", "findings")
         ]
+        for query, found in (
+            ("flight=a", {old}),  # which the later flight saw, too
+            ("flight=b", {old, new}),
+            ("datetime=2023-11-14", {old, new}),  # a day, not its midnight
+            ("datetime=2023-11-13", set()),
+            ("datetime=../2023-11-14", {old, new}),
+        ):
+            rest = client.get(f"{address.format('findings')}?{query}").json()["features"]
+            assert {each["id"] for each in rest} == found, query
     files = [json.loads((tmp_path / "objects.geojson").read_text())["features"], *shown]
     names = ("class", "flights", "first_seen", "last_seen", "east_m", "north_m", "sigma_m")
     for features in files:

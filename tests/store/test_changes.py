@@ -20,7 +20,7 @@ from rich.console import Console
 
 from sealing import seal_again
 from sorvolo.cli.printing import announce_people
-from sorvolo.errors import InputError, StoreError
+from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.findings.importance import between, in_short
 from sorvolo.geometry.polygons import signed_area
 from sorvolo.missions.site.history import came_and_left
@@ -517,6 +517,10 @@ def test_a_version_is_found_by_its_time_and_differs_by_its_tiles(folder: Path) -
         )
         with pytest.raises(InputError, match=r"had no map.*2023-11-14T22:13:20"):
             archive.version_at(flown - timedelta(seconds=2))
+        for day in (flown.date(), str(flown.date()), f"{flown:%Y-%m-%dT%H:%M:%S}"):
+            assert archive.version_at(day).id == 2
+        with pytest.raises(SettingsError, match="'May' is not a date"):
+            archive.version_at("May")
     page = (folder / "flights/b/changes.html").read_text()
     assert all(f"flight {each}, <time>flown 2023-11-14</time>" in page for each in "ab")
     with sqlite3.connect(folder / "site.db") as connection:  # flights whose clocks have no date

@@ -1,13 +1,14 @@
 """OGC API Features over a site's collections: landing page, conformance, collections, items by place, time and more."""
 
 from collections.abc import Sequence
-from datetime import UTC, datetime
+from datetime import UTC, datetime, time
 from urllib.parse import urlencode
 
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import JSONResponse
 from shapely.geometry import box, mapping
 
+from sorvolo.errors import SettingsError
 from sorvolo.paths import Json, JsonView
 from sorvolo.station.collections import TITLES, Collection, SiteCollections
 from sorvolo.station.exports import cogs_of, tilejson_address
@@ -16,6 +17,7 @@ from sorvolo.station.problems import Problem
 from sorvolo.station.reviews import Reviews
 from sorvolo.station.security import FOR_VIEWERS, address
 from sorvolo.station.sites import SiteShelf, bounds_lonlat
+from sorvolo.store.exports.plain import moment_of
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import VersionEntry
 
@@ -199,18 +201,21 @@ def _interval(text: str) -> tuple[datetime | None, datetime | None]:
         raise Problem(
             400, f"datetime={text[:80]}: a moment or START/END was needed, .. for an open end"
         )
-    ends = [None if each in ("", "..") else _moment(each) for each in parts]
-    return (ends[0], ends[0]) if len(ends) == 1 else (ends[0], ends[1])
+    start, end = (
+        None if each in ("", "..") else _moment(each, of_day)
+        for each, of_day in ((parts[0], time.min), (parts[-1], time.max))
+    )
+    return start, end
 
 
-def _moment(text: str) -> datetime:
+def _moment(text: str, of_day: time = time.min) -> datetime:
+    """A time; a date alone stands for this time of its day. Raises Problem (400)."""
     try:
-        moment = datetime.fromisoformat(text.replace("Z", "+00:00"))
-    except ValueError as error:
+        return moment_of(text, of_day)
+    except SettingsError as error:
         raise Problem(
             400, f"datetime: {text[:60]!r} is no time such as 2026-05-31T12:00:00Z"
         ) from error
-    return moment if moment.tzinfo else moment.replace(tzinfo=UTC)
 
 
 def _words(text: str) -> frozenset[str]:
@@ -234,7 +239,10 @@ def _filtered(
                 )
             )
             and (min_score is None or (values.get("score") or 0.0) >= min_score)
-            and (not flights or values.get("flight") in flights)
+            and (
+                not flights
+                or not flights.isdisjoint(values.get("flights") or [values.get("flight")])
+            )
             and (not verdicts or (values.get("review") or "none") in verdicts)
             and _meets(values, interval)
         )

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from datetime import UTC, datetime
+from datetime import UTC, date, time
 from functools import partial
 from pathlib import Path
 from typing import Any, Self, TypeVar
@@ -23,6 +23,7 @@ from sorvolo.store.exports.change_files import CROPS, finding_feature, object_cr
 from sorvolo.store.exports.plain import (
     FeatureList,
     features_name,
+    moment_of,
     plain_json,
 )
 from sorvolo.store.images import image_from_jpeg
@@ -190,12 +191,13 @@ class Archive:
         """The version that mosaic.tif and the other files of the map show; 0 for none."""
         return self.catalogue_rows(records.derived_version)
 
-    def version_at(self, moment: datetime) -> VersionEntry:
-        """The newest version of flights flown by a moment, taken as UTC when it names no time zone.
+    def version_at(self, moment: date | str) -> VersionEntry:
+        """The newest version of flights flown by a moment, or by the end of a date, as such or in ISO 8601; taken as UTC
+        when it names no time zone.
 
-        A flight whose clock has no date counts from when its map was made. Raises InputError when there was no map yet.
+        A flight whose clock has no date counts from when its map was made. Raises InputError when there was no map yet, SettingsError for no time.
         """
-        utc = moment.replace(tzinfo=UTC) if moment.tzinfo is None else moment.astimezone(UTC)
+        utc = moment_of(str(moment), time.max).astimezone(UTC)
         complete = self.versions()
         known = [entry for entry in complete if entry.moment <= utc]
         if not known:
