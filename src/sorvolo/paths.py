@@ -32,6 +32,12 @@ def listed(given: Any) -> list[Any]:
     return [os.fspath(each) if isinstance(each, str | os.PathLike) else each for each in several]
 
 
+def take_one_or_several(record: object, *names: str) -> None:
+    """Let these fields of a frozen record, while it is made, be one thing or several: a text is one thing."""
+    for name in names:
+        object.__setattr__(record, name, tuple(listed(getattr(record, name))))
+
+
 @overload
 def as_path(given: AnyPath) -> Path: ...
 @overload

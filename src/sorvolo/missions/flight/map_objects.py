@@ -76,8 +76,6 @@ def open_detector(
 
 def check_classes(detector: ObjectDetector | None, classes: Sequence[str]) -> None:
     """Raise SettingsError for a class that the detector does not know, before anything is searched."""
-    if isinstance(classes, str):
-        raise SettingsError(f"classes is the text {classes!r}; give several: ({classes!r},)")
     if detector is not None and (unknown := sorted(set(classes) - set(detector.classes))):
         raise SettingsError(
             f"the model knows no {unknown[0]!r}; it knows {', '.join(detector.classes)}"

@@ -9,6 +9,7 @@ from sorvolo.change.compare import PairMethod
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.geodesy import check_map_crs
 from sorvolo.missions.flight.looked_at import ENOUGH_LOOKED_AT, check_enough
+from sorvolo.paths import take_one_or_several
 
 if TYPE_CHECKING:
     from sorvolo.missions.flight.map_objects import ObjectFinder
@@ -113,6 +114,7 @@ class MapSettings:
     enough_looked_at: float = ENOUGH_LOOKED_AT  # share of the ground, else the result is to check
 
     def __post_init__(self) -> None:
+        take_one_or_several(self, "classes", "checks")
         check_enough(self.enough_looked_at)
         memory_budget_bytes(self.memory_mb)
         if not 1e-4 <= self.control_sigma_m <= 100:
@@ -162,6 +164,7 @@ class CompareSettings:
     enough_looked_at: float = ENOUGH_LOOKED_AT  # share of the ground, else the result is to check
 
     def __post_init__(self) -> None:
+        take_one_or_several(self, "classes")
         check_enough(self.enough_looked_at)
         if not 0.05 <= self.views_per_second <= 240:
             raise SettingsError(

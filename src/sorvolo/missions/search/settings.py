@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sorvolo.errors import SettingsError
-from sorvolo.paths import as_path, listed
+from sorvolo.paths import as_path, listed, take_one_or_several
 
 CUT_OUTS = "cut-outs.png"
 """The file of a search's folder that shows the people who were cut out and planted."""
@@ -35,6 +35,7 @@ class SearchSettings:
     seed: int = 1
 
     def __post_init__(self) -> None:
+        take_one_or_several(self, "classes")
         if not 10 <= self.plants <= 5000:
             raise SettingsError(
                 f"--plants must lie in 10 to 5000, got {self.plants}: fewer measure nothing"
@@ -73,6 +74,7 @@ class SearchOutputs:
     def __post_init__(self) -> None:
         for name in ("folder", "area", "poa"):
             object.__setattr__(self, name, as_path(getattr(self, name)))
+        take_one_or_several(self, "flights")
         for name in ("refly", "plant"):
             object.__setattr__(
                 self, name, tuple(Path(each) for each in listed(getattr(self, name)))

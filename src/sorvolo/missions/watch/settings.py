@@ -9,7 +9,7 @@ from sorvolo.missions.flight.looked_at import ENOUGH_LOOKED_AT, check_enough
 from sorvolo.missions.flight.settings import check_telemetry
 from sorvolo.missions.watch import alerts
 from sorvolo.missions.watch.cot_sender import CotTls, cot_place
-from sorvolo.paths import as_path
+from sorvolo.paths import as_path, take_one_or_several
 
 DEFAULT_FRAMES_PER_SECOND = 10.0
 """Frames searched a second of a recorded flight: what a camera sees for half a second only is seen five times."""
@@ -41,6 +41,7 @@ class WatchSettings:
     enough_looked_at: float = ENOUGH_LOOKED_AT  # share of the ground, else the result is to check
 
     def __post_init__(self) -> None:
+        take_one_or_several(self, "classes")
         if self.least_score is not None and not 0 <= self.least_score <= 1:
             raise SettingsError(f"the least score must lie in 0 to 1, got {self.least_score}")
         if isinstance(self.tiles, int) and not 64 <= self.tiles <= 16_384:
@@ -83,6 +84,7 @@ class WatchOutputs:
     def __post_init__(self) -> None:
         for name in ("folder", "below"):
             object.__setattr__(self, name, as_path(getattr(self, name)))
+        take_one_or_several(self, "labels")
         if self.save not in ("none", "video", "pictures"):
             raise SettingsError(f"save must be none, video or pictures, got {self.save!r}")
         if unknown := sorted(set(self.labels) - set(_LABEL_FORMATS)):
