@@ -410,8 +410,8 @@ SENTENCES = """async () => {
   const looks = ({options}) => !['none', 'boats'].includes(options?.model);
   for (const link of ['live', 'late', 'waiting', 'lost']) for (const loaded of ['yes', 'no', 'failed']) for (const [pod, searched] of Object.entries(pods))
     for (const [people, objects] of Object.entries(peoples)) for (const each of histories) {
-      const isLow = link === 'late', votes = link === 'lost' ? 2 : 0;
-      const parts = sentence({link, loaded, runs: each, objects, changes: [], pod: searched, versions: [], votes, isLow});
+      const isLow = link === 'late', isFull = link === 'waiting', votes = link === 'lost' ? 2 : 0;
+      const parts = sentence({link, loaded, runs: each, objects, changes: [], pod: searched, versions: [], votes, isLow, isFull});
       asked += 1;
       found.add(JSON.stringify({link, loaded, pod, people, state: each[0]?.state ?? '', text: parts.map(({words}) => words).join(' · '),
         looking: each.some((run) => run.state === 'running' && looks(run)),
@@ -429,6 +429,8 @@ def test_the_sentence_is_in_no_state_a_wrong_all_clear(opened: Watched) -> None:
         text = each["text"]
         assert not re.search(r"all clear|nobody|no one|no people|empty|safe", text, re.IGNORECASE)
         assert ("may be old" in text) == (each["link"] != "live")
+        disk = {"late": "nearly full", "waiting": "disk is full"}.get(each["link"], "")
+        assert disk in text and ("disk" in text) == bool(disk)
         if each["loaded"] != "yes":
             assert "person" not in text and "looked" not in text
             continue
@@ -512,7 +514,10 @@ def test_from_a_flying_drone_to_the_place_of_a_person_in_three_taps(
         assert (taps, time.monotonic() - began_s < 60) == (3, True)
         for system in Coordinates:
             assert place_text(lat, lon, system) in sent
-        assert f"/#/site/field/place?at={lon:.7f},{lat:.7f}" in sent and "2.5 m (1 sigma)" in sent
+        assert (
+            f"/#/site/field/place?at={lon:.7f},{lat:.7f} (on this computer alone)" in sent
+            and "2.5 m (1 sigma)" in sent
+        )
         announce(served, "person.found", {"feature": person, "is_local": False})
         page.locator(".message.person").wait_for()
         covers_nothing(page, ".card-over")
@@ -967,7 +972,7 @@ def test_of_two_missions_at_once_the_map_s_figures_are_shown(
         }
         happens("run-watch", "person.found", {"feature": person, "is_local": False})
     expect(page.locator(".message.person")).to_have_count(1)
-    expect(page.locator(".message.person")).to_contain_text("2 people found, the last:")
+    expect(page.locator(".message.person")).to_contain_text("People seen 2 times, the last:")
     happens("run-watch", "run.finished", {"headline": "two cars found"})
     page.locator(".message", has_text="two cars found").wait_for()
     expect(mapping).to_have_text("3 of 5 frames matched, 2 rejected")

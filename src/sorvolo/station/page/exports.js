@@ -5,7 +5,7 @@ import { button, el, fill, report } from "./dom.js";
 import { lookOf, titleOf } from "./feature_card.js";
 import { say } from "./languages.js";
 import { middleOf } from "./places.js";
-import { copy, NOT_COPIED } from "./share.js";
+import { copy, isOwn, NOT_COPIED } from "./share.js";
 import { siteName } from "./sites.js";
 import { bytes, length, place, time, VERDICTS } from "./words.js";
 import { zip } from "./zip.js";
@@ -23,7 +23,7 @@ export function exportPanel(screen, body) {
     fill(copied, is ? say("Link copied") : NOT_COPIED);
   };
   fill(body, el("div.row.wrap", button(say("Copy link"), link, { class: "main" }), copied),
-    el("p.note", say("Who opens it needs a token of their own where the station has tokens.")), el("h3", say("What is shown")), shown,
+    el("p.note", isOwn ? say("This address works on this computer alone. Open the station by its address in the network to share it.") : say("Who opens it needs a token of their own where the station has tokens.")), el("h3", say("What is shown")), shown,
     el("div.row.wrap", button(say("Print or PDF"), () => print(screen))), el("details", { open: true }, el("summary", say("All files")), files));
 
   function refresh() {

@@ -148,10 +148,11 @@ export class Live {
   /** A person was found, by whatever mission: one banner for each mission, which stays until it is closed. */
   person(feature, local, run) {
     const mission = this.of(run);
+    // sightings: while a flight goes on, one person may be found twice, and the sentence alone counts people
     mission.people = (mission.people ?? 0) + 1;
     mission.banner?.remove(); // another mission's stays: it is of another flight
     const place = local || !feature.geometry ? say("without a place on Earth") : words.place(middleOf(feature.geometry));
-    mission.banner = message(mission.people > 1 ? say("{n} people found, the last:", { n: mission.people }) : say("Person found"), { kind: "alert person", todo: place,
+    mission.banner = message(mission.people > 1 ? say("People seen {n} times, the last:", { n: mission.people }) : say("Person found"), { kind: "alert person", todo: place,
       act: local || !feature.geometry ? null : button(say("Show"), () => this.showFound(watched(feature, run))) });
     if (choices.get("sound")) beep();
   }

@@ -36,12 +36,12 @@ export const openOf = (...lists) => lists.flat().filter(({ properties: { review,
  * The parts of the sentence: {words, act, kind}. `link` is "live", "late" (kept answers are shown), "waiting" or "lost"; `loaded` "yes", "no" or "failed";
  * `runs` the site's missions, newest first; objects, changes and pod are ALL features, whatever a filter hides; `now` by the station's clock, ms.
  */
-export function sentence({ link, loaded, runs, objects, changes, pod, versions, votes = 0, isLow = false, now = 0 }) {
+export function sentence({ link, loaded, runs, objects, changes, pod, versions, votes = 0, isLow = false, isFull = false, now = 0 }) {
   const parts = [];
   const tell = (words, act = null, kind = "") => parts.push({ words, act, kind });
   if (link !== "live") tell(say("{link}: this may be old", { link: LINKS[link] }), null, "warning");
   if (votes) tell(say("{n} verdict waits to be sent|{n} verdicts wait to be sent", { n: votes }), null, "warning");
-  if (isLow) tell(say("The disk is nearly full"), null, "warning");
+  if (isLow || isFull) tell(isFull ? say("The station's disk is full") : say("The disk is nearly full"), null, "warning");
   if (loaded !== "yes") {
     tell(loaded === "failed" ? say("What is known here could not be loaded") : say("Loading what is known"), null, loaded === "failed" ? "warning" : "");
     return parts;

@@ -24,11 +24,14 @@ export async function copy(text) {
 
 export const placeUrl = (site, place) => `${roomUrl(site, "place")}?at=${place.map((each) => each.toFixed(7)).join(",")}`;
 
+/** Whether the page's address means another device on another device. */
+export const isOwn = /^(localhost|127\.|\[::1\])/.test(location.hostname);
+
 /** What is sent of a place: what is there, where, how surely, a link. */
 function wordsOf(name, place, sigma_m, link) {
   const lines = [name, ...["latlon", "mgrs", "utm"].map((kind) => placeIn(kind, place))];
   if (sigma_m) lines.push(say("to {sigma} m (1 sigma)", { sigma: numeral(sigma_m, 1) }));
-  return [...new Set(lines), `geo:${place[1].toFixed(6)},${place[0].toFixed(6)}`, link].join("\n");
+  return [...new Set(lines), `geo:${place[1].toFixed(6)},${place[0].toFixed(6)}`, isOwn ? say("{link} (on this computer alone)", { link }) : link].join("\n");
 }
 
 /** Buttons that hand a place on; `name` says what is there. */
