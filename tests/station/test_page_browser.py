@@ -931,7 +931,9 @@ def test_a_flight_is_followed_live(served: Served, opened: Watched) -> None:
     page.wait_for_timeout(100)
     assert page.evaluate("window.pwned") is None
     happens("run.finished", {"headline": "all done"})
-    page.locator(".message", has_text="to review").get_by_text("all done").wait_for()
+    done = page.locator(".message", has_text="to review").filter(has_text="all done")
+    done.get_by_role("button", name="Findings").click()
+    page.locator(".gallery h3").wait_for()
 
 
 def test_the_api_can_be_read_as_a_page(served: Served, opened: Watched) -> None:
@@ -1164,7 +1166,7 @@ def test_a_link_to_a_site_shows_it_once_its_first_mission_made_it(
         page = context_of(browser).new_page()
         page.set_default_timeout(WAIT_MS)
         page.goto(f"{station.url}/#/site/field/findings")
-        page.get_by_text("Not found").wait_for()
+        page.get_by_role("heading", name="There is no site field").wait_for()
         shutil.copytree(made_site, tmp_path / "field")
         page.locator(KNOWN).wait_for()
         page.context.close()

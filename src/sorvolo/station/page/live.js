@@ -171,7 +171,7 @@ export class Live {
     const people = thereOf(objects).filter(({ properties }) => properties.class === "person").length;
     const open = openOf(objects, changes).length;
     const result = [people ? say("{n} person|{n} people", { n: people }) : null, open ? say("{n} to review", { n: open }) : say("nothing new to review")].filter(Boolean).join(", ");
-    message(say("The mission is done: {result}", { result }), { todo: headline });
+    message(say("The mission is done: {result}", { result }), { todo: headline, act: open ? button(say("Findings"), () => this.screen.open("findings", true)) : null });
   }
 
   figures(id) {

@@ -129,7 +129,7 @@ async function route() {
     if (!(problem instanceof Problem)) throw problem;
     if (problem.status === 401) return;
     const isAwaited = problem.status === 404 && kind === "site";
-    blank(problem.title, problem.detail, isAwaited ? el("p", say("Once a first mission has put something on its map, it is shown here.")) : null,
+    blank(isAwaited ? say("There is no site {name}", { name: id }) : problem.title, isAwaited ? "" : problem.detail, isAwaited ? el("p", say("Once a first mission has put something on its map, it is shown here.")) : null,
       el("p", el("a", { href: "#/" }, say("All sites")), " ", button(say("Try again"), () => route())));
     if (isAwaited) screen = whenMade(id, route);
   }

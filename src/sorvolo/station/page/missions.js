@@ -9,7 +9,7 @@ import { thereOf } from "./sentence.js";
 import { cropsOf, newestFirst, peopleFirst } from "./site_data.js";
 import { mayNot } from "./sites.js";
 import { Upload } from "./upload.js";
-import { bytes, clock, dateOf, day, duration, nameOf, time } from "./words.js";
+import { bytes, clock, dateOf, day, duration, nameOf, percent, time } from "./words.js";
 import { zipOfFiles } from "./zip.js";
 
 const KINDS = {
@@ -146,9 +146,10 @@ export class Missions {
   async upload(file) {
     const upload = new Upload(file);
     const bar = el("progress", { max: 1, value: 0, "aria-label": file.name });
-    const row = el("div.upload", el("span", `${file.name} (${bytes(file.size)})`), bar, quiet(say("Stop"), () => upload.stop()));
+    const share = el("span.soft");
+    const row = el("div.upload", el("span", `${file.name} (${bytes(file.size)}) `), share, bar, quiet(say("Stop"), () => upload.stop()));
     this.uploadList.append(row);
-    upload.addEventListener("progress", ({ detail }) => { bar.value = detail; });
+    upload.addEventListener("progress", ({ detail }) => { bar.value = detail; fill(share, percent(detail)); });
     try {
       return await upload.send();
     } finally { row.remove(); }
