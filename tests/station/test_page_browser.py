@@ -148,6 +148,10 @@ def greeted(served: Served, stream: str, session: str) -> Iterator[ClientConnect
         drone.send(Message(Kind.HELLO, 0, 0, hello.to_json().encode()).to_bytes())
         drone.recv()
         yield drone
+    # else the start page of the next test may begin to show it
+    wait_for(
+        lambda: stream not in [e["stream"] for e in served.ask("/api/streams") if e["is_connected"]]
+    )
 
 
 @contextmanager
