@@ -3,13 +3,15 @@
 import numpy as np
 import pytest
 
+from sorvolo.geometry.pose import site_from_gimbal_rotation
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.tracking.headings import (
     CompassError,
-    Heading,
     HeadingFromMotion,
     HeadingTurn,
+    Way,
     heading_deg,
+    righted,
 )
 
 _M_PER_PX = 0.05
@@ -22,7 +24,7 @@ def _fly(
     gps_m: float = 0.0,
     wobble_px: float = 0.0,
     seed: int = 1,
-) -> list[Heading]:
+) -> list[Way]:
     """What is reported along a way (N, 2) of a camera with these headings, ten frames a second."""
     rng = np.random.default_rng(seed)
     drift_m = gps_m * np.cumsum(rng.normal(0, 1, way_m.shape), axis=0) / np.sqrt(len(way_m))
@@ -124,3 +126,43 @@ def test_a_compass_that_jumps_is_followed_at_once() -> None:
     for turn_deg, anew in ((3.0, False), (4.0, False), (170.0, True)):
         error.add(HeadingTurn(turn_deg, 2.0), 0.2, anew=anew)
     assert error.turn.turn_deg == pytest.approx(170.0)
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 5.0])
+@pytest.mark.parametrize("told_share", [1.0, 0.8])
+def test_a_tilt_and_a_height_that_are_off_show_on_the_way_back(
+    tilt_deg: float, told_share: float
+) -> None:
+    """Two strips, 50 m up; telemetry's axis meets the ground too far towards the picture's top by its tilt's error."""
+    headings_deg = np.concatenate([np.full(90, 90.0), np.linspace(90, 270, 30), np.full(90, 270.0)])
+    forward = np.column_stack([np.sin(np.radians(headings_deg)), np.cos(np.radians(headings_deg))])
+    way_m = np.cumsum(0.8 * forward, axis=0)
+    told_m = 50 * told_share
+    finder, way = HeadingFromMotion(), Way()
+    for number, place_m in enumerate(way_m):
+        outline_px = _outline(headings_deg[number], place_m, headings_deg[0], way_m[0])
+        middle_m = place_m + told_m * np.tan(np.radians(tilt_deg)) * forward[number]
+        way = finder.add(number / 5, outline_px, middle_m, told_m, 50 / _M_PER_PX)
+    assert way.scale == pytest.approx(1 / told_share, abs=0.02)
+    rotation = site_from_gimbal_rotation(270.0, -90.0 + tilt_deg, 0.0)
+    prior = CameraPrior(np.array([*way_m[-1], told_m]), np.ones(3), rotation, np.full(3, 2.0))
+    right = righted(prior, way, 0.0)
+    assert right.position_m[2] == pytest.approx(50, abs=1.0)
+    off_deg = np.degrees(np.arccos(np.clip(-right.rotation[2, 2], -1, 1)))
+    assert off_deg < 0.3 + 0.35 * tilt_deg  # of 5 degrees what is sure
+    assert np.linalg.norm(right.rotation[:2, 2]) < np.linalg.norm(rotation[:2, 2]) + 0.01
+    assert right.position_sigma_m[2] == 1.0
+
+
+def test_a_strip_without_a_turn_shows_no_tilt() -> None:
+    """There a tilt is the same as a shift of all fixes."""
+    finder, way = HeadingFromMotion(), Way()
+    for number in range(100):
+        place_m = np.array([0.8 * number, 0.0])
+        outline_px = _outline(90.0, place_m, 90.0, np.zeros(2))
+        way = finder.add(
+            number / 5, outline_px, place_m + np.array([4.0, 0.0]), 50.0, 50 / _M_PER_PX
+        )
+    assert way.beside_sigma_m > 4
+    prior = CameraPrior(np.array([80.0, 0.0, 50.0]), np.ones(3), np.diag([1.0, -1, -1]), np.ones(3))
+    assert np.allclose(righted(prior, way, 0.0).rotation, prior.rotation, atol=0.01)

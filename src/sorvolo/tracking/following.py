@@ -14,7 +14,6 @@ from sorvolo.survey.objects import Detections, Sighting, Track
 from sorvolo.survey.wording import counted
 from sorvolo.tracking.headings import (
     HeadingCheck,
-    HeadingFromPictures,
     contradiction,
 )
 from sorvolo.tracking.image_motion import ImageMotion
@@ -92,9 +91,13 @@ class GroundFollower:
         is_video: bool,
     ) -> None:
         self._camera, self._ground = camera, ground
-        self._tracker = Tracker(settings)
-        self._heading = None if knows_heading else HeadingFromPictures()
-        self._check = HeadingCheck() if knows_heading and is_video else None
+        self._tracker, fx_px = Tracker(settings), camera.camera.fx_px
+        self._knows_heading = knows_heading
+        self._check = (
+            HeadingCheck(fx_px, knows_heading=knows_heading)
+            if is_video or not knows_heading
+            else None
+        )
         self._path: list[Floats] = []
         self.unlocated: Counter[str] = Counter()
 
@@ -119,19 +122,18 @@ class GroundFollower:
     @property
     def contradiction(self) -> str:
         """What in the telemetry the pictures' motion contradicts; "" where nothing does, and of photos."""
-        pictures = self._heading if self._check is None else self._check.pictures
-        if pictures is None:
+        if self._check is None:
             return ""
         fx_px = self._camera.camera.fx_px
-        words = contradiction(pictures.places, fx_px, knows_tilt=self._heading is None)
-        if not words and self._check is not None and self._check.unturned:
+        words = contradiction(self._check.pictures.places, fx_px, knows_tilt=self._knows_heading)
+        if not words and self._check.unturned:
             seen = counted(self._check.unturned, "detection")
             return f"its headings are far off, which showed only after {seen}: objects may be counted twice"
         return words
 
     def look_ahead(self, coming: Iterable[tuple[Frame, CameraPrior]]) -> None:
         """Learn from a recorded video's first frames, before any is taken, whether headings are far off."""
-        if self._check is not None:
+        if self._check is not None and self._knows_heading:
             self._check.look_ahead(coming, self._below_m)
 
     def take(self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior) -> Taken:
@@ -191,8 +193,6 @@ class GroundFollower:
         self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior
     ) -> CameraPrior:
         """The prior with its heading from the pictures, or with its compass corrected by what stands."""
-        if self._heading is not None:
-            return self._heading.take(frame, time_ns, found, prior, self._below_m(prior))
         if self._check is not None:
             return self._check.take(frame, time_ns, found, prior, self._below_m(prior))
         return prior

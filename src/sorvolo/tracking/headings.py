@@ -18,44 +18,67 @@ from sorvolo.survey.flight import CameraPrior, Frame
 from sorvolo.survey.objects import Detections, no_detections
 from sorvolo.tracking.image_motion import ImageMotion
 
-_WINDOW_S = 20.0  # of the way that is laid on the fixes
+_WINDOW_S = 60.0  # of the way that is laid on the fixes; by choice
+_SHORT_S = 20.0  # the same where tilts are unknown: they sway
 _LEAST_M = 6.0  # of way, rms: less is within the fixes' own errors
 _WANDER_M = 1.0  # of the fixes' error along a way: it turns the way, and fits all the same
+_TILTED = (
+    0.1  # sigma of where the axis meets the ground, in shares of the height: 6 degrees; by choice
+)
 _LEAST_SIGMA_DEG = 4.0  # however well two photos fit
 _STEPS_PER_ERROR = 8.0  # neighbouring fixes, and neighbouring frames' tilts, err alike
 
 
 @dataclass(frozen=True)
-class Heading:
-    """Clockwise from north, of the picture's top; `sigma_deg` is infinite while it is not known."""
+class Way:
+    """What the pictures' way beside the fixes shows of a camera that looks down; sigmas are infinite where that is not known.
 
-    heading_deg: float
-    sigma_deg: float
+    `heading_deg` is the picture's top's, clockwise from north. The middle of the picture lies by `beside_m` too far to
+    the right (real) and the top (imaginary part) by telemetry. `scale` is the true height above the ground in
+    telemetry's.
+    """
+
+    heading_deg: float = 0.0
+    sigma_deg: float = float("inf")
+    beside_m: complex = 0j
+    beside_sigma_m: float = float("inf")
+    scale: float = 1.0
+    scale_sigma: float = float("inf")
 
 
 class HeadingFromMotion:
     """A downward camera's heading from its own pictures and the fixes; `add` and `lose` change it.
 
     `ImageMotion` lays each picture into the first one, which shows how the camera turned and moved since, all but the
-    direction in which it began; the least-squares turn of that way onto the fixes of the last seconds is this direction
-    (Procrustes in the plane, as complex numbers: real part right or east, imaginary part up or north).
+    direction in which it began, its scale and what turns with the camera: least squares lay that way on the places by
+    telemetry (complex numbers: real part right or east, imaginary part up or north). What turns with the camera shows
+    only where it turns: until then its own sigma, `_TILTED`, keeps it from being taken for the fixes' shift.
     """
 
-    def __init__(self) -> None:
-        self._turned_rad = 0.0  # clockwise since the first picture
-        self._points: deque[tuple[float, complex, complex]] = deque()
+    def __init__(self, window_s: float = _WINDOW_S) -> None:
+        self._window_s, self._turned_rad = window_s, 0.0  # clockwise since the first picture
+        self._points: deque[tuple[float, complex, complex, complex, float]] = deque()
 
-    def add(self, time_s: float, outline_px: PointsPx, place_m: Floats) -> Heading:
-        """Take in one picture and return its heading.
+    def add(
+        self,
+        time_s: float,
+        outline_px: PointsPx,
+        place_m: Floats,
+        height_m: float = 50.0,
+        fx_px: float = 1000.0,
+    ) -> Way:
+        """Take in one picture and return what the way shows by now.
 
         `outline_px` (4, 2) are its corners, from the top-left one clockwise, in the first picture's pixels; `place_m`
-        (2,) the fix, east and north.
+        (2,) what its middle shows by telemetry, east and north; `fx_px` is the camera's, in the first picture's pixels.
         """
         right, down = outline_px[1] - outline_px[0]
         self._turned_rad = float(np.arctan2(down, right))
         x, y = outline_px.mean(axis=0)
-        self._points.append((time_s, complex(x, -y), complex(place_m[0], place_m[1])))
-        while time_s - self._points[0][0] > _WINDOW_S:
+        to_right = np.exp(-1j * self._turned_rad)
+        told_m = complex(place_m[0], place_m[1])
+        self._points.append((time_s, complex(x, -y) * height_m / fx_px, told_m, to_right, height_m))
+        while time_s - self._points[0][0] > self._window_s:
             self._points.popleft()
         return self._known()
 
@@ -63,25 +86,30 @@ class HeadingFromMotion:
         """The pictures' way is broken (a cut, a frame that fits nothing): begin anew."""
         self._points.clear()
 
-    def _known(self) -> Heading:
-        seen = np.array([point[1] for point in self._points])
-        fixes = np.array([point[2] for point in self._points])
-        seen, fixes = seen - seen.mean(), fixes - fixes.mean()
-        spread_px = float(np.sqrt(np.mean(np.abs(seen) ** 2)))
-        if (
-            len(seen) < 5
-            or float(np.sqrt(np.mean(np.abs(fixes) ** 2))) < _LEAST_M
-            or spread_px <= 0
-        ):
-            return Heading(0.0, float("inf"))
-        turn = np.vdot(seen, fixes) / np.vdot(seen, seen).real
-        reach_m = abs(turn) * spread_px
-        miss_m = float(np.sqrt(np.mean(np.abs(fixes - turn * seen) ** 2)))
-        count = max(1.0, len(seen) / _STEPS_PER_ERROR)
-        aside_m = np.hypot(miss_m / np.sqrt(count), _WANDER_M)
-        sigma_deg = float(np.degrees(np.arctan2(aside_m, reach_m)))
-        heading_deg = float(np.degrees(-np.angle(turn) + self._turned_rad)) % 360
-        return Heading(heading_deg, sigma_deg if reach_m > 2 * miss_m else float("inf"))
+    def _known(self) -> Way:
+        _, seen_m, told_m, to_right, height_m = np.array(self._points).T
+        told_m = told_m - told_m.mean()
+        rows = np.column_stack([np.ones_like(seen_m), seen_m - seen_m.mean(), to_right])
+        if len(rows) < 5 or told_m.std() < _LEAST_M or seen_m.std() <= 0:
+            return Way()
+        normal = rows.conj().T @ rows / len(rows)
+        normal[2, 2] += (_WANDER_M / (_TILTED * height_m.real.mean())) ** 2
+        inverse = np.linalg.inv(normal)
+        fit = inverse @ (rows.conj().T @ told_m) / len(rows)
+        turn, reach_m = complex(fit[1]), float(abs(fit[1]) * seen_m.std())
+        miss_m = float(np.std(told_m - rows @ fit))
+        if reach_m <= 2 * miss_m:
+            return Way()
+        aside_m = np.hypot(miss_m / np.sqrt(max(1.0, len(rows) / _STEPS_PER_ERROR)), _WANDER_M)
+        sigmas = aside_m * np.sqrt(np.diag(inverse).real)
+        return Way(
+            float(np.degrees(self._turned_rad - np.angle(turn))) % 360,
+            float(np.degrees(np.arctan2(sigmas[1], abs(turn)))),
+            complex(fit[2]) * turn.conjugate() / abs(turn),
+            float(sigmas[2]),
+            abs(turn),
+            float(sigmas[1]),
+        )
 
 
 SeenPlace = tuple[int, int, complex, complex, float]
@@ -157,44 +185,55 @@ def _miss_m(seen_m: NDArray[np.complex128], told_m: NDArray[np.complex128]) -> f
 
 
 class HeadingFromPictures:
-    """The heading of a camera from the motion that its pictures show; without `over_guesses` the way begins anew where
-    a picture shows no motion that fits."""
+    """What the motion in a camera's pictures shows of it; where its heading is known the way begins anew with a picture
+    that shows no motion that fits."""
 
-    def __init__(self, *, over_guesses: bool = True) -> None:
-        self._motion, self._heading = ImageMotion(), HeadingFromMotion()
-        self._segments, self._guessed, self._over_guesses = 1, 0, over_guesses
+    def __init__(self, fx_px: float, *, knows_heading: bool) -> None:
+        self._motion, self._fx_px = ImageMotion(), fx_px
+        self._heading = HeadingFromMotion(_WINDOW_S if knows_heading else _SHORT_S)
+        self._segments, self._guessed, self._over_guesses = 1, 0, not knows_heading
         self.places: list[SeenPlace] = []
 
-    def take(
+    def way(
         self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior, below_m: float
-    ) -> CameraPrior:
-        """The prior with the heading in it, where that is known by now; `below_m` is the ground's height."""
-        heading = self.heading(frame, time_ns, found, prior, below_m)
-        if not np.isfinite(heading.sigma_deg):
-            return prior
-        sigma_deg = np.array([*prior.attitude_sigma_deg[:2], heading.sigma_deg])
-        rotation = site_from_gimbal_rotation(heading.heading_deg, -90.0, 0.0)
-        return replace(prior, rotation=rotation, attitude_sigma_deg=sigma_deg)
-
-    def heading(
-        self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior, below_m: float
-    ) -> Heading:
-        """The heading of a frame, which has to be given each; its sigma is infinite where it is not known by now."""
+    ) -> Way:
+        """What the way to a frame shows, which has to be given each."""
         _, outline_px = self._motion.locate(found, frame, time_ns)
         is_guess = self._motion.guessed != self._guessed and not self._over_guesses
         if self._motion.segments != self._segments or is_guess:
             self._heading.lose()
         self._segments, self._guessed = self._motion.segments, self._motion.guessed
-        if not prior.knows_place:
-            return Heading(0.0, float("inf"))
         ahead, up_m = prior.rotation[:, 2], float(prior.position_m[2]) - below_m
-        if ahead[2] < -_LEAST_DOWN and up_m > 0:
-            x, y = outline_px.mean(axis=0)
-            east, north = prior.position_m[:2] - up_m / ahead[2] * ahead[:2]
-            up_m *= frame.image.shape[1] / float(np.hypot(*(outline_px[1] - outline_px[0])))
-            told_m = complex(east, north)
-            self.places.append((self._segments, frame.time_ns, complex(x, -y), told_m, up_m))
-        return self._heading.add(time_ns / 1e9, outline_px, prior.position_m[:2])
+        if not prior.knows_place or not (ahead[2] < -_LEAST_DOWN and up_m > 0):
+            return Way()
+        middle_m = prior.position_m[:2] - up_m / ahead[2] * ahead[:2]
+        x, y = outline_px.mean(axis=0)
+        shrunk = float(np.hypot(*(outline_px[1] - outline_px[0]))) / frame.image.shape[1]
+        told_m = complex(middle_m[0], middle_m[1])
+        self.places.append((self._segments, frame.time_ns, complex(x, -y), told_m, up_m / shrunk))
+        return self._heading.add(time_ns / 1e9, outline_px, middle_m, up_m, self._fx_px * shrunk)
+
+
+def righted(prior: CameraPrior, way: Way, below_m: float) -> CameraPrior:
+    """The prior with its tilt and its height above the ground corrected by what is sure of what a way shows."""
+    up_m = float(prior.position_m[2]) - below_m
+    height_m = up_m * (1 + (way.scale - 1) * _sure(way.scale - 1, way.scale_sigma))
+    tilt = way.beside_m * _sure(abs(way.beside_m), way.beside_sigma_m) / height_m
+    tilted = rotation_from_vector(np.array([-tilt.imag, -tilt.real, 0.0]))
+    return replace(
+        prior,
+        position_m=np.array([*prior.position_m[:2], below_m + height_m]),
+        position_sigma_m=np.minimum(
+            prior.position_sigma_m, [np.inf, np.inf, way.scale_sigma * height_m]
+        ),
+        rotation=prior.rotation @ tilted,
+    )
+
+
+def _sure(shown: float, sigma: float) -> float:
+    """How much of an error that may have any size is sure, where it is shown with this sigma (James and Stein's positive
+    part)."""
+    return 1 - min(1.0, sigma / (abs(shown) + 1e-9)) ** 2
 
 
 _LEAST_DOWN = 0.96  # of the optical axis: 16 degrees off straight down or less; the heading of others is not checked
@@ -250,8 +289,7 @@ _REMEMBERED_S = 20.0  # of what was shown; by choice
 class CompassError:
     """By how much headings by telemetry have to turn clockwise: the mean of what pictures showed lately.
 
-    A compass's errors have no known spread, so that a mean of T with a sigma of s is shrunk by what s alone explains: to
-    T (1 - s²/T²), or 0 (James and Stein's positive part). `turns_deg` are the turns of what was corrected.
+    Only what is sure of it is corrected (`_sure`). `turns_deg` are the turns of what was corrected.
     """
 
     turns_deg: list[float] = field(default_factory=list)
@@ -280,8 +318,8 @@ class CompassError:
     def corrected(self, prior: CameraPrior) -> CameraPrior:
         """The prior, turned by what is sure."""
         turn = self.turn
-        kept = 1 - (turn.sigma_deg / (abs(turn.turn_deg) + 1e-9)) ** 2
-        if kept <= 0:
+        kept = _sure(turn.turn_deg, turn.sigma_deg)
+        if kept == 0:
             return prior
         self.turns_deg.append(kept * turn.turn_deg)
         return turned(prior, HeadingTurn(kept * turn.turn_deg, turn.sigma_deg))
@@ -290,22 +328,23 @@ class CompassError:
 _LEAST_ELAPSED_S = 0.1  # the first one weighs as much; by choice
 _TURNS_DEG_S = 20.0  # a drone that turns faster has its heading not checked; by choice
 _CLOCK_OFF_NS = 1_000_000_000  # by which telemetry's clock may be off: so long after a turn headings are not checked
-_AHEAD_NS = 30 * 10**9  # so far a recording is looked at before it begins; by choice
-_SURE_DEG = 1.7  # a heading shown so well needs no further look ahead; by choice
+_AHEAD_NS = 60 * 10**9  # so far a recording is looked at before it begins; by choice
+_SURE_DEG, _SURE_M = 1.7, 2.0  # what is shown so well needs no further look ahead; by choice
 _FAR_OFF_DEG = 15.0  # what was placed before such a turn showed is doubted; by choice
 _JUMP_DEG = 60.0  # from one frame to the next, against the pictures' own turning; by choice
 
 
 class HeadingCheck:
-    """A video's headings corrected by the motion that its pictures show, where the camera looks about straight down.
+    """A video's cameras corrected by the motion that their pictures show, where they look about straight down.
 
     While the drone turns nothing but a jump is judged: telemetry's clock may be off. `unturned` are the detections that
     were placed before the pictures showed a heading that is far off.
     """
 
-    def __init__(self) -> None:
-        self.pictures = HeadingFromPictures(over_guesses=False)
-        self.error = CompassError()
+    def __init__(self, fx_px: float, *, knows_heading: bool) -> None:
+        self._fx_px, self._knows_heading = fx_px, knows_heading
+        self.pictures = HeadingFromPictures(fx_px, knows_heading=knows_heading)
+        self.error, self._way = CompassError(), Way()
         self._last: tuple[int, float, float] | None = None  # time, heading, turn, as last shown
         self._steady_ns = 0  # the drone turns until then
         self._unjudged, self.unturned = 0, 0
@@ -314,34 +353,42 @@ class HeadingCheck:
         self, coming: Iterable[tuple[Frame, CameraPrior]], below_m: Callable[[CameraPrior], float]
     ) -> None:
         """Begin with the turn that the flight's first frames show together."""
-        ahead, first_ns = HeadingCheck(), -1
+        ahead, first_ns = HeadingCheck(self._fx_px, knows_heading=self._knows_heading), -1
         for frame, prior in coming:
             first_ns = frame.time_ns if first_ns < 0 else first_ns
-            looks_aside = prior.knows_place and not is_checked(prior)
+            looks_aside = prior.knows_place and -float(prior.rotation[2, 2]) < _LEAST_DOWN
             if looks_aside or frame.time_ns - first_ns > _AHEAD_NS:
                 break
             ahead.take(frame, frame.time_ns, no_detections(()), prior, below_m(prior))
-            if ahead.error.sigma_deg < _SURE_DEG:
+            if ahead.error.sigma_deg < _SURE_DEG and ahead._way.beside_sigma_m < _SURE_M:
                 break
-        self.error = replace(ahead.error, turns_deg=[])
+        self.error, self._way = replace(ahead.error, turns_deg=[]), ahead._way
 
     def take(
         self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior, below_m: float
     ) -> CameraPrior:
-        """The prior with its heading corrected; `below_m` is the ground's height."""
-        shown = self.pictures.heading(frame, time_ns, found, prior, below_m)
-        if not is_checked(prior):
+        """The prior with its heading, tilt and height corrected; `below_m` is the ground's height."""
+        shown = self.pictures.way(frame, time_ns, found, prior, below_m)
+        if not is_checked(prior) and self._knows_heading:
             return prior
         if np.isfinite(shown.sigma_deg):
             self._judge(time_ns, shown, prior)
+            if shown.beside_sigma_m < max(self._way.beside_sigma_m, _SURE_M):
+                self._way = shown
+        if not self._knows_heading:
+            if not np.isfinite(shown.sigma_deg):
+                return prior
+            sigma_deg = np.array([*prior.attitude_sigma_deg[:2], shown.sigma_deg])
+            rotation = site_from_gimbal_rotation(shown.heading_deg, -90.0, 0.0)
+            return replace(prior, rotation=rotation, attitude_sigma_deg=sigma_deg)
         turn = self.error.turn
         if not np.isfinite(turn.sigma_deg):
             self._unjudged += len(found)
         elif not self.error.turns_deg and abs(turn.turn_deg) > max(_FAR_OFF_DEG, turn.sigma_deg):
             self.unturned = self._unjudged
-        return self.error.corrected(prior)
+        return righted(self.error.corrected(prior), self._way, below_m)
 
-    def _judge(self, time_ns: int, shown: Heading, prior: CameraPrior) -> None:
+    def _judge(self, time_ns: int, shown: Way, prior: CameraPrior) -> None:
         """Take in what a frame's way shows of the compass, where the frame allows it."""
         turn = HeadingTurn(shown.heading_deg - heading_deg(prior), shown.sigma_deg)
         now = (time_ns, shown.heading_deg, turn.turn_deg)
