@@ -795,6 +795,22 @@ def test_headings_of_a_video_that_are_far_off_are_set_right(
     assert "headings_wrong" not in before
 
 
+def test_heights_that_are_off_are_set_right(
+    flown: Path, detector: TruthDetector, rightly_headed: Watched, tmp_path: Path
+) -> None:
+    """The same objects in the same places from a log whose heights above take-off are a fifth too low."""
+    rows = _rows(flown)
+    for row in rows:
+        row["relativeHeight"] = f"{0.8 * float(row['relativeHeight']):.3f}"
+    log = _written(rows, tmp_path / "low.csv")
+    right, before = rightly_headed
+    found, notices = _watched(_video(flown), flown, detector, tmp_path / "off", log)
+    assert [each[0] for each in found] == [each[0] for each in right]
+    beside_deg = np.array([each[1:] for each in found]) - np.array([each[1:] for each in right])
+    assert np.abs(beside_deg).max() < 2e-5
+    assert "heights_wrong" in notices and "heights_wrong" not in before
+
+
 def test_a_heading_that_shows_only_later_makes_no_clean_headline(
     flown: Path, detector: TruthDetector, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

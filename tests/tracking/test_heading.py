@@ -144,6 +144,7 @@ def test_a_tilt_and_a_height_that_are_off_show_on_the_way_back(
         middle_m = place_m + told_m * np.tan(np.radians(tilt_deg)) * forward[number]
         way = finder.add(number / 5, outline_px, middle_m, told_m, 50 / _M_PER_PX)
     assert way.scale == pytest.approx(1 / told_share, abs=0.02)
+    assert way.sure_scale == pytest.approx(1 / told_share, abs=0.03)
     rotation = site_from_gimbal_rotation(270.0, -90.0 + tilt_deg, 0.0)
     prior = CameraPrior(np.array([*way_m[-1], told_m]), np.ones(3), rotation, np.full(3, 2.0))
     right = righted(prior, way, 0.0)

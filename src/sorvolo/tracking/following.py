@@ -120,6 +120,11 @@ class GroundFollower:
         return () if self._check is None else self._check.error.turns_deg
 
     @property
+    def height_scale(self) -> float:
+        """The height above the ground in telemetry's, as the pictures' motion shows it; 1 where that is not known."""
+        return 1.0 if self._check is None else self._check.shown.sure_scale
+
+    @property
     def contradiction(self) -> str:
         """What in the telemetry the pictures' motion contradicts; "" where nothing does, and of photos."""
         if self._check is None:
@@ -192,7 +197,7 @@ class GroundFollower:
     def _with_heading(
         self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior
     ) -> CameraPrior:
-        """The prior with its heading from the pictures, or with its compass corrected by what stands."""
+        """The prior with what the pictures' motion shows of the camera."""
         if self._check is not None:
             return self._check.take(frame, time_ns, found, prior, self._below_m(prior))
         return prior

@@ -22,9 +22,7 @@ _WINDOW_S = 60.0  # of the way that is laid on the fixes; by choice
 _SHORT_S = 20.0  # the same where tilts are unknown: they sway
 _LEAST_M = 6.0  # of way, rms: less is within the fixes' own errors
 _WANDER_M = 1.0  # of the fixes' error along a way: it turns the way, and fits all the same
-_TILTED = (
-    0.1  # sigma of where the axis meets the ground, in shares of the height: 6 degrees; by choice
-)
+_TILTED = 0.1  # sigma of where the axis meets the ground, in heights: 6 degrees; by choice
 _LEAST_SIGMA_DEG = 4.0  # however well two photos fit
 _STEPS_PER_ERROR = 8.0  # neighbouring fixes, and neighbouring frames' tilts, err alike
 
@@ -44,6 +42,11 @@ class Way:
     beside_sigma_m: float = float("inf")
     scale: float = 1.0
     scale_sigma: float = float("inf")
+
+    @property
+    def sure_scale(self) -> float:
+        """The scale, as far as it is sure."""
+        return 1 + (self.scale - 1) * _sure(self.scale - 1, self.scale_sigma)
 
 
 class HeadingFromMotion:
@@ -217,7 +220,7 @@ class HeadingFromPictures:
 def righted(prior: CameraPrior, way: Way, below_m: float) -> CameraPrior:
     """The prior with its tilt and its height above the ground corrected by what is sure of what a way shows."""
     up_m = float(prior.position_m[2]) - below_m
-    height_m = up_m * (1 + (way.scale - 1) * _sure(way.scale - 1, way.scale_sigma))
+    height_m = up_m * way.sure_scale
     tilt = way.beside_m * _sure(abs(way.beside_m), way.beside_sigma_m) / height_m
     tilted = rotation_from_vector(np.array([-tilt.imag, -tilt.real, 0.0]))
     return replace(
@@ -338,13 +341,14 @@ class HeadingCheck:
     """A video's cameras corrected by the motion that their pictures show, where they look about straight down.
 
     While the drone turns nothing but a jump is judged: telemetry's clock may be off. `unturned` are the detections that
-    were placed before the pictures showed a heading that is far off.
+    were placed before the pictures showed a heading that is far off. `shown` is the way by which heights and tilts are
+    corrected.
     """
 
     def __init__(self, fx_px: float, *, knows_heading: bool) -> None:
         self._fx_px, self._knows_heading = fx_px, knows_heading
         self.pictures = HeadingFromPictures(fx_px, knows_heading=knows_heading)
-        self.error, self._way = CompassError(), Way()
+        self.error, self.shown = CompassError(), Way()
         self._last: tuple[int, float, float] | None = None  # time, heading, turn, as last shown
         self._steady_ns = 0  # the drone turns until then
         self._unjudged, self.unturned = 0, 0
@@ -360,9 +364,9 @@ class HeadingCheck:
             if looks_aside or frame.time_ns - first_ns > _AHEAD_NS:
                 break
             ahead.take(frame, frame.time_ns, no_detections(()), prior, below_m(prior))
-            if ahead.error.sigma_deg < _SURE_DEG and ahead._way.beside_sigma_m < _SURE_M:
+            if ahead.error.sigma_deg < _SURE_DEG and ahead.shown.beside_sigma_m < _SURE_M:
                 break
-        self.error, self._way = replace(ahead.error, turns_deg=[]), ahead._way
+        self.error, self.shown = replace(ahead.error, turns_deg=[]), ahead.shown
 
     def take(
         self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior, below_m: float
@@ -373,8 +377,8 @@ class HeadingCheck:
             return prior
         if np.isfinite(shown.sigma_deg):
             self._judge(time_ns, shown, prior)
-            if shown.beside_sigma_m < max(self._way.beside_sigma_m, _SURE_M):
-                self._way = shown
+            if shown.beside_sigma_m < max(self.shown.beside_sigma_m, _SURE_M):
+                self.shown = shown
         if not self._knows_heading:
             if not np.isfinite(shown.sigma_deg):
                 return prior
@@ -386,7 +390,7 @@ class HeadingCheck:
             self._unjudged += len(found)
         elif not self.error.turns_deg and abs(turn.turn_deg) > max(_FAR_OFF_DEG, turn.sigma_deg):
             self.unturned = self._unjudged
-        return righted(self.error.corrected(prior), self._way, below_m)
+        return righted(self.error.corrected(prior), self.shown, below_m)
 
     def _judge(self, time_ns: int, shown: Way, prior: CameraPrior) -> None:
         """Take in what a frame's way shows of the compass, where the frame allows it."""

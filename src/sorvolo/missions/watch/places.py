@@ -82,6 +82,7 @@ def over_heights(
 
 
 _COMPASS_REPORTED_DEG = 5.0  # by which headings are off: less is not worth a notice; by choice
+_HEIGHT_REPORTED = 0.05  # the same of heights above the ground; by choice
 _AHEAD_STEP_S = 0.2  # between frames that are looked at before the watch
 CONTRADICTED = "telemetry_contradicted"
 _OF_MAPS = (
@@ -221,6 +222,12 @@ class GroundPlaces(Places):
                 f"{counted(len(turns_deg), 'picture')}"
             )
             found.append(Notice("headings_wrong", len(turns_deg), text))
+        if abs(follower.height_scale - 1) > _HEIGHT_REPORTED:
+            text = (
+                f"the height above the ground is {follower.height_scale:.2f} times the telemetry's, as the pictures "
+                "show: corrected"
+            )
+            found.append(Notice("heights_wrong", 1, text))
         if why_not := follower.contradiction:
             text = f"the pictures' motion contradicts the telemetry: {why_not}"
             found.append(Notice(CONTRADICTED, 1, text))
