@@ -129,6 +129,7 @@ def test_it_goes_on_and_notifies_nobody_twice(
     shutil.move(amid, whole)
     for name in ("", "annotated", "objects"):  # what was being written
         (whole / name / ".tmp-1-picture.jpg").write_bytes(b"half")
+    (whole / "objects" / "999.jpg").write_bytes(b"of a track that does not come again")
     alerts.unlink()
     detector.asked = 0
     monkeypatch.setattr(

@@ -19,6 +19,7 @@ from sorvolo.store.exports.annotated import AnnotatedVideo, annotated, write_ann
 from sorvolo.store.exports.detection_files import (
     ANNOTATED_PICTURES,
     ANNOTATED_VIDEO,
+    CROPS,
     LABELS,
     TRACKS,
     TRACKS_GPX,
@@ -72,7 +73,6 @@ class WatchFiles:
         self._best: dict[int, Sighting] = {}
         self.crop_names: dict[int, str] = {}
         self.segments: dict[int, int] = {}  # by track
-        self._forgotten: list[str] = []
         self._shown_s = time.monotonic()
         self._labelled: list[tuple[LabelledPicture, Floats]] = []
         self._classes: tuple[str, ...] = ()
@@ -132,14 +132,15 @@ class WatchFiles:
 
     def forget(self, track_ids: Iterable[int]) -> None:
         """The crops of tracks that turned out to be others belong to nothing any more; `clear` removes them."""
-        self._forgotten += [
-            name for each in track_ids if (name := self.crop_names.pop(each, None)) is not None
-        ]
+        for each in track_ids:
+            self.crop_names.pop(each, None)
 
     def clear(self) -> None:
-        """Remove the crops that were forgotten; not earlier: who received an alert may still be looking at them."""
-        for name in self._forgotten:
-            (self.folder / name).unlink(missing_ok=True)
+        """Remove the crops of no track, a killed watch's too; not earlier: who received an alert may still look at them."""
+        kept = set(self.crop_names.values())
+        for path in (self.folder / CROPS).glob("*.jpg"):
+            if f"{CROPS}/{path.name}" not in kept:
+                path.unlink(missing_ok=True)
 
     def show(self, tracks: Iterable[Track]) -> None:
         """Bring the list of tracks up to date, unless that was done within the last seconds."""
