@@ -53,8 +53,10 @@ async function saveDrawings(screen, change) {
   }
 }
 
-/** Send the drawings that wait; what the station refuses for good is said and dropped. */
-export async function sendDrawings(screen) {
+/** Send the drawings that wait, one time after another; what the station refuses for good is said and dropped. */
+export const sendDrawings = (screen) => (screen.sending = Promise.resolve(screen.sending).catch(() => {}).then(() => send(screen)));
+
+async function send(screen) {
   const mine = unsentOf(screen);
   if (!mine.length) return;
   const isMine = ({ id }) => mine.some((each) => each.id === id);
