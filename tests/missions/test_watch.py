@@ -811,6 +811,25 @@ def test_heights_that_are_off_are_set_right(
     assert "heights_wrong" in notices and "heights_wrong" not in before
 
 
+def test_heights_of_a_log_without_angles_are_not_called_corrected(
+    flown: Path, detector: TruthDetector, tmp_path: Path
+) -> None:
+    """There only the heading is taken from the pictures."""
+    rows = [
+        {name: value for name, value in row.items() if name not in _ANGLES} for row in _rows(flown)
+    ]
+    for row in rows:
+        row["relativeHeight"] = f"{0.8 * float(row['relativeHeight']):.3f}"
+    log = _written(rows, tmp_path / "low.csv")
+    _, notices = _watched(_video(flown), flown, detector, tmp_path / "off", log)
+    assert "heights_wrong" not in notices
+
+
+_ANGLES = {"Yaw", "Pitch", "Roll", "quatW", "quatX", "quatY", "quatZ"} | {
+    f"Gimbal:{name}" for name in ("yaw", "pitch", "roll", "Xroll", "Xpitch", "Yyaw")
+}
+
+
 def test_a_heading_that_shows_only_later_makes_no_clean_headline(
     flown: Path, detector: TruthDetector, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

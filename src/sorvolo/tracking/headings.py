@@ -373,18 +373,18 @@ class HeadingCheck:
     ) -> CameraPrior:
         """The prior with its heading, tilt and height corrected; `below_m` is the ground's height."""
         shown = self.pictures.way(frame, time_ns, found, prior, below_m)
-        if not is_checked(prior) and self._knows_heading:
-            return prior
-        if np.isfinite(shown.sigma_deg):
-            self._judge(time_ns, shown, prior)
-            if shown.beside_sigma_m < max(self.shown.beside_sigma_m, _SURE_M):
-                self.shown = shown
         if not self._knows_heading:
             if not np.isfinite(shown.sigma_deg):
                 return prior
             sigma_deg = np.array([*prior.attitude_sigma_deg[:2], shown.sigma_deg])
             rotation = site_from_gimbal_rotation(shown.heading_deg, -90.0, 0.0)
             return replace(prior, rotation=rotation, attitude_sigma_deg=sigma_deg)
+        if not is_checked(prior):
+            return prior
+        if np.isfinite(shown.sigma_deg):
+            self._judge(time_ns, shown, prior)
+            if shown.beside_sigma_m < max(self.shown.beside_sigma_m, _SURE_M):
+                self.shown = shown
         turn = self.error.turn
         if not np.isfinite(turn.sigma_deg):
             self._unjudged += len(found)
