@@ -16,6 +16,7 @@ from sorvolo.findings.register import (
     Register,
     SearchedDate,
     associate,
+    untold,
 )
 from sorvolo.survey.findings import ChangeFacts, ChangeKind
 from sorvolo.survey.map_objects import SearchedFrames
@@ -137,6 +138,26 @@ def test_changes_that_nobody_named_are_things_too() -> None:
     assert between(register, "flight0", "flight1") == "1 truck came; 1 thing left"
     (lasting,) = associate(seen[1:2], [look(1), look(2)]).findings
     assert not lasting.gone  # nobody looks for it
+    for label in ("", "small object"):  # no detector looks for them, so the comparison alone tells
+        came = associate([replace(seen[1], label=label)], [])
+        assert between(came, "flight0", "flight1") == f"1 {label or 'thing'} came"
+
+
+def test_what_no_change_tells_is_told_by_the_searches() -> None:
+    """A person left whose ground looks the same, another with a change; a change at the place, rejected perhaps, tells."""
+    left = {"label": "person", "origin": KnownBy.CHANGED, "gone": "flight1", "order": 1.0}
+    seen = [sighting(0, "map", east_m, label="person") for east_m in (0.0, 20.0)]
+    seen += [sighting(0, "left", 20.1, **left), sighting(1, "map", 40.0)]
+    register = associate(seen, [look(0), look(1)])
+    told = replace(change(1, 25.0, 0.6, ChangeKind.DISAPPEARED), id=seen[2].id)
+    car, person = untold(register, [told], ["flight0"], "flight1")
+    assert (person.kind, person.class_before) == (ChangeKind.DISAPPEARED, "person")
+    assert (car.kind, car.class_after) == (ChangeKind.APPEARED, "car")
+    assert np.allclose(person.centre_m, [0, 0]) and np.allclose(car.length_m, 4.4)
+    rejected = change(2, 0.3, 0.6, ChangeKind.DISAPPEARED)
+    moves, ploughed = (change(3, 40.0, 4.0, kind) for kind in (ChangeKind.MOVING, ChangeKind.AREA))
+    others = [told, rejected, moves, ploughed]
+    assert [each.kind for each in untold(register, others, ["flight0"], "flight1")] == ["appeared"]
 
 
 def test_what_came_where_its_like_left_is_seen_once() -> None:

@@ -634,9 +634,22 @@ def test_a_comparison_shows_the_same_on_both_sides_and_blinks_bare_ground(
 ) -> None:
     watched = Watched(context_of(browser, device_scale_factor=1), served.url)
     page = watched.page
+
+    def left(route: Any) -> None:
+        """By the search of both dates alone: no change tells it."""
+        found = (answer := route.fetch()).json()
+        own = {"class": "person", "gone": "b", "flights": ["a"], "untold": {"b": "disappeared"}}
+        place = found["features"][0]["geometry"]
+        gone = {"type": "Feature", "id": "left", "geometry": place, "properties": own}
+        route.fulfill(response=answer, json={**found, "features": [*found["features"], gone]})
+
+    page.route(re.compile("collections/findings"), left)
     show(watched, served)
-    page.locator("#rooms [data-panel=compare]").click()
+    page.locator("#sentence button", has_text="5 changes").click()
     page.locator(".before-map .maplibregl-canvas").wait_for()
+    expect(page.locator(".changes li")).to_have_count(5)
+    alone = page.locator(".changes li", has_text="by the search, not by the pictures")
+    expect(alone).to_contain_text("person disappeared")
     page.locator(".changes button").first.click()
     edge = page.get_by_label("Swipe between before and after")
     for split in ("100", "0"):  # before alone, after alone

@@ -25,11 +25,13 @@ from sorvolo.findings.importance import between, in_short
 from sorvolo.geometry.polygons import signed_area
 from sorvolo.missions.site.history import came_and_left
 from sorvolo.missions.worker import PERSON_FOUND, Journal, _add_people
+from sorvolo.station.found import found_features
 from sorvolo.store.exports.change_files import changes_geojson, mask_name, write_view_masks
 from sorvolo.store.exports.places import Placemark, gpx_bytes, kml_bytes, longitude_latitude
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.change_records import StoredChange, stored_changes
 from sorvolo.survey.findings import Change, ChangeKind, HeightChange, Verdict
+from sorvolo.survey.map_objects import MapObject, ObjectSearch, SearchedFrames
 
 
 @pytest.fixture
@@ -286,9 +288,23 @@ def test_history_states_what_the_comparison_states(folder: Path) -> None:
     with Archive.open(folder, write=True) as archive:
         archive.review(changes[1].id, Verdict.REJECTED)
     assert came_and_left(folder) == f"from a to b: {in_short(changes[:1])}"
+    # whom the search of one date found, and that of the other did not
+    outlines_m = np.array([[[-99, 99], [99, 99], [99, -99], [-99, -99]]] * 2, float)
+    person = MapObject("a-o1", "person", 0.9, np.zeros(2), 0.3, 0.6, 0.4, 2, 2, SEEN_NS, SEEN_NS)
+    search = ObjectSearch("default", ("person",), (), SearchedFrames(outlines_m), 2, 0, 0)
+    with Archive.open(folder, write=True) as archive:
+        for flight, objects, found in (("a", (person,), None), ("b", (), changes)):
+            searched = replace(search, objects=objects)
+            with archive.begin_flight(flight, "", {}) as writer:
+                report = {"flight": flight, "comparison": found and fake_comparison()}
+                writer.commit([frame(0)], {}, report, "", changes=found, search=searched)
+        archive.review(changes[1].id, Verdict.REJECTED)
+        (left,) = (each for each in found_features(archive, [], []) if each["properties"]["untold"])
+    assert left["properties"]["untold"] == {"b": "disappeared"}
+    assert came_and_left(folder) == f"from a to b: 1 person left; {in_short(changes[:1])}"
     with Archive.open(folder, write=True) as archive, archive.begin_flight("c", "", {}) as writer:
         writer.commit([frame(0)], {}, {"flight": "c"}, "<html></html>")
-    assert "no objects were searched for on b and c" in came_and_left(folder)
+    assert "no objects were searched for on c" in came_and_left(folder)
 
 
 def test_a_person_whom_a_comparison_alone_found_is_announced(folder: Path) -> None:

@@ -14,7 +14,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 from sorvolo.geometry.arrays import Floats, PointsM, Rows, frozen
-from sorvolo.survey.findings import ChangeKind
+from sorvolo.survey.findings import ChangeFacts, ChangeKind
 from sorvolo.survey.map_objects import SearchedFrames, looked_at
 
 # Of its own length something may lie from where another mission found it, and so much more: a person who turned.
@@ -31,6 +31,7 @@ _LIKE_SIZE = 2.5  # lengths further apart than this ratio are two things, where 
 _LIKE_CLASS = 0.1  # classes' shares that agree less are two classes
 _NAMED = 0.1  # beside a detector's own class counts that of a change: by the same frames, or one small picture
 _LEFT = 4.0  # as unlike is what the date's comparison saw leave: what came in its place is nearer
+_SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
 _FAR = 1e3  # the cost of a pair that cannot be one thing: more than all that can
 
 UNNAMED = "thing"
@@ -117,11 +118,14 @@ class GroundFinding:
     @property
     def newest(self) -> MissionSighting:
         """The surest sighting of the newest date that saw it, a detector's own before a change's."""
-        last = self.dates[-1]
         return max(
-            (each for each in self.sightings if each.date == last),
+            self.of(self.dates[-1]),
             key=lambda each: (each.origin is KnownBy.DETECTED, each.score, each.mission, each.id),
         )
+
+    def of(self, date: str) -> list[MissionSighting]:
+        """Its sightings of a date."""
+        return [each for each in self.sightings if each.date == date]
 
     @cached_property
     def dates(self) -> tuple[str, ...]:
@@ -190,19 +194,52 @@ def reach_m(places_m: PointsM) -> tuple[Floats, Floats]:
 def begun_and_ended(
     register: Register, before: Collection[str], after: str
 ) -> Iterator[tuple[ChangeKind, GroundFinding]]:
-    """What came to be there, or left, between dates that both looked for it: appeared or disappeared. What moves is
-    another's on each date."""
+    """What came to be there, or left, between dates that both looked for it, or by the later one's comparison: appeared
+    or disappeared. What moves is another's on each date."""
     searches = [each.frames for each in register.looks if each.date in before]
-    standing = [each for each in register.findings if not each.newest.moving]
+    concerned = [each for each in register.findings if after in (each.dates[0], each.gone)]
+    standing = [each for each in concerned if not each.newest.moving]
     new = [each for each in standing if each.dates[0] == after]
     places_m = np.array([each.position_m for each in new]).reshape(-1, 2)
     was_looked_for = looked_at(places_m, [each.label for each in new], searches)
     for found, is_known in zip(new, was_looked_for):
-        if is_known and _can_be_missed(found.sightings):
+        by_change = any(
+            each.origin is KnownBy.CHANGED and not each.gone for each in found.of(after)
+        )
+        if by_change or (is_known and _can_be_missed(found.sightings)):
             yield ChangeKind.APPEARED, found
     for found in standing:
         if found.gone == after and any(each in found.dates for each in before):
             yield ChangeKind.DISAPPEARED, found
+
+
+def untold(
+    register: Register, changes: Sequence[ChangeFacts], before: Collection[str], after: str
+) -> Iterator[ChangeFacts]:
+    """What came or left by the detector's searches alone: none of `changes`, all those of the later date, holds it or,
+    rejected perhaps, is at its place. Its outline is the square around it."""
+    ids = {each.id for each in changes}
+    places = [each for each in changes if each.kind not in (ChangeKind.AREA, ChangeKind.MOVING)]
+    for kind, found in begun_and_ended(register, before, after):
+        newest, half_m = found.newest, max(_known(found.newest.length_m), _REACH_M) / 2
+        if ids.isdisjoint(each.id for each in found.sightings) and not any(
+            np.hypot(*(each.centre_m - found.position_m)) <= _REACH_M + half_m + each.length_m / 2
+            for each in places
+        ):
+            yield ChangeFacts(
+                found.id,
+                kind,
+                newest.score,
+                found.position_m + half_m * _SQUARE,
+                found.first_ns,
+                found.last_ns,
+                1,
+                4 * half_m**2,
+                2 * half_m,
+                found.sigma_m,
+                class_before=found.label if kind is ChangeKind.DISAPPEARED else "",
+                class_after=found.label if kind is ChangeKind.APPEARED else "",
+            )
 
 
 def _can_be_missed(sightings: Sequence[MissionSighting]) -> bool:

@@ -13,6 +13,7 @@ from sorvolo.findings.register import (
     MissionSighting,
     associate,
     id_by,
+    untold,
 )
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.paths import Json
@@ -53,7 +54,14 @@ def found_features(
         stored = archive.objects()
     objects = {each.thing.id: each for each in stored}
     watched = {each["id"]: each for each in tracks}
-    return [_feature(each, site, objects, watched) for each in ordered(register.findings)]
+    features = [_feature(each, site, objects, watched) for each in ordered(register.findings)]
+    if archive is not None:
+        properties = {each["id"]: each["properties"] for each in features}
+        flights = list(dict.fromkeys(each.flight_id for each in archive.versions()))
+        for number, flight in enumerate(flights[1:], 1):
+            for each in untold(register, archive.changes(flight), flights[:number], flight):
+                properties[each.id]["untold"][flight] = each.kind
+    return features
 
 
 def _sightings_of(
@@ -174,6 +182,7 @@ def _feature(
         "end_datetime": known["last_seen"],
         "review_kind": "object",
         "crop_of": crop,
+        "untold": {},
     }
     return shown
 

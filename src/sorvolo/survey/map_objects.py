@@ -3,8 +3,8 @@
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
+import shapely
 
 from sorvolo.errors import GeometryError
 from sorvolo.geometry.arrays import Floats, Mask, PointsM, frozen
@@ -121,11 +121,7 @@ def looked_at(places_m: PointsM, labels: Sequence[str], searches: Sequence[Searc
 
 def _shown_often(places_m: PointsM, outlines_m: Floats) -> Mask:
     needed = min(_LOOKS, len(outlines_m))
-    counts = np.zeros(len(places_m), int)
-    for outline_m in outlines_m:
-        low_m, high_m = outline_m.min(axis=0), outline_m.max(axis=0)
-        ring = np.ascontiguousarray(outline_m - low_m, np.float32)
-        for k in np.flatnonzero(((places_m >= low_m) & (places_m <= high_m)).all(axis=1)):
-            east, north = places_m[k] - low_m
-            counts[k] += cv2.pointPolygonTest(ring, (float(east), float(north)), False) >= 0
+    frames = shapely.STRtree(shapely.polygons(outlines_m))
+    shown, _ = frames.query(shapely.points(places_m), predicate="intersects")
+    counts = np.bincount(shown, minlength=len(places_m))
     return np.asarray((counts >= needed) & (needed > 0), bool)

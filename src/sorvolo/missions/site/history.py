@@ -8,6 +8,7 @@ from pathlib import Path
 
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.findings.importance import between, in_short
+from sorvolo.findings.register import untold
 from sorvolo.missions.heights.measure import coloured_heights
 from sorvolo.store.exports.map_pictures import write_kmz, write_preview
 from sorvolo.store.exports.plain import moment_of
@@ -74,19 +75,21 @@ def site_history(site: Path) -> list[HistoryEntry]:
 
 def came_and_left(site: Path) -> str:
     """What came and left between the newest two flights of the site, in a sentence: the comparison's, where the later
-    one was compared. "" for one flight."""
+    one was compared, with what the detector's searches alone show. "" for one flight."""
     with Archive.open(site, write=False) as archive:
         made = {each.flight_id: each.id for each in archive.versions()}
-        flights = list(made)[-2:]
-        if len(flights) < 2:
+        if len(made) < 2:
             return ""
-        if made[flights[1]] in archive.comparisons():
-            changes = archive.changes(flights[1])
+        *_, before, after = made
+        register = archive.register()
+        if made[after] in archive.comparisons():
+            changes = archive.changes(after)
+            others = untold(register, changes, made.keys() - {after}, after)
             kept = [each for each in changes if each.verdict is not Verdict.REJECTED]
-            words = in_short(kept, is_local=archive.site().is_local)
+            words = in_short([*kept, *others], is_local=archive.site().is_local)
         else:
-            words = between(archive.register(), *flights)
-        return f"from {flights[0]} to {flights[1]}: {words}"
+            words = between(register, before, after)
+        return f"from {before} to {after}: {words}"
 
 
 def _entry(

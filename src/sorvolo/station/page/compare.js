@@ -169,16 +169,20 @@ export class Compare {
 
   refresh() {
     if (!this.versions) return;
-    const shown = this.screen.data.shown("changes");
+    const shown = this.changes;
     fill(this.list, el("h3", say("{n} change|{n} changes", { n: shown.length })), el("ol.changes", shown.map((each, k) =>
-      el("li", button([badge(each), ` ${titleOf(each)}`], () => this.fly(k), { class: "link", "aria-current": k === this.at || null })))),
+      el("li", button([badge(each), ` ${titleOf(each)}`, each.properties.untold ? el("small", ` ${say("by the search, not by the pictures' comparison")}`) : null], () => this.fly(k), { class: "link", "aria-current": k === this.at || null })))),
     el("p.note", say("Arrow keys fly from one to the next. Hatched ground could not be compared.")),
     shown.length ? button(say("Review them"), () => this.screen.open("findings"), { icon: "review" }) : null);
     if (this.other) this.put();
   }
 
+  get changes() {
+    return [...this.screen.data.shown("changes"), ...this.screen.data.untold()];
+  }
+
   fly(k) {
-    const shown = this.screen.data.shown("changes");
+    const shown = this.changes;
     if (!shown.length) return;
     this.at = (k + shown.length) % shown.length;
     this.screen.goTo(shown[this.at]);

@@ -65,7 +65,8 @@ export function sentence({ link, loaded, runs, objects, changes, pod, versions, 
   const looked = lookedAt(pod);
   tell(looked ? say("{share} of the ground looked at (a person on it: {from}–{to})", { share: percent(looked.share), from: Math.round(looked.from * 100), to: percent(looked.to) }) : say("the chance to have seen a person is not measured"), "coverage");
   const open = openOf(objects, changes).length;
-  if (changes.length) tell(say("{n} change|{n} changes", { n: changes.length }), "compare");
+  const changed = changes.length + objects.reduce((sum, { properties }) => sum + Object.keys(properties.untold ?? {}).length, 0);
+  if (changed) tell(say("{n} change|{n} changes", { n: changed }), "compare");
   if (open) tell(say("{n} to review", { n: open }), "review");
   return parts;
 }

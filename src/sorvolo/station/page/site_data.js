@@ -63,6 +63,14 @@ export class SiteData extends EventTarget {
     return name === "objects" || name === "changes" ? passing(list, this.filters) : list;
   }
 
+  /** What came or left by the searches of two dates alone, where no comparison of pictures shows a change; of the versions that are compared. */
+  untold() {
+    const [low, high] = this.versions ? [Math.min(...this.versions), Math.max(...this.versions)] : [0, Infinity];
+    const flights = (this.detail.versions ?? []).filter(({ n }) => n > low && n <= high).map(({ flight }) => flight);
+    return passing(this.all.objects, this.filters).flatMap((each) => Object.entries(each.properties.untold ?? {}).filter(([flight]) => flights.includes(flight)).map(([, kind]) => (
+      { ...each, properties: { ...each.properties, kind, [kind === "appeared" ? "class_after" : "class_before"]: each.properties.class, untold: {} } })));
+  }
+
   filter(change) {
     this.filters = { ...this.filters, ...change };
     this.dispatchEvent(new Event("filters"));
