@@ -3,11 +3,13 @@
 import re
 import shutil
 import time
+from datetime import datetime
 from pathlib import Path
 
 from fake_flights import SITE
 from starlette.testclient import TestClient
 
+from sorvolo.station.state import utc_after
 from sorvolo.store.site.archive import Archive
 from waiting import wait_for
 
@@ -52,6 +54,24 @@ def test_what_a_person_marks_as_found_is_a_finding(client: TestClient) -> None:
     assert client.post(reviews, json=vote).json()["id"] == person["id"]
     assert client.put(URL, json={"revision": 1, "features": []}).status_code == 200
     assert client.get(items).json()["features"] == []
+
+
+def test_a_drawing_that_waited_has_the_time_when_it_was_drawn(client: TestClient) -> None:
+    """As its page states it, once; not where that is no moment, lies ahead, or is of a wrong clock."""
+    hour_ago = utc_after(-3600)
+    times = [hour_ago, "", "when?", utc_after(3600), "2001-01-01T00:00:00Z", "0001-01-01"]
+    zones = [zone(str(number), at=each) for number, each in enumerate(times)]
+    answer = client.put(URL, json={"revision": 0, "features": zones}).json()
+    drawn = [each["properties"]["at"] for each in answer["features"]]
+    assert abs(when(drawn[0]) - when(hour_ago)) < 0.1
+    assert all(-60 < when(each) - time.time() <= 0 for each in drawn[1:])
+    again = [zone("0", at=utc_after(-9))]
+    answer = client.put(URL, json={"revision": 1, "features": again}).json()
+    assert answer["features"][0]["properties"]["at"] == drawn[0]
+
+
+def when(moment: str) -> float:
+    return datetime.fromisoformat(moment).timestamp()
 
 
 def test_what_an_earlier_station_drew_can_be_kept_on(client: TestClient, root: Path) -> None:

@@ -27,6 +27,7 @@ import av
 import numpy as np
 from browsers import WAIT_MS, Served, Watched, chromium, context_of
 from fake_changes import fake_change
+from fake_reports import fake_picture, fake_report
 from live_sender import free_port, sending, udp_url
 from PIL import Image
 from playwright.sync_api import expect
@@ -49,6 +50,7 @@ from sorvolo.station.sites import site_summary
 from sorvolo.station.tokens import make_token, revoke_token
 from sorvolo.store.exports.change_files import crop_names
 from sorvolo.store.images import jpeg_from_image, png_from_rgba
+from sorvolo.store.pages.flight import report_page
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.files import HeightFile
 from sorvolo.survey.findings import ChangeKind, Verdict
@@ -595,7 +597,13 @@ def test_what_hides_what_is_measured_and_what_is_wrong_is_said_where_it_is(
     page.locator(".map-tools [data-panel=layers]").click()
     page.get_by_text("Filter", exact=True).click()
     page.get_by_label("Verdict").select_option("rejected")
+    page.reload()
     page.locator(".chips button", has_text="Only rejected").click()
+    page.get_by_text("Filter", exact=True).click()
+    page.get_by_label("Verdict").select_option("confirmed")
+    page.goto(f"{served.url}/#/")
+    page.locator(".card a", has_text="field").first.click()
+    page.locator(KNOWN).wait_for()
     expect(page.locator(".chips button")).to_have_count(0)
     page.locator("[data-panel=measure]").click()
     kept = len(served.ask("/api/sites/field/drawings")["features"])
@@ -627,6 +635,107 @@ def test_what_hides_what_is_measured_and_what_is_wrong_is_said_where_it_is(
     shown.wait_for()
     expect(shown).to_have_js_property("complete", True)
     assert shown.evaluate("each => each.clientWidth <= 4 * each.naturalWidth")
+
+
+def test_a_find_is_shown_in_its_surroundings_and_in_the_video(
+    served: Served, opened: Watched, tmp_path: Path
+) -> None:
+    """With its outline, a scale bar and north, large enough, of a change on both dates; views that look alike once."""
+    page = opened.page
+    change = changes(served)[0]
+    frame = served.ask("/api/sites/field/collections/frames/items")["features"][1]
+    after_s = int(datetime.fromisoformat(change["properties"]["first_seen"]).timestamp())
+    views = [
+        {
+            "flight": flight,
+            "time": datetime.fromtimestamp(after_s + second, UTC).isoformat(),
+            "frame_id": frame["id"],
+            "crop_url": change["properties"]["crops"][0],
+            "video_s": 0.5,
+            "video_url": "/flown.mp4",
+            **{name: [] for name in ("changes", "objects", "reviews")},
+        }
+        for flight, second in [("a", -99), ("a", -98.8), ("a", -98.6), ("a", -90), ("b", 1)]
+    ]
+    page.route("**/field/place?*", lambda route: route.fulfill(json=views))
+    flown = write_video(tmp_path / "flown.mp4").read_bytes()
+    whole = {
+        "content-range": f"bytes 0-{len(flown) - 1}/{len(flown)}",
+        "content-type": "video/mp4",
+    }
+    page.route("**/flown.mp4", lambda route: route.fulfill(status=206, headers=whole, body=flown))
+    page.locator("#rooms [data-panel=findings]").click()
+    page.locator(".segments button", has_text="Changes").click()
+    page.locator(f".strip [data-id='{change['id']}']").click()
+    expect(page.locator(".film li")).to_have_count(3)
+    page.get_by_role("button", name="10 m around").click()
+    shown = page.locator(".ground")
+    expect(shown).to_have_count(2)
+    for figure in shown.all():
+        expect(figure.locator("img")).to_have_js_property("complete", True)
+        ground, outline = (figure.locator(each).bounding_box() for each in ("svg", "svg .outline"))
+        side = min(ground["width"], ground["height"])
+        assert side > 150
+        for at, long in (("x", "width"), ("y", "height")):
+            off = outline[at] + outline[long] / 2 - ground[at] - ground[long] / 2
+            assert abs(off) < 0.02 * side < outline[long]
+        assert figure.locator("text").all_text_contents() == ["2 m", "N"]
+    page.keyboard.press("j")
+    expect(shown).to_have_count(2)  # until it is pressed again
+    page.locator("#rooms [data-panel=live]").click()
+    lon, lat = np.mean(frame["geometry"]["coordinates"][0][:4], axis=0)
+    page.goto(f"{served.url}/#/site/field/place?at={lon},{lat}")
+    page.locator(".film .marked button").first.click()
+    mark = page.locator(".picture .at")
+    mark.wait_for()
+    picture, ring = (each.bounding_box() for each in (page.locator(".picture video"), mark))
+    for at, long in (("x", "width"), ("y", "height")):
+        off = ring[at] + ring[long] / 2 - picture[at] - picture[long] / 2
+        assert abs(off) < 0.05 * picture[long]
+    page.locator(".picture video").evaluate("each => { each.currentTime = 0; }")
+    expect(mark).to_be_hidden()  # the drone was elsewhere
+    page.get_by_label("Close the video").click()
+
+
+def test_a_searcher_s_phone_shows_where_it_is_and_no_engineering(
+    browser: Any, served: Served
+) -> None:
+    """The place of the device in one tap, keys nowhere; a sheet that no slip folds away; memory and disk in Settings."""
+    west, south, east, north = served.ask("/api/sites/field")["bounds_wgs84"]
+    here = {"longitude": west + 0.3 * (east - west), "latitude": south + 0.7 * (north - south)}
+    context = context_of(
+        browser, viewport={"width": 390, "height": 844}, has_touch=True, geolocation=here
+    )
+    context.grant_permissions(["geolocation"])
+    watched = Watched(context, served.url)
+    page = watched.page
+    show(watched, served)
+    page.get_by_label("Where am I?").tap()
+    dot = page.locator(".maplibregl-user-location-dot")
+    dot.wait_for()
+    spot = "() => { const box = document.querySelector('.maplibregl-user-location-dot').getBoundingClientRect(); return document.elementsFromPoint(box.x + box.width / 2, box.y + box.height / 2).some(each => each.closest('.map-canvas')) && box.y; }"
+    wait_for(lambda: page.evaluate(spot))  # in view
+    tab = page.locator("#rooms [data-panel=live]")
+    tab.tap()
+    tab.tap()
+    page.keyboard.press("1")
+    expect(page.get_by_role("heading", name="Activity")).to_be_visible()
+    stops = []
+    for _ in range(3):
+        page.locator(".panel .handle").tap()
+        stops.append(page.locator(".panel").get_attribute("data-stop"))
+    assert sorted(stops) == ["full", "half", "peek"]
+    page.locator("#rooms [data-panel=findings]").tap()
+    page.locator(".confirm").wait_for()
+    engineering = re.compile(r"memory|disk|\bMB\b|matched|by GPS|numpy|sharp")
+    assert not engineering.search(page.locator("body").inner_text())
+    assert not [each for each in page.locator("kbd").all() if each.is_visible()]
+    page.locator("#settings-button").tap()
+    expect(page.get_by_text("Keys", exact=True)).to_be_hidden()
+    page.get_by_text("Diagnostics").tap()
+    assert engineering.search(page.locator(".diagnostics").inner_text())
+    assert watched.faults == []
+    context.close()
 
 
 def test_a_comparison_shows_the_same_on_both_sides_and_blinks_bare_ground(
@@ -1026,16 +1135,42 @@ def test_what_is_drawn_without_the_station_waits_for_it(opened: Watched, served:
     expect(page.locator("#link-state")).to_contain_text("1 waiting")
     page.reload()
     expect(waiting).to_have_count(1)
+    drawn_s = time.time()
+    page.wait_for_timeout(1500)
     page.unroute_all()
     page.reload()
     expect(page.locator("#link-state")).to_have_text("Connected")
     there = served.ask("/api/sites/field/drawings")
     (marked,) = [each for each in there["features"] if each not in kept["features"]]
     assert marked["properties"]["purpose"] == "found"
+    assert datetime.fromisoformat(marked["properties"]["at"]).timestamp() < drawn_s
     expect(page.locator("#sentence")).to_contain_text("1 person")
     wish = {"revision": there["revision"], "features": kept["features"]}
     served.ask("/api/sites/field/drawings", "PUT", wish)
     opened.faults[:] = [each for each in opened.faults if "ERR_FAILED" not in each]
+
+
+def test_what_waits_of_somebody_else_is_said_and_can_be_discarded(opened: Watched) -> None:
+    """It is sent once that person is logged in; here nobody would know of it, for ever."""
+    page = opened.page
+    waiting = page.locator("#link-state")
+    page.evaluate("""async () => {
+      const {votes} = await import('/page/votes.js');
+      const vote = {site: 'field', kind: 'change', id: 'b-1', verdict: 'confirmed', note: '', at: ''};
+      votes.keep(['ada', 'bob', 'bob'].map((who, number) => ({...vote, who, number})));
+    }""")
+    waiting.get_by_role("button", name="3 waiting").click()
+    box = page.get_by_role("dialog")
+    expect(box.locator("li")).to_have_text(
+        [re.compile("1 verdict.* by ada"), re.compile("2 .* by bob")]
+    )
+    box.get_by_role("button", name="Discard for good").last.click()
+    expect(box.locator("li")).to_have_count(1)
+    expect(waiting).to_contain_text("1 waiting")
+    box.get_by_role("button", name="Discard for good").click()
+    expect(box).to_have_count(0)
+    expect(waiting).to_have_text("Connected")
+    assert page.evaluate("localStorage.getItem('sorvolo-votes')") == "[]"
 
 
 def test_a_vote_that_is_refused_is_said_on_every_screen(opened: Watched, served: Served) -> None:
@@ -2338,6 +2473,7 @@ def test_a_vote_on_what_a_watch_has_just_found_is_shown(opened: Watched, served:
         page.keyboard.press("c")
         page.locator(".strip button.confirmed").wait_for()
         expect(page.locator(".strip button[data-id='run-8:1']")).to_have_count(0)
+        page.wait_for_load_state("networkidle")  # its picture is asked for, too
     finally:
         (results / "tracks.geojson").unlink()
 
@@ -2485,4 +2621,29 @@ def test_a_phone_and_paper_show_many_changes_in_little_room(browser: Any) -> Non
     assert last is not None and last["height"] > 0
     printed = page.pdf(format="A4", prefer_css_page_size=True)
     assert len(re.findall(rb"/Type\s*/Page\b", printed)) <= 5
+    page.context.close()
+
+
+def test_a_flight_s_report_keeps_engineering_folded_and_figures_whole(browser: Any) -> None:
+    """Its time, memory, settings and libraries are a click away, at the end; no line breaks before a unit."""
+    page = context_of(browser, viewport={"width": 320, "height": 844}).new_page()
+    page.set_content(report_page(fake_report(), fake_picture()))
+    engineering = re.compile(
+        r"numpy|opencv|memory|processor time|time taken|overlap", re.IGNORECASE
+    )
+    assert not engineering.search(page.locator("body").inner_text())
+    folded = page.locator("details", has_text="How it was computed")
+    folded.locator("summary").click()
+    assert engineering.search(folded.inner_text())
+    assert folded.evaluate("each => !each.closest('section').nextElementSibling")
+    lines = page.locator("h1").evaluate("""each => {
+      const text = each.firstChild, found = [...text.data.matchAll(/[\\d.]+(?:\\s\\d+)*\\s(?:m²|ha|cm|m)(?![a-z])/g)];
+      return found.map(({0: {length}, index}) => {
+        const range = document.createRange();
+        range.setStart(text, index);
+        range.setEnd(text, index + length);
+        return range.getClientRects().length;
+      });
+    }""")
+    assert len(lines) == 2 and set(lines) == {1}
     page.context.close()

@@ -4,8 +4,11 @@ import hashlib
 import json
 import sqlite3
 import threading
+import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Literal
 from urllib.parse import quote
@@ -24,7 +27,7 @@ from sorvolo.station.problems import Problem
 from sorvolo.station.security import FOR_VIEWERS, needs
 from sorvolo.station.settings import StationSettings
 from sorvolo.station.sites import SiteShelf
-from sorvolo.station.state import StationState, compact_json, utc_now
+from sorvolo.station.state import StationState, compact_json, utc_after, utc_now
 from sorvolo.station.tokens import Holder, Role
 from sorvolo.store.atomic import atomic_write_bytes, make_folder
 from sorvolo.survey.findings import Verdict
@@ -320,6 +323,9 @@ def _as_stored(review: Review) -> Verdict | None:
 
 _MOST_DRAWINGS, _MOST_CORNERS = 500, 500
 _FOLDER = "drawings"
+_LONGEST_WAIT_S = (
+    30 * 86_400.0
+)  # of a drawing in a browser without the station: else its clock is wrong
 
 Longitude = Annotated[float, Field(ge=-180, le=180)]
 Latitude = Annotated[float, Field(ge=-90, le=90)]
@@ -350,7 +356,7 @@ class _Properties(Wish, extra="forbid"):
     planned: bool = False
     label: str = Field("", max_length=100)  # of what was found; "" is a person
     by: str = Field("", max_length=200)  # who drew it first, as the station knows it
-    at: str = Field("", max_length=40)  # and when
+    at: str = Field("", max_length=40)  # and when, as the page states
 
 
 class Drawing(Wish):
@@ -367,6 +373,15 @@ class DrawingsWish(Wish):
 
     revision: int = Field(ge=0, le=2**53)
     features: Annotated[list[Drawing], Field(max_length=_MOST_DRAWINGS)]
+
+
+def _drawn_utc(stated: str) -> str:
+    """When a drawing was made that may have waited in a browser; now, where that does not say."""
+    with suppress(ValueError):
+        waited_s = time.time() - datetime.fromisoformat(stated).timestamp()
+        if 0 <= waited_s < _LONGEST_WAIT_S:
+            return utc_after(-waited_s)
+    return utc_now()
 
 
 class Drawings:
@@ -409,7 +424,7 @@ class Drawings:
             for each in wish.features:
                 first = drawn.get(each.id, {"by": who})
                 each.properties.by = first.get("by", "")
-                each.properties.at = first.get("at") or utc_now()
+                each.properties.at = first.get("at") or _drawn_utc(each.properties.at)
             kept = {"revision": now + 1, "features": [each.model_dump() for each in wish.features]}
             path = self._path(site_id)
             make_folder(path.parent)

@@ -7,19 +7,22 @@ const FIRST = {
 };
 
 /** Text that the browser keeps, null to forget it; a private window may keep nothing. */
-export const stored = {
+const storeIn = (place) => ({
   get(key) {
-    try { return localStorage.getItem(key); } catch { return null; }
+    try { return place().getItem(key); } catch { return null; }
   },
   /** Whether it is kept. */
   set(key, text) {
     try {
-      if (text === null) localStorage.removeItem(key);
-      else localStorage.setItem(key, text);
+      if (text === null) place().removeItem(key);
+      else place().setItem(key, text);
       return true;
     } catch { return false; }
   },
-};
+});
+export const stored = storeIn(() => localStorage);
+/** As long as the tab is open. */
+export const tab = storeIn(() => sessionStorage);
 
 /** A list that the browser keeps; where it keeps nothing, as long as the page, which then does not close without a question. */
 export class KeptList {

@@ -1,6 +1,6 @@
 // Drawing on the map: distances, areas and height profiles; areas of interest, alert zones and waypoints, shared by all.
 
-import { get, Problem, put, siteUrl } from "./api.js";
+import { get, now, Problem, put, siteUrl } from "./api.js";
 import { button, cross, el, fill, message, press, quiet, report, svg } from "./dom.js";
 import { isWritten } from "./feature_card.js";
 import { say } from "./languages.js";
@@ -21,7 +21,7 @@ const NONE = { features: [], revision: 0 };
 const REFUSED = [400, 403, 413, 422]; // by the station, for good
 
 export async function loadDrawings(screen) {
-  show(screen, screen.drawings ?? NONE);
+  if (!screen.drawings) show(screen, screen.drawings = NONE);
   if (screen.data.detail.is_new) return;
   try {
     show(screen, await get(siteUrl(screen.data.id, "drawings")));
@@ -33,14 +33,16 @@ export async function loadDrawings(screen) {
 /** Drawings of the screen's site, by whom the page belongs to, that the station does not have yet. */
 const unsentOf = ({ data }) => unsent.all.filter(({ site, who }) => site === data.id && who === votes.who).map(({ feature }) => feature);
 
-function show(screen, { features, revision }) {
+function show(screen, drawings) {
+  const { features } = drawings;
   const mine = unsentOf(screen).filter(({ id }) => !features.some((each) => each.id === id));
-  Object.assign(screen, { zones: [...features, ...mine], drawings: { features, revision } });
+  Object.assign(screen, { zones: [...features, ...mine], drawings });
   screen.view?.ready.then(() => screen.view.put("drawings", screen.zones));
 }
 
 async function saveDrawings(screen, change) {
   const save = async () => {
+    if ((screen.drawings ?? NONE) === NONE) await loadDrawings(screen); // what is there is not known yet
     const { features, revision } = screen.drawings ?? NONE;
     show(screen, await put(siteUrl(screen.data.id, "drawings"), { revision, features: change(features) }));
   };
@@ -167,7 +169,7 @@ export class Draw {
     const count = (this.screen.zones ?? []).filter((each) => each.properties.purpose === purpose).length + 1;
     const geometry = geometryOf(shape, points);
     const name = purpose === "measure" ? sizeOf(geometry) : `${TOOLS[purpose][0]} ${count}`;
-    const feature = { type: "Feature", id: crypto.randomUUID?.() ?? String(Date.now()), geometry, properties: { purpose, name } };
+    const feature = { type: "Feature", id: crypto.randomUUID?.() ?? String(Date.now()), geometry, properties: { purpose, name, at: new Date(now()).toISOString() } };
     this.take(null);
     unsent.keep([...unsent.all, { site: this.screen.data.id, who: votes.who, feature }]);
     votes.changed();
@@ -213,7 +215,7 @@ export class Draw {
       this.may ? el("input", { type: "text", ".value": each.properties.name ?? "", "aria-label": say("Name"), maxlength: 80, on: { change: (event) => this.rename(each, event.target.value) } }) : each.properties.name,
       el("span.soft", sizeOf(each.geometry), each.properties.by ? ` · ${words.nameOf(each.properties.by)}` : "", mine.some(({ id }) => id === each.id) ? ` · ${say("waits to be sent")}` : ""),
       quiet(say("Show"), () => this.screen.view?.go(each.geometry.type === "Point" ? each.geometry.coordinates : boundsOf([each.geometry]))),
-      each.properties.purpose === "interest" ? quiet(say("Filter"), () => this.narrow(each), { "aria-pressed": data.filters.area === each.geometry.coordinates[0] }) : null,
+      each.properties.purpose === "interest" ? quiet(say("Filter"), () => this.narrow(each), { "aria-pressed": isArea(data, each) }) : null,
       this.may ? cross(say("Delete {name}", { name: each.properties.name ?? "" }), () => this.remove([each.id])) : null)),
     route.length ? el("li.route", el("b", say("Re-fly route")), el("span.soft", `${say("{n} point|{n} points", { n: route.length })}, ${words.length(length_m(route.map((each) => each.geometry.coordinates)))}`),
       quiet(say("Show"), () => this.screen.view?.go(boundsOf(route.map((each) => each.geometry)))),
@@ -221,8 +223,7 @@ export class Draw {
   }
 
   narrow(zone) {
-    const ring = zone.geometry.coordinates[0];
-    this.screen.data.filter({ area: this.screen.data.filters.area === ring ? null : ring });
+    this.screen.data.filter({ area: isArea(this.screen.data, zone) ? null : zone.geometry.coordinates[0] });
     this.showList();
   }
 
@@ -233,7 +234,7 @@ export class Draw {
   async remove(ids) {
     unsent.keep(unsent.all.filter(({ feature }) => !ids.includes(feature.id)));
     votes.changed();
-    if (this.screen.zones.some((each) => ids.includes(each.id) && this.screen.data.filters.area === each.geometry.coordinates[0])) this.screen.data.filter({ area: null });
+    if (this.screen.zones.some((each) => ids.includes(each.id) && isArea(this.screen.data, each))) this.screen.data.filter({ area: null });
     await saveDrawings(this.screen, (list) => list.filter((each) => !ids.includes(each.id)));
     this.showList();
   }
@@ -252,6 +253,9 @@ export class Draw {
     this.over.abort();
   }
 }
+
+/** Whether the filter keeps to a zone. */
+const isArea = ({ filters }, { geometry }) => JSON.stringify(filters.area) === JSON.stringify(geometry.coordinates[0]);
 
 const geometryOf = (shape, points) => ({ point: { type: "Point", coordinates: points[0] }, line: { type: "LineString", coordinates: points }, ring: { type: "Polygon", coordinates: [[...points, points[0]]] } })[shape];
 

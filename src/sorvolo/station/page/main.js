@@ -5,6 +5,7 @@ import { applyTheme, choices } from "./choices.js";
 import { button, choice, dialog, el, field, fill, message, quiet, report, tick } from "./dom.js";
 import { Events } from "./events.js";
 import { LANGUAGES, say } from "./languages.js";
+import { grouped } from "./site_data.js";
 import { showSites } from "./sites.js";
 import { unsent, votes } from "./votes.js";
 import { bytes, nameOf, VERDICTS } from "./words.js";
@@ -77,7 +78,8 @@ function listen() {
     const state = station.events.state;
     linkState.className = state;
     const length = votes.waiting.length + unsent.all.length;
-    fill(linkState, LINKS[state], length ? ` · ${say("{n} waiting", { n: length })}` : "");
+    const waiting = say("{n} waiting", { n: length });
+    fill(linkState, LINKS[state], length ? [" · ", [...byOthers().values()].length ? button(waiting, showWaiting, { class: "link" }) : waiting] : "");
     if (state !== "live") return;
     for (const each of document.querySelectorAll(".message.away")) each.remove();
     votes.send();
@@ -89,6 +91,24 @@ function listen() {
   station.events.addEventListener("state", show);
   station.events.addEventListener("reload", () => route());
   station.events.addEventListener("station.disk", ({ detail: { data } }) => disk(data));
+}
+
+/** What waits in this browser of people who are not logged in now, by person. */
+const byOthers = () => grouped([...votes.waiting, ...unsent.all].filter(({ who }) => who !== votes.who), ({ who }) => who);
+
+/** Whose votes and drawings wait here, and what can be done with them. */
+function showWaiting() {
+  const list = el("ul.plain");
+  const show = () => fill(list, [...byOthers()].map(([who, theirs]) => el("li", el("p", say("{n} verdict or drawing by {name}|{n} verdicts and drawings by {name}", { n: theirs.length, name: nameOf(who) })),
+    button(say("Discard for good"), () => {
+      votes.keep(votes.waiting.filter((each) => each.who !== who));
+      unsent.keep(unsent.all.filter((each) => each.who !== who));
+      votes.changed();
+      show();
+      if (!list.children.length) box.close();
+    }))));
+  show();
+  const box = dialog(say("Waiting in this browser"), list, el("p.note", say("They are sent once their author is logged in here.")), station.status.name === "this machine" ? null : button(say("Log in as somebody else"), logOut));
 }
 
 /** The station's disk fell below its floor of free space, or has room again. */

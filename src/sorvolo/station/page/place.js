@@ -52,7 +52,7 @@ export function placePanel(screen, body) {
       reviews.length ? el("section", el("h3", say("Reviews")), el("ul.plain", reviews.map(review))) : null,
       [...flights].map(([flight, list]) => el("section.dates",
         el("h3", words.day(list[0].time), el("small", ` ${flight}`)),
-        el("ol.film", { tabindex: 0, "aria-label": say("Views of {flight}", { flight }) }, list.map((each) => view(screen, each))))));
+        el("ol.film", { tabindex: 0, "aria-label": say("Views of {flight}", { flight }) }, apart(list).map((each) => view(screen, each, place))))));
   }
 
   if (last) look(last);
@@ -91,11 +91,22 @@ function review(each) {
 }
 
 /** A button that plays the video of a place's view; null where there is none. */
-export const jump = (screen, each) => (each.video_s === null || !each.video_url ? null
-  : quiet(`▶ ${words.duration(each.video_s)}`, () => screen.video.play(each), { title: say("Show the video at this second") }));
+export const jump = (screen, each, place) => (each.video_s === null || !each.video_url ? null
+  : quiet(`▶ ${words.duration(each.video_s)}`, () => screen.video.play(each, place), { title: say("Show the video at this second") }));
 
-function view(screen, each) {
-  return el("li", each.crop_url ? picture(each.crop_url, say("Seen {time}", { time: words.time(each.time) })) : el("div.gone", say("no picture kept")), el("span", words.clock(each.time)), jump(screen, each));
+/** Of views less than a second apart, which look alike, the one in the middle. */
+export function apart(views) {
+  const runs = [];
+  for (const each of views) {
+    const last = runs.at(-1);
+    if (last && last[0].flight === each.flight && new Date(each.time) - new Date(last[0].time) < 1000) last.push(each);
+    else runs.push([each]);
+  }
+  return runs.map((run) => run[run.length >> 1]);
+}
+
+function view(screen, each, place) {
+  return el("li.marked", each.crop_url ? picture(each.crop_url, say("Seen {time}", { time: words.time(each.time) })) : el("div.gone", say("no picture kept")), el("span", words.clock(each.time)), jump(screen, each, place));
 }
 
 /** With which chance somebody at a place would have been seen, and why so little; null where the map shows no such layer. */

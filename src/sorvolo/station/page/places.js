@@ -84,6 +84,16 @@ export function area_m2(ring) {
   return Math.abs(twice) / 2;
 }
 
+/** Where a [lon, lat] is in a picture whose corners on the ground are a ring, the top left first: shares of width and height. */
+export function shareIn(ring, [lon, lat]) {
+  const [[x0, y0], [x1, y1], [x2, y2], [x3, y3]] = ring.map(([x, y]) => [x - lon, y - lat]);
+  const [sx, sy] = [x0 - x1 + x2 - x3, y0 - y1 + y2 - y3];
+  const all = (x1 - x2) * (y3 - y2) - (x3 - x2) * (y1 - y2);
+  const [g, h] = [(sx * (y3 - y2) - (x3 - x2) * sy) / all, ((x1 - x2) * sy - sx * (y1 - y2)) / all];
+  const [a, b, d, e] = [x1 - x0 + g * x1, x3 - x0 + h * x3, y1 - y0 + g * y1, y3 - y0 + h * y3];
+  return [(b * y0 - e * x0) / (a * e - b * d), (d * x0 - a * y0) / (a * e - b * d)];
+}
+
 export const polygonsOf = ({ type, coordinates }) => (type === "MultiPolygon" ? coordinates : [coordinates]);
 
 export function inRing([x, y], ring) {

@@ -5,9 +5,9 @@ import { choices } from "./choices.js";
 import { button, choice, el, fill, icon, press, quiet, svg, tick } from "./dom.js";
 import { badge, facts, isWritten, picture, pictures, titleOf } from "./feature_card.js";
 import { say } from "./languages.js";
-import { middleOf } from "./places.js";
+import { metresOfDegree, middleOf, polygonsOf } from "./places.js";
 import { handover } from "./share.js";
-import { jump } from "./place.js";
+import { apart, jump } from "./place.js";
 import { time, VERDICTS } from "./words.js";
 import { cropsOf, isChange, newestFirst, peopleFirst } from "./site_data.js";
 import { judge, verdictForm } from "./verdicts.js";
@@ -19,10 +19,19 @@ const ORDERS = {
   time: [say("Newest first"), newestFirst],
 };
 
+/** A thing's outline in 10 m of ground around it, north up: as it is known, else a circle of its size. */
+function outlineOf({ geometry, properties: { length_m: length } }) {
+  const [lon, lat] = middleOf(geometry);
+  if (geometry.type === "Point") return svg("circle", { cx: 5, cy: 5, r: 0.65 * Math.max(1, Math.min(8, length || 2)) });
+  const [x_m, y_m] = metresOfDegree(lat);
+  const path = polygonsOf(geometry).flat().map((ring) => `M${ring.map(([x, y]) => `${(5 + (x - lon) * x_m).toFixed(2)} ${(5 - (y - lat) * y_m).toFixed(2)}`).join("L")}Z`);
+  return svg("path", { d: path.join(""), class: "outline" });
+}
+
 /** The room's life: a strip of all, and the stage's large card. */
 export class Review {
   constructor(screen, body) {
-    Object.assign(this, { screen, what: "objects", order: "score", open: false, at: null });
+    Object.assign(this, { screen, what: "objects", order: "score", open: false, at: null, isWide: false, views: [] });
     if (screen.data.chosen ? isChange(screen.data.chosen) : !screen.data.all.objects.length) this.what = "changes";
     this.head = el("div");
     this.strip = el("ul.strip", { "aria-label": say("To review") });
@@ -69,7 +78,7 @@ export class Review {
     const chosen = feature.id === this.at;
     const words = { confirmed: "check", rejected: "cross" }[feature.properties.review];
     return el("li", button([
-      cropsOf(feature).length ? picture(cropsOf(feature).at(-1), "") : el("div.gone", say("no picture yet")),
+      cropsOf(feature).length ? picture(cropsOf(feature).at(feature.properties.kind === "disappeared" ? 0 : -1), "") : el("div.gone", say("no picture yet")),
       el("span.name", badge(feature), titleOf(feature)),
       words ? el("span.mark", icon(words), el("span.sr", VERDICTS[feature.properties.review])) : null,
     ], () => this.choose(feature.id), { "aria-current": chosen || null, data: { id: feature.id }, class: feature.properties.review ?? "open" }));
@@ -90,8 +99,8 @@ export class Review {
     const place = middleOf(feature.geometry);
     fill(this.big,
       el("div.gallery-head", badge(feature), el("h3", titleOf(feature)), el("span.soft", say("{n} of {all}", { n: at + 1, all: list.length })),
-        isChange(feature) ? null : quiet(say("10 m around"), (event) => this.around(feature, event.currentTarget), { "aria-pressed": false }),
-        quiet(say("Previous"), () => this.step(-1), { "aria-keyshortcuts": "K" }), quiet(say("Next"), () => this.step(1), { "aria-keyshortcuts": "J" })),
+        button(say("10 m around"), () => this.around(feature), { "aria-pressed": this.isWide }),
+        button(say("Previous"), () => this.step(-1), { "aria-keyshortcuts": "K" }), button(say("Next"), () => this.step(1), { "aria-keyshortcuts": "J" })),
       this.pictures, this.film,
       el("div.gallery-foot", facts(feature, data.detail.is_local),
         el("div", verdictForm(this.screen, feature, { keys: true, given: (verdict, note) => this.give(verdict, note) }),
@@ -103,28 +112,39 @@ export class Review {
   }
 
   /** Every picture of the place, 10 m of ground each, north up; a tap makes one large. */
-  async showFilm(feature, [lon, lat]) {
+  async showFilm(feature, place) {
     const film = this.film;
-    const views = await get(`${siteUrl(this.screen.data.id, "place")}?lon=${lon}&lat=${lat}`).catch(() => []);
+    const views = await get(`${siteUrl(this.screen.data.id, "place")}?lon=${place[0]}&lat=${place[1]}`).catch(() => []);
     if (film !== this.film) return;
     this.views = views.filter((each) => each.crop_url);
-    fill(film, this.views.map((each) => el("li", button(picture(each.crop_url, ""), () => this.large(feature, each), { class: "frame", "aria-label": say("Seen {time}", { time: time(each.time) }) }), jump(this.screen, each))));
+    fill(film, apart(this.views).map((each) => el("li", button(picture(each.crop_url, ""), () => this.large(feature, [each]), { class: "frame", "aria-label": say("Seen {time}", { time: time(each.time) }) }), jump(this.screen, each, place))));
+    if (this.isWide) this.wide(feature);
   }
 
-  /** The surroundings in place of the crop, or back. */
-  around(feature, pressed) {
-    const on = pressed.getAttribute("aria-pressed") !== "true";
-    press([pressed], () => on);
-    if (on && this.views?.length) this.large(feature, this.views.find((each) => each.flight === feature.properties.flight) ?? this.views[0]);
-    else if (!on) this.pictures.replaceWith(this.pictures = pictures(feature));
+  /** The surroundings in place of the crops, or back; kept from one to the next. */
+  around(feature) {
+    this.isWide = !this.isWide;
+    press([this.big.querySelector(".gallery-head [aria-pressed]")], () => this.isWide);
+    if (this.isWide) this.wide(feature);
+    else this.pictures.replaceWith(this.pictures = pictures(feature));
   }
 
-  /** A picture of 10 m of ground with the thing's outline, a scale bar and north. */
-  large(feature, view) {
-    const length_m = Math.max(1, Math.min(8, feature.properties.length_m || 2));
-    const ring = svg("svg", { viewBox: "0 0 10 10", class: "scale", "aria-hidden": "true" }, svg("circle", { cx: 5, cy: 5, r: 0.65 * length_m }), svg("path", { d: "M.5 9.5h2M9.5 2V.6m-.3.5.3-.5.3.5" }),
-      svg("text", { x: 0.5, y: 9.2 }, "2 m"), svg("text", { x: 9.35, y: 2.6 }, "N"));
-    const shown = el("div.pictures.n1", el("figure.ground", picture(view.crop_url, `${say("10 m around")}, ${time(view.time)}`), ring, el("figcaption", time(view.time))));
+  /** What the flight that found it saw around it; of a change, what an earlier one saw, too. */
+  wide(feature) {
+    const { flight, first_seen: first } = feature.properties;
+    const middle = (list) => list.slice(list.length >> 1)[0];
+    const views = apart(this.views);
+    const own = views.filter((each) => each.flight === flight);
+    const earlier = isChange(feature) ? views.filter((each) => each.flight !== flight && each.time < first) : [];
+    const shown = [middle(earlier.filter((each) => each.flight === earlier.at(-1).flight)), middle(own) ?? views[0]].filter(Boolean);
+    if (shown.length) this.large(feature, shown);
+  }
+
+  /** Pictures of 10 m of ground with the thing's outline, a scale bar and north. */
+  large(feature, views) {
+    const shown = el("div", { class: `pictures n${views.length}` }, views.map((view) => el("figure.ground", picture(view.crop_url, `${say("10 m around")}, ${time(view.time)}`),
+      svg("svg", { viewBox: "0 0 10 10", class: "scale", "aria-hidden": "true" }, outlineOf(feature), svg("path", { d: "M.5 9.5h2M9.5 2V.6m-.3.5.3-.5.3.5" }),
+        svg("text", { x: 0.5, y: 9.2 }, "2 m"), svg("text", { x: 9.35, y: 2.6 }, "N")), el("figcaption", time(view.time)))));
     this.pictures.replaceWith(shown);
     this.pictures = shown;
   }

@@ -99,6 +99,7 @@ class SiteScreen {
       if (event.dataTransfer.files.length) { this.open("live", true); this.opened.take(event.dataTransfer.files); }
     });
     this.timers = [setInterval(() => this.tell(), 1000), setInterval(() => this.look(), STATUS_MS)];
+    fill(this.chips, chips(this.data)); // of before a reload
     this.open(view);
     this.load();
     this.look();
@@ -348,7 +349,7 @@ class SiteScreen {
     else if (event.key === "Escape") {
       if (this.data.chosen) this.data.choose(null);
       else if (this.shown in TOOLS) this.open(this.room);
-      else if (this.data.filters !== ALL) this.data.filter(ALL);
+      else if (JSON.stringify(this.data.filters) !== JSON.stringify(ALL)) this.data.filter(ALL);
     }
   }
 
@@ -358,6 +359,7 @@ class SiteScreen {
     this.opened?.close?.();
     this.live.close();
     this.video.close();
+    this.data.close();
     this.over.abort();
     this.timers.forEach(clearInterval);
     delete document.body.dataset.panel;

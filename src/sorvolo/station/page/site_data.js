@@ -1,6 +1,7 @@
 // The data of one site in the page: features as loaded and as live events change them, filters, what is chosen.
 
 import { features, get, kept, siteUrl } from "./api.js";
+import { tab } from "./choices.js";
 import { ALL, passing } from "./filters.js";
 import { votes } from "./votes.js";
 
@@ -13,7 +14,8 @@ export class SiteData extends EventTarget {
     this.detail = detail;
     this.id = detail.id;
     this.all = Object.fromEntries(NAMES.map((name) => [name, []]));
-    this.filters = { ...ALL };
+    this.kept = `sorvolo-filters-${detail.id}`;
+    this.filters = { ...ALL, ...JSON.parse(tab.get(this.kept)) };
     this.chosen = null;
     this.turns = {}; // of loading, by name: an answer that a later one has overtaken is not shown
     this.isOld = false; // something of it was kept by the service worker, and not the station's answer
@@ -73,7 +75,13 @@ export class SiteData extends EventTarget {
 
   filter(change) {
     this.filters = { ...this.filters, ...change };
+    tab.set(this.kept, JSON.stringify(this.filters)); // for a reload
     this.dispatchEvent(new Event("filters"));
+  }
+
+  /** Another screen is shown: a later one begins without filters. */
+  close() {
+    tab.set(this.kept, null);
   }
 
   find(id) {

@@ -6,7 +6,7 @@ import { button, cross, el, fill, quiet, tick } from "./dom.js";
 import { say } from "./languages.js";
 import { CLASSES, OTHER_CLASS } from "./map_style.js";
 import { PictureMotion } from "./picture_motion.js";
-import { isWithin } from "./places.js";
+import { isWithin, shareIn } from "./places.js";
 import * as words from "./words.js";
 
 const { number, percent } = words;
@@ -23,6 +23,7 @@ const STATE_MS = 1000;
 const QUIET_S = 3; // without a picture of a drone that sends: stated
 const DEAD_S = 10; // the connection looks open and is dead, as after a sleep: made anew
 
+const MARKED_S = 0.1; // of a recording, before and after a frame whose place on the ground is known
 const NEAR_DEG = 0.02; // of a site's ground: a drone there is shown with it
 
 /** The videos beside a site's map: one for each drone that flies there. `play(view)` shows a recorded flight at a second. */
@@ -87,20 +88,34 @@ export class VideoWall {
 
   /** The map has the room that the videos leave. */
   fit() {
-    this.screen.wall.hidden = !this.panes.size;
-    this.screen.view?.map.resize();
+    const { wall, view, live, data: { detail: { bounds_wgs84: bounds } } } = this.screen;
+    const before = view?.map.getContainer().clientHeight;
+    wall.hidden = !this.panes.size;
+    view?.map.resize();
+    if (bounds && live?.follows && !live.drones.size && view?.map.getContainer().clientHeight < before) view.go(bounds, 0, true); // a phone's: nobody has moved it
+
   }
 
   /** Play the recorded flight of a place's view. */
-  play(view) {
+  /** `place` is marked while that very picture is shown. */
+  play(view, place) {
     if (!view.video_url) return;
     const name = view.flight;
     this.take(name);
     const player = el("video", { src: view.video_url, controls: true, playsinline: true, ".muted": true });
-    player.addEventListener("loadedmetadata", () => { player.currentTime = view.video_s; player.play().catch(() => {}); }, { once: true });
+    player.addEventListener("loadedmetadata", () => { player.currentTime = view.video_s; }, { once: true });
+    const mark = el("span.at", { hidden: true });
+    const put = () => {
+      const ring = this.screen.data.all.frames.find(({ id }) => id === view.frame_id)?.geometry?.coordinates[0];
+      mark.hidden = !ring || Math.abs(player.currentTime - view.video_s) > MARKED_S;
+      if (!mark.hidden) [mark.style.left, mark.style.top] = shareIn(ring, place).map((each) => `${100 * each}%`);
+    };
+    const over = new AbortController();
+    for (const type of ["seeked", "timeupdate"]) player.addEventListener(type, put);
+    this.screen.hear(this.screen.data, "data", put, over); // frames come last
     const pane = el("aside.video", { "aria-label": say("Recording of {name}", { name }) }, el("header", el("b", name), el("span.delay", say("recorded")),
-      cross(say("Close the video"), () => this.take(name))), el("div.picture", player));
-    this.add(name, { pane, close: () => pane.remove(), off() {} });
+      cross(say("Close the video"), () => this.take(name))), el("div.picture", player, mark));
+    this.add(name, { pane, close: () => { over.abort(); pane.remove(); }, off() {} });
   }
 
   close() {
