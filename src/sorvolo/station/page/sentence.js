@@ -34,9 +34,9 @@ export const openOf = (...lists) => lists.flat().filter(({ properties: { review,
 
 /**
  * The parts of the sentence: {words, act, kind}. `link` is "live", "late" (kept answers are shown), "waiting" or "lost"; `loaded` "yes", "no" or "failed";
- * `runs` the site's missions, newest first; objects, changes and pod are ALL features, whatever a filter hides; `now` by the station's clock, ms.
+ * `runs` the site's missions, newest first; `drones` the names of those that send from here; objects, changes and pod are ALL features, whatever a filter hides; `now` by the station's clock, ms.
  */
-export function sentence({ link, loaded, runs, objects, changes, pod, versions, votes = 0, isLow = false, isFull = false, now = 0 }) {
+export function sentence({ link, loaded, runs, objects, changes, pod, versions, drones = [], votes = 0, isLow = false, isFull = false, now = 0 }) {
   const parts = [];
   const tell = (words, act = null, kind = "") => parts.push({ words, act, kind });
   if (link !== "live") tell(say("{link}: this may be old", { link: LINKS[link] }), null, "warning");
@@ -55,6 +55,8 @@ export function sentence({ link, loaded, runs, objects, changes, pod, versions, 
     if (!told.has(name)) tell(hasLanded ? name : `${name} ${duration((now - new Date(began)) / 1000)}`, "live");
     told.add(name);
   }
+  const unsearched = [...new Set([...drones, ...running.map(({ input }) => input?.stream).filter(Boolean)])].filter((each) => !running.some((run) => run.input?.stream === each && looksForPeople(run)));
+  if (unsearched.length) tell(say("the video of {names} is not searched for people", { names: unsearched.join(", ") }), "live", "warning");
   if (!running.length) {
     const newest = versions.at(-1);
     tell(newest ? say("Map of {date}", { date: day(newest.flown_at ?? newest.made_at) }) : say("No map yet"), "live");
@@ -71,8 +73,14 @@ export function sentence({ link, loaded, runs, objects, changes, pod, versions, 
   return parts;
 }
 
-/** Whether a mission's detector surely knows people: a model of one's own may not. */
-const looksForPeople = ({ options }) => /^(default|thermal)/.test(options?.model ?? "default");
+/** Whether a mission surely looks for people: a model of one's own may not know them. */
+const looksForPeople = ({ options }) => /^(default|thermal)/.test(options?.model ?? "default") && (!options?.classes?.length || options.classes.includes("person"));
+
+/** Whether the newest flight was flown into the map by a mission that does not look for people, after the last one that did. */
+function isNewer(runs, looks) {
+  const flown = runs.find(({ mission, state }) => ["map", "compare"].includes(mission) && state === "finished");
+  return Boolean(flown && !looksForPeople(flown) && looks.length && looks.every((each) => each.ended_at && each.ended_at < flown.started_at));
+}
 
 /** People first, then all else; where there is no person, why that says little. */
 function found(objects, pod, running, runs) {
@@ -84,9 +92,10 @@ function found(objects, pod, running, runs) {
   if (people) return [[say("{n} person|{n} people", { n: people }), ...more].join(", "), "review", "found"];
   const seen = (property) => objects.filter(({ properties }) => properties.class === "person" && property(properties)).length;
   const [rejected, gone] = [seen(({ review }) => review === "rejected"), seen(({ gone: isGone, review }) => isGone && review !== "rejected")];
-  const wasLooked = lookedAt(pod) || runs.some((run) => ["watch", "search"].includes(run.mission) && run.state === "finished" && looksForPeople(run));
+  const looks = runs.filter((run) => ["watch", "search"].includes(run.mission) && run.state === "finished" && looksForPeople(run));
+  const wasLooked = lookedAt(pod) || looks.length;
   const why = rejected || gone
     ? [gone ? say("{n} person on an earlier date only|{n} people on an earlier date only", { n: gone }) : null, rejected ? say("{n} person found and rejected in review|{n} people found and rejected in review", { n: rejected }) : null].filter(Boolean).join(", ")
-    : running.some(looksForPeople) ? say("no person found so far") : wasLooked ? say("no person found in what was looked at") : say("no search for people is on record");
+    : running.some(looksForPeople) ? say("no person found so far") : wasLooked ? (isNewer(runs, looks) ? say("no person found in what was looked at before the newest flight") : say("no person found in what was looked at")) : say("no search for people is on record");
   return [[...more, why].join(", "), "review"];
 }

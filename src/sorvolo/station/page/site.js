@@ -212,7 +212,7 @@ class SiteScreen {
     if (this.closed) return;
     const { status, events } = this.station;
     const { objects, changes, pod } = this.data.all;
-    const parts = sentence({ link: events.state === "live" && this.data.isOld ? "late" : events.state, loaded: this.loaded, runs: this.runs, objects, changes, pod, versions: this.data.detail.versions, votes: votes.mine.length, now: now(),
+    const parts = sentence({ link: events.state === "live" && this.data.isOld ? "late" : events.state, loaded: this.loaded, runs: this.runs, objects, changes, pod, versions: this.data.detail.versions, drones: this.video?.here ?? [], votes: votes.mine.length, now: now(),
       isLow: status.disk_free_gb < 2 * status.disk_floor_gb, isFull: status.disk_free_gb < status.disk_floor_gb });
     const text = JSON.stringify(parts);
     if (text === this.told) return;

@@ -29,13 +29,14 @@ const NEAR_DEG = 0.02; // of a site's ground: a drone there is shown with it
 /** The videos beside a site's map: one for each drone that flies there. `play(view)` shows a recorded flight at a second. */
 export class VideoWall {
   constructor(screen) {
-    Object.assign(this, { screen, panes: new Map(), closed: new Set() });
+    Object.assign(this, { screen, panes: new Map(), closed: new Set(), here: [] });
     this.opener = button(say("Video"), () => { this.closed.clear(); this.look(); }, { class: "video-open", icon: "video" });
     this.opener.hidden = true;
     screen.stage.append(this.opener);
     screen.hear(screen.station.events, "stream.state", ({ detail: { data: { stream, is_connected: isOn, flights } } }) => {
       if (isOn) return void this.look();
       this.panes.get(stream)?.off(flights?.at(-1)?.is_over ? "ended" : "no signal");
+      this.here = this.here.filter((each) => each !== stream);
       screen.live.drones.delete(stream);
       screen.live.drawSoon();
     });
@@ -49,6 +50,7 @@ export class VideoWall {
     } catch { return; } // the connection's own sign shows it
     if (this.screen.closed) return;
     const on = streams.filter((each) => each.is_connected);
+    this.here = on.filter((each) => this.isHere(each)).map(({ stream }) => stream);
     for (const each of on) if (this.isHere(each) && !this.panes.has(each.stream) && !this.closed.has(each.stream)) this.open(each.stream);
     this.opener.hidden = !on.some((each) => this.closed.has(each.stream));
   }
