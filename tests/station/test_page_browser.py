@@ -409,7 +409,7 @@ SENTENCES = """async () => {
   const peoples = {none: [], open: [person({})], rejected: [person({review: 'rejected'})], gone: [person({gone: true})],
     disputed: [person({review: 'disputed'})], confirmed: [person({review: 'confirmed'})], unsure: [person({review: 'unsure'})]};
   const runs = ['running', 'finished', 'incomplete', 'failed', 'stopped', 'lost'].flatMap((state) => ['map', 'compare', 'watch', 'search']
-    .flatMap((mission) => [[{}, null], [{landed: true}, {model: 'default-int8'}], [{}, {model: 'none'}], [{}, {model: 'boats'}], [{}, {model: 'thermal', classes: ['person']}],
+    .flatMap((mission) => [[{}, null], [{landed: true}, {model: 'default'}], [{}, {model: 'none'}], [{}, {model: 'boats'}], [{}, {model: 'thermal', classes: ['person']}],
       [{}, {classes: ['car']}]].map(([progress, options]) => ({state, mission, progress, options, input: {stream: 's'}, started_at: '2026-05-01T10:00:00Z'}))));
   const earlier = {state: 'finished', mission: 'watch', started_at: '2026-04-01T10:00:00Z', ended_at: '2026-04-01T10:09:00Z'};
   const histories = [[], ...runs.flatMap((each) => [[each], [each, earlier]])];

@@ -256,7 +256,7 @@ def test_a_watch_that_is_stopped_keeps_what_it_found_and_states_that_it_was(tmp_
     with TestClient(
         station_app(StationSettings(tmp_path, free_floor_gb=0.0)), base_url=HOST
     ) as client:
-        run = client.post("/api/runs", json=wish(client, "watch", model="default-int8")).json()
+        run = client.post("/api/runs", json=wish(client, "watch", model="default")).json()
         path = f"/api/runs/{run['id']}"
         wait_for(lambda: client.get(path).json()["progress"])
         client.post(f"{path}/stop")

@@ -95,11 +95,11 @@ def test_the_exported_file_gives_what_torch_gives(trained: SingleStage, exported
     assert not check.is_good and check.box_px > 0.5, check
 
 
-def test_the_file_stores_weights_in_half_as_many_bytes(exported: bytes) -> None:
+def test_the_file_stores_weights_in_a_quarter_of_the_bytes(exported: bytes) -> None:
     count = sum(each.numel() for each in SingleStage(2).parameters())
-    assert len(exported) < 2.1 * count
+    assert len(exported) < 1.1 * count
     file = onnx.load_model_from_string(exported)
-    assert "head.fine_output.weight_half" in {each.name for each in file.graph.initializer}
+    assert "head.fine_output.weight_quantized" in {each.name for each in file.graph.initializer}
     assert [each.key for each in file.metadata_props] == [METADATA_KEY]
 
 

@@ -209,9 +209,6 @@ def test_models_that_do_not_fit_are_reported(
     assert "for the preset thesis --weights takes auto, none" in words(
         "--weights", str(learnt), "--preset", "thesis", "--steps", "4"
     )
-    assert "is in int8 and cannot be learnt on from; give the float32 model" in words(
-        "--weights", "default-int8"
-    )
     assert "there is no model file" in words("--weights", "gone.onnx")
     assert "there is no model 'nobody'" in words("--weights", "nobody")
     (tmp_path / "junk.onnx").write_bytes(b"junk")

@@ -20,8 +20,12 @@ from sorvolo.lab.training.boxes import Finder
 
 OPSET = 17  # of ONNX, that of 2021, which all runtimes know
 _TRACED_PX = (256, 320)  # rows, columns; the model takes any size, different sides show a mix-up
-_HALF = "_half"  # ends the name of what is stored in float16
-_HALVED_VALUES = 256  # of an array, at least
+_BYTES, _STEP = (
+    "_quantized",
+    "_scale",
+)  # end the names of what is stored in eight bits, and of its steps
+_LEAST_WEIGHT = 1e-30  # of an output with no others but zeros
+_STORED_VALUES = 256  # of an array, at least, for eight bits to pay
 _SAME_PX, _SAME_SCORE = 0.5, 1e-3
 _GRAIN, _SHAKES = (
     0.01,
@@ -49,9 +53,12 @@ class ExportCheck:
 
 
 def round_weights(model: Finder) -> Finder:
-    """The same model, its weights changed to the nearest that float16 holds."""
+    """The same model, its weights changed to the nearest that eight bits hold, in steps of each output's own, a power of two."""
     for weight in model.parameters():
-        weight.data = weight.data.half().float().contiguous()
+        if weight.ndim > 1:
+            most = weight.data.abs().flatten(1).amax(1).clamp(min=_LEAST_WEIGHT)
+            step = (most / 127).log2().ceil().exp2().reshape(-1, *[1] * (weight.ndim - 1))
+            weight.data = (weight.data / step).round() * step
     return model
 
 
@@ -82,25 +89,32 @@ def export_onnx(model: Finder, info: dict[str, Any]) -> bytes:
     entry = file.metadata_props.add()
     entry.key = METADATA_KEY
     entry.value = json.dumps({"format": 1, "stride": model.stride, **info})
-    _store_halves(file.graph)
+    _store_bytes(file.graph)
     onnx.checker.check_model(file)
     return file.SerializeToString()
 
 
-def _store_halves(graph: Any) -> None:
-    """Store weights that float16 holds exactly so, each with a cast back: half the bytes, the same values."""
-    kept, casts = [], []
+def _store_bytes(graph: Any) -> None:
+    """Store weights that eight bits hold exactly so: a quarter of the bytes, the same values once it is opened."""
+    kept, nodes = [], []
     for each in graph.initializer:
-        values = numpy_helper.to_array(each)
-        if values.dtype == np.float32 and values.size >= _HALVED_VALUES:
-            half = values.astype(np.float16)
-            if np.array_equal(half, values):
-                name = f"{each.name}{_HALF}"
-                kept.append(numpy_helper.from_array(half, name))
-                casts.append(helper.make_node("Cast", [name], [each.name], to=TensorProto.FLOAT))
+        values, name = numpy_helper.to_array(each), each.name
+        if values.dtype == np.float32 and values.ndim > 1 and values.size >= _STORED_VALUES:
+            most = np.abs(values).max(tuple(range(1, values.ndim)), keepdims=True)
+            step = np.exp2(np.ceil(np.log2(np.maximum(most, _LEAST_WEIGHT) / 127)), dtype="f4")
+            steps = np.rint(values / step).astype(np.int8)
+            if np.array_equal(steps * step, values):
+                kept.append(numpy_helper.from_array(steps, name + _BYTES))
+                kept.append(numpy_helper.from_array(step, name + _STEP))
+                nodes.append(
+                    helper.make_node(
+                        "Cast", [name + _BYTES], [name + "_cast"], to=TensorProto.FLOAT
+                    )
+                )
+                nodes.append(helper.make_node("Mul", [name + "_cast", name + _STEP], [name]))
                 continue
         kept.append(each)
-    nodes = [*casts, *graph.node]
+    nodes.extend(graph.node)
     for field, rows in ((graph.initializer, kept), (graph.node, nodes)):
         del field[:]
         field.extend(rows)
@@ -110,9 +124,13 @@ def read_layers(exported: bytes) -> dict[str, Tensor]:
     """A model file's weights in float32, by their names in the network."""
     graph = onnx.load_model_from_string(exported).graph
     layers = {
-        each.name.removesuffix(_HALF): torch.from_numpy(numpy_helper.to_array(each).astype("f4"))
+        each.name: torch.from_numpy(numpy_helper.to_array(each).astype("f4"))
         for each in graph.initializer
     }
+    for name in [each for each in layers if each.endswith(_BYTES)]:
+        own, steps = name.removesuffix(_BYTES), layers[name]
+        step = layers[name + _STEP] if name + _STEP in layers else layers[own + _STEP]
+        layers[own] = steps * step.reshape(-1, *[1] * (steps.ndim - 1))
     for node in graph.node:  # an export keeps values that are the same once
         if node.op_type == "Identity" and node.input[0] in layers:
             layers[node.output[0]] = layers[node.input[0]]

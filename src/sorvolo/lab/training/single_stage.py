@@ -139,8 +139,9 @@ class SingleStage(Finder):
         scores, bins, places = cells(self.outputs(images), self.classes)
         own = scores[0].T.sigmoid()
         _, rows = torch.topk(own.amax(0), at_most(_BEFORE, own[0]))
-        boxes = clipped(boxes_from_bins(bins[0], places), images.shape[2], images.shape[3])
-        return best_boxes(boxes[rows], own[:, rows], _SUPPRESS_IOU, self.least_score)
+        placed = boxes_from_bins(bins[0, rows], places[rows])
+        boxes = clipped(placed, images.shape[2], images.shape[3])
+        return best_boxes(boxes, own[:, rows], _SUPPRESS_IOU, self.least_score)
 
     def carry_on(
         self, layers: Mapping[str, Tensor], known: Sequence[str], classes: Sequence[str]

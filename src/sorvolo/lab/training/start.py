@@ -47,10 +47,6 @@ def load_start(settings: TrainSettings) -> Start | None:
         return imagenet_weights(choice)
     path = find_model(PACKAGED if choice == "auto" else choice)
     info, content = read_info(path), read_model(path)
-    if info.precision != "float32":
-        raise InputError(
-            f"{path} is in {info.precision} and cannot be learnt on from; give the float32 model that it was made from"
-        )
     identity = f"model with SHA-256 {sha256(content).hexdigest()[:16]}"
     return Start(read_layers(content), f"the model {info.name}", identity, info)
 
