@@ -18,8 +18,7 @@ from sorvolo.cli.main import main
 from sorvolo.errors import SettingsError, StoreError
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.missions.archive import index as indexing
-from sorvolo.missions.archive.find import find_place
-from sorvolo.missions.archive.index import IndexOutcome, index_archive
+from sorvolo.missions.archive.index import IndexOutcome, find_place, index_archive
 from sorvolo.store.index import tables
 from sorvolo.store.index.archive_index import INDEX, POINTER, ArchiveIndex
 from sorvolo.store.site.archive import Archive

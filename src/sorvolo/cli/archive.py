@@ -84,7 +84,7 @@ def find_command(
 
     Example: sorvolo archive find /srv/flights --at 46.5001,13.2502 --from 2026-05-01 --class car --within 10
     """
-    from sorvolo.missions.archive.find import find_place
+    from sorvolo.missions.archive.index import find_place
 
     found = find_place(
         root,

@@ -60,6 +60,14 @@ HeightModel = Annotated[
     option("GeoTIFF of ground heights in the telemetry's reference.", show_default="level ground"),
 ]
 
+ThroughTrees = Annotated[
+    bool,
+    option(
+        "Also put the frames together on the forest floor, to find people below crowns.",
+        "--through-trees",
+    ),
+]
+
 
 def watch_command(
     source: Annotated[str, argument("A video, a folder of photos, or a live stream's address.")],
@@ -81,6 +89,7 @@ def watch_command(
     ground_elevation: GroundElevation = None,
     height_model: HeightModel = "",
     give_up: GiveUp = 30.0,
+    through_trees: ThroughTrees = False,
     enough_looked_at: EnoughLookedAt = 0.9,
     coordinates: PlaceFormatOption = "latlon",
     as_json: AsJson = False,
@@ -89,9 +98,8 @@ def watch_command(
 
     Ends with the source or with Ctrl-C, and writes all results either way. While a drone flies, frames of new ground are
     searched first; the others are kept and searched once it has landed, or after Ctrl-C (again: stop at once).
-    The first line counts the ground that was looked at; exit code 3: less than was asked for, so what else is there is
-    not known, or its pictures contradict the telemetry. detections.jsonl grows while the watch runs. After a crash or a power cut, give the same command again:
-    it continues where it was, and sends no alert twice.
+    The first line counts the ground that was looked at; exit code 3: less than was asked for, its pictures contradict
+    the telemetry, or cameras over trees may be off. After a crash or a power cut, give the same command again.
 
     Example: sorvolo watch DJI_0042.MP4 --classes person
 
@@ -111,6 +119,7 @@ def watch_command(
         offset_s=offset,
         ground_elevation_m=ground_elevation,
         height_model=height_model,
+        through_trees=through_trees,
         enough_looked_at=enough_looked_at,
     )
     outputs = WatchOutputs(

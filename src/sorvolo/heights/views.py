@@ -1,7 +1,7 @@
 """The photos of a flight as heights are made from them: where each camera stands and what it is good for."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,6 +32,12 @@ class View:
         if self.camera.is_distorted:
             raise GeometryError(f"{self.name}: heights need pictures without distortion")
         object.__setattr__(self, "fix_m", frozen(self.fix_m))
+
+    def smaller(self, share: float) -> "View":
+        """The view with its picture made smaller by a share, 32 px wide and high at least."""
+        camera = self.camera
+        sides = (max(32, round(side * share)) for side in (camera.width_px, camera.height_px))
+        return replace(self, camera=camera.resized(*sides))
 
     def pixels_from_site(self, points_m: PointsM) -> PointsPx:
         """(N, 2) where site points, (N, 3), are seen; NaN behind the camera."""

@@ -1,37 +1,30 @@
-"""Files from a web address or a disk, taken only if their hash is the one that was asked for."""
+"""Files from a web address, taken only if their hash is the one that was asked for."""
 
 import hashlib
 import http.client
-import re
 import urllib.error
 import urllib.parse
 import urllib.request
-from contextlib import closing
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import Any
 
 from sorvolo.errors import InputError
 
 _MOST_BYTES = 1 << 30  # a model has 10 to 300 MB; by choice
 _CHUNK_BYTES = 1 << 20
 _PATIENCE_S = 30.0  # without a byte; by choice
-_WEB = re.compile(r"(?i)https?://")
-
-
-def is_web_address(source: str) -> bool:
-    """Whether it is one that is asked over http or https, and no path."""
-    return _WEB.match(source) is not None
 
 
 def copy_by_hash(address: str, to: Path, sha256: str, *, offline: str) -> None:
-    """Copy what is at a web address or a path to the file `to`; it is what was asked for when this returns.
+    """Copy what is at a web address to the file `to`; it is what was asked for when this returns.
 
     `offline` is what a person without a network can do. Raises InputError where the file cannot be had, is larger than
     1 GB, or has another SHA-256 than `sha256` (hexadecimal): `to` is then to be thrown away.
     """
     digest, size = hashlib.sha256(), 0
+    opener = urllib.request.build_opener(WebRedirects)
     try:
-        with closing(_opened(address)) as stream, to.open("wb") as file:
+        with opener.open(address, timeout=_PATIENCE_S) as stream, to.open("wb") as file:
             while chunk := stream.read(_CHUNK_BYTES):
                 size += len(chunk)
                 if size > _MOST_BYTES:
@@ -56,13 +49,6 @@ def copy_by_hash(address: str, to: Path, sha256: str, *, offline: str) -> None:
             f"{address} is not the file that was asked for: its SHA-256 is {found}, wanted was {sha256}; nothing was "
             "installed. Try again, or ask again for file and hash"
         )
-
-
-def _opened(address: str) -> IO[bytes]:
-    if is_web_address(address):
-        opener = urllib.request.build_opener(WebRedirects)
-        return cast(IO[bytes], opener.open(address, timeout=_PATIENCE_S))
-    return Path(address).expanduser().open("rb")
 
 
 class WebRedirects(urllib.request.HTTPRedirectHandler):

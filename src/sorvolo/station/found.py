@@ -59,9 +59,8 @@ def found_features(
         properties = {each["id"]: each["properties"] for each in features}
         flights = list(dict.fromkeys(each.flight_id for each in archive.versions()))
         for number, flight in enumerate(flights[1:], 1):
-            changes = archive.changes(flight)
-            for kind, each in untold(register, changes, flights[:number], flight):
-                properties[each.id]["untold"][flight] = kind
+            for each in untold(register, archive.changes(flight), flights[:number], flight):
+                properties[each.id]["untold"][flight] = each.kind
     return features
 
 

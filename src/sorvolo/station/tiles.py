@@ -6,7 +6,7 @@ import os
 import re
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from io import BytesIO
 from pathlib import Path
@@ -490,15 +490,7 @@ class FloorTiles:
             keyframes = [by_name[view.name] for view in solved.views]
             first = solved.views[0].camera
             share = min(1.0, _FLOOR_PX / max(first.width_px, first.height_px))
-            views = [
-                replace(
-                    each,
-                    camera=each.camera.resized(
-                        round(each.camera.width_px * share), round(each.camera.height_px * share)
-                    ),
-                )
-                for each in solved.views
-            ]
+            views = [each.smaller(share) for each in solved.views]
             self._views = key, views, FlightPictures(archive, keyframes, solved.radial)
         return self._views[1:]
 

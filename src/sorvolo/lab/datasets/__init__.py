@@ -6,15 +6,14 @@ from typing import TypedDict, Unpack
 
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.lab.datasets.checking import labelled_set, naming, plain
-from sorvolo.lab.datasets.coco import read_coco
-from sorvolo.lab.datasets.okutama import read_okutama
-from sorvolo.lab.datasets.parsed import ParsedSet, Reader
-from sorvolo.lab.datasets.recognising import form_of
+from sorvolo.lab.datasets.coco import coco_files, read_coco
+from sorvolo.lab.datasets.okutama import looks_like_okutama, read_okutama
+from sorvolo.lab.datasets.parsed import ParsedSet, Reader, files_below, is_label_file, read_text
 from sorvolo.lab.datasets.splits import compiled
-from sorvolo.lab.datasets.umcd import read_umcd
-from sorvolo.lab.datasets.visdrone import read_visdrone
-from sorvolo.lab.datasets.voc import read_voc
-from sorvolo.lab.datasets.yolo import read_yolo
+from sorvolo.lab.datasets.umcd import looks_like_umcd, read_umcd
+from sorvolo.lab.datasets.visdrone import looks_like_visdrone, read_visdrone
+from sorvolo.lab.datasets.voc import looks_like_voc, read_voc
+from sorvolo.lab.datasets.yolo import looks_like_yolo, read_yolo
 from sorvolo.paths import AnyPath
 from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import CLASSES
@@ -28,6 +27,9 @@ READERS: Mapping[str, Reader] = {
     "umcd": read_umcd,
 }
 """Every form by the name that a user gives it."""
+
+_MOST_LOOKED_AT = 200  # files; the first ones may be empty, of pictures of nothing
+_PARTS = frozenset({"images", "train", "val", "valid", "test"})
 
 
 class LabelOptions(TypedDict, total=False):
@@ -109,7 +111,7 @@ def _parsed(place: Path, form: str | None) -> ParsedSet:
     """What the form's reader finds; an error of a form that was asked for adds what it looks like instead."""
     if form is None:
         known = ", ".join(READERS)
-        recognised = form_of(place)
+        recognised = _form_of(place)
         if recognised is not None:
             return READERS[recognised](place)
         if place.is_file():
@@ -125,9 +127,43 @@ def _parsed(place: Path, form: str | None) -> ParsedSet:
     try:
         return READERS[form](place)
     except InputError as error:
-        recognised = form_of(place)
+        recognised = _form_of(place)
         if recognised in (None, form):
             raise
         raise InputError(
             f"{error}; it looks like {recognised}: read it as that, or leave the form out"
         ) from error
+
+
+def _form_of(place: Path) -> str | None:
+    """The form's name among READERS; None for what is of none of them."""
+    if place.is_file():
+        ending = place.suffix.lower()
+        known = {".json": "coco", ".yaml": "yolo", ".yml": "yolo", ".xml": "voc"}
+        return known.get(ending) or (_form_of_text(place) if ending == ".txt" else None)
+    if coco_files(place):
+        return "coco"
+    if any(looks_like_voc(path) for path in files_below(place, ".xml")[:_MOST_LOOKED_AT]):
+        return "voc"
+    found = (_form_of_text(path) for path in _label_texts(place)[:_MOST_LOOKED_AT])
+    return next((form for form in found if form), None)
+
+
+def _label_texts(folder: Path) -> list[Path]:
+    """The folder's text files of labels; of one part of a set without any, those beside the part."""
+    texts = [path for path in files_below(folder, ".txt") if is_label_file(path)]
+    if not texts and folder.name.lower() in _PARTS:
+        texts = [path for path in files_below(folder.parent, ".txt") if is_label_file(path)]
+    return texts
+
+
+def _form_of_text(path: Path) -> str | None:
+    line = next((line for line in read_text(path).splitlines() if line.strip()), "")
+    for form, looks_like in (
+        ("visdrone", looks_like_visdrone),
+        ("okutama", looks_like_okutama),
+        ("yolo", looks_like_yolo),
+    ):
+        if looks_like(line):
+            return form
+    return "umcd" if looks_like_umcd(path) else None

@@ -155,10 +155,15 @@ class ResultCache:
 
     def kept_frames(self) -> Iterator[KeptFrame]:
         """Yield the frames of a stream that a killed run was through with, in order."""
-        for index, stage in sorted(self._known) if self.is_of_stream else ():
-            frame = self.known(index, _FRAME, KeptFrame) if stage == _FRAME else None
-            if frame is not None:
-                yield frame
+        if self.is_of_stream:
+            yield from self.kept(_FRAME, KeptFrame)
+
+    def kept(self, stage: str, kind: type[T]) -> Iterator[T]:
+        """Yield a killed run's results of a stage, in order of their frames."""
+        for index, name in sorted(self._known):
+            result = self.known(index, stage, kind) if name == stage else None
+            if result is not None:
+                yield result
 
     def note_came(self, frame: _OfFlight) -> None:
         """Note a live frame that waits to be searched. Raises StoreError when the disk is full."""

@@ -123,10 +123,10 @@ class FlightPictures:
     ) -> None:
         self._archive, self._keyframes = archive, keyframes
         self._lens = lens_left_over(keyframes[0].camera, radial)
-        self._large = ImageCache(self._load, _LARGE_BYTES)
+        self._large = ImageCache(self.load, _LARGE_BYTES)
 
     def colour(self, number: int) -> ImageRGB:
-        """A picture as it is stored, corrected."""
+        """What `load` gives, kept."""
         return self._large.get(number)
 
     def release(self) -> None:
@@ -136,11 +136,11 @@ class FlightPictures:
 
     def gray(self, number: int) -> ImageGray:
         """A picture in gray, as it is stored; it is not kept."""
-        return gray_from_rgb(self._load(number))
+        return gray_from_rgb(self.load(number))
 
     def grays(self, number: int, widths: Sequence[int]) -> dict[int, ImageGray]:
         """A picture in gray, so many pixels wide each; decoded once, and not kept."""
-        image, camera = self._load(number), self._keyframes[number].camera
+        image, camera = self.load(number), self._keyframes[number].camera
         return {
             width: gray_from_rgb(
                 at_size(image, width, round(width * camera.height_px / camera.width_px))
@@ -148,7 +148,8 @@ class FlightPictures:
             for width in widths
         }
 
-    def _load(self, number: int) -> ImageRGB:
+    def load(self, number: int) -> ImageRGB:
+        """A picture as it is stored, corrected; it is not kept."""
         keyframe = self._keyframes[number]
         image = corrected(self._archive.image(keyframe), keyframe.gains, keyframe.vignette)
         return image if self._lens is None else self._lens.undistort(image)

@@ -1,7 +1,7 @@
 """`sorvolo search --through-trees`: a mapped flight's pictures put together on the floor below crowns, and its finds."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from sorvolo.canopy.finds import Find, Finds, average, look_under_trees
 from sorvolo.canopy.integral import LEAST_VIEWS, Floor, Picture, UnderTrees, lay, levelled
 from sorvolo.canopy.planting import PlantedFloor, free_share, plant_on_floor
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Floats32, ImageRGBA, Numbers
+from sorvolo.geometry.arrays import Floats32, ImageGray, ImageRGB, ImageRGBA, Numbers
 from sorvolo.heights.cameras import Cameras3D, find_tracks, solve_steady, solve_tracks
 from sorvolo.heights.field import HeightField
 from sorvolo.heights.figures import camera_figures
@@ -29,6 +29,7 @@ from sorvolo.missions.heights.run import (
 )
 from sorvolo.missions.search.measure import SeenFloor
 from sorvolo.paths import AnyPath
+from sorvolo.registration.features import gray_from_rgb
 from sorvolo.store.atomic import atomic_write_bytes, make_folder, write_page
 from sorvolo.store.exports.places import place_deg
 from sorvolo.store.exports.plain import feature, feature_collection, geojson_bytes, json_bytes
@@ -36,7 +37,6 @@ from sorvolo.store.images import BytesCache, jpeg_from_image
 from sorvolo.store.pages.search import under_trees_page
 from sorvolo.store.rasters.height_model import read_height_cog, write_height_cog
 from sorvolo.store.site.archive import Archive
-from sorvolo.store.site.catalogue import StoredKeyframe
 from sorvolo.store.site.files import UNDER_TREES
 from sorvolo.survey.flight import Site
 from sorvolo.survey.map_objects import MapObject
@@ -46,10 +46,8 @@ from sorvolo.survey.wording import counted
 _PICTURES_BYTES = 224 << 20
 _LEAST_CELL_M = 0.08  # a body is ten cells long; finer ones cost more and show no more
 _GRAY = 12  # levels between the colours of a pixel in a thermal picture, at most
-_FLOOR_M = (
-    -40.0,
-    5.0,
-)  # where the floor is looked for, above the map's level ground: that may be crowns
+FLOOR_M = -40.0, 5.0
+"""Where the floor is looked for, above a map's level ground: that may be crowns."""
 _TILT = float(np.tan(np.radians(10)))  # as far as fixes alone hold the tilt that cameras share
 _MOST_STRETCH = 0.06  # of the focal length, three sigmas of what it may be off
 _MOST_SWING_DEG = 3.0  # median, of cameras that a gimbal holds
@@ -69,107 +67,153 @@ class UnderTreesUpdate:
     total: int = 3
 
 
+@dataclass(frozen=True, eq=False)
+class LookedUnderTrees:
+    """What pictures put together show of the floor: what files and pages state of it, and the finds as objects."""
+
+    report: dict[str, Any]
+    objects: tuple[MapObject, ...]
+    finds: Finds
+    views: Sequence[View]  # with pixels of a body's size
+    picture: Picture
+    under: UnderTrees
+    cameras: Mapping[str, Any]
+    site: Site
+
+    def write(self, folder: Path) -> None:
+        """Write under_trees.tif (mean, anomaly, number of views, free share, floor's height), .html, .geojson and .json."""
+        under, site, report = self.under, self.site, self.report
+        make_folder(folder)
+        free, floor_m = (
+            free_share(under, self.views, self.picture),
+            under.floor_m + site.origin.height_m,
+        )
+        bands = under.mean, under.anomaly, under.views.astype(np.float32), free, floor_m
+        names = "mean", "anomaly, sigmas", "views", "free share", f"floor, {site.height_reference}"
+        grid = height_grid(site, report["cell_m"]).grid
+        write_height_cog(bands, names, under.lattice.first, grid, folder / "under_trees.tif")
+        features = [
+            feature({"type": "Point", "coordinates": place_deg(find.place_m, site)}, row)
+            for find, row in zip(self.finds.people, report["people"])
+        ]
+        collection = feature_collection("under_trees", features, is_local=False)
+        atomic_write_bytes(folder / "under_trees.geojson", geojson_bytes(collection))
+        atomic_write_bytes(folder / "under_trees.json", json_bytes(report))
+        ringed = _ringed(under, self.finds)
+        page = under_trees_page(report, ringed, [each.crop_jpeg for each in self.objects])
+        write_page(folder / "under_trees.html", page)
+
+
+def look_through_trees(
+    name: str,
+    site: Site,
+    views: Sequence[View],
+    opened: Callable[[Sequence[View], tuple[float, float]], Callable[[int], ImageRGB]],
+    times_ns: Mapping[str, int],
+    sigma_m: float,
+    *,
+    before: Cameras3D | None = None,
+    floor_m: tuple[float, float] = FLOOR_M,
+    plants: int = 80,
+    is_quick: bool = False,
+) -> Generator[UnderTreesUpdate, None, LookedUnderTrees]:
+    """Put a flight's views together on the floor, yielding progress.
+
+    `opened` gives the pictures of views by number, the left-over distortion taken out; `sigma_m` is what places err by
+    where cameras are solved. `before` are cameras that were solved before; `is_quick` takes all tilts as one, and plants nothing. Raises
+    InputError for too few pictures, or without a floor in focus.
+    """
+    if len(views) < LEAST_VIEWS:
+        raise InputError(
+            f"flight {name} has {len(views)} pictures with a place; to look through trees each spot needs "
+            f"{LEAST_VIEWS} or more: map photos of strips side by side (of a video only few frames are kept)"
+        )
+    yield UnderTreesUpdate(name, "cameras", 0)
+    radial = 0.0, 0.0
+    solved, warning = _solved(views, opened(views, radial), before, is_quick=is_quick)
+    if solved is not None:
+        views, radial = solved.views, solved.radial
+    unknown = np.zeros((0, 3)), np.nan, 1.0, radial, np.full(3, np.nan), 0
+    cameras = camera_figures(solved or Cameras3D(tuple(views), (), *unknown))
+    yield UnderTreesUpdate(name, "floor", 1)
+    colour = opened(views, radial)
+    views, cell_m = _at_body_size(views, floor_m[0])
+    is_thermal = int(np.ptp(colour(0).astype(np.int16), axis=2).max()) <= _GRAY
+
+    def load(number: int) -> Any:
+        size = views[number].camera.width_px, views[number].camera.height_px
+        stored = gray_from_rgb(colour(number)) if is_thermal else colour(number)
+        image = np.asarray(cv2.resize(stored, size, interpolation=cv2.INTER_AREA), np.uint8)
+        # half levels take half the memory of floats: a median is at one
+        return (2 * levelled(image)).astype(np.int16)
+
+    kept = BytesCache[int, Any](_PICTURES_BYTES, lambda image: image.nbytes)
+
+    def picture(number: int) -> Floats32:
+        return np.asarray(kept.get(number, lambda: load(number)) * np.float32(0.5))
+
+    lattice = Lattice.over(ground_outlines_m(views, floor_m[0]), height_grid(site, cell_m))
+    under, floor, finds = look_under_trees(views, picture, lattice, *floor_m)
+    planted = None
+    if is_thermal and not is_quick:
+        yield UnderTreesUpdate(name, "planted bodies", 2)
+        planted = plant_on_floor(under, views, picture, finds.people, plants)
+    if warning:  # of cameras that share a tilt, which nothing but their fixes holds
+        above_m = np.median([each.site_from_camera.translation_m[2] for each in views])
+        sigma_m = float(np.hypot(sigma_m, _TILT * (above_m - np.median(floor.up_m))))
+    crops = [_crop(each, views, picture) for each in finds.people]
+    report = _report(name, site, under, floor, finds, planted, sigma_m)
+    report |= {"pictures": len(views), "warnings": [warning] if warning else [], "cell_m": cell_m}
+    report["headline"]["complete"] = not warning
+    if warning:
+        report["headline"]["text"] += (
+            f"; the cameras may be off: places are good to {sigma_m:.0f} m, and people may be missed"
+        )
+    objects = _objects(name, finds, sigma_m, times_ns, crops)
+    return LookedUnderTrees(report, tuple(objects), finds, views, picture, under, cameras, site)
+
+
 def search_under_trees(
     site_folder: AnyPath, folder: AnyPath, *, flight: str = "", plants: int = 80
 ) -> Iterator[UnderTreesUpdate | dict[str, Any]]:
     """Put a flight's pictures together on the floor below the trees, yielding progress and last the report.
 
     `plants` bodies are planted on the floor of thermal pictures for the probability of detection.
-    Files in `folder`: under_trees.tif (mean, anomaly, number of views, free share, floor's height), under_trees.html,
-    under_trees.geojson and under_trees.json; the finds become objects of the flight. Raises InputError for a flight without GPS, with too few
-    pictures or without a floor in focus.
+    The files of `LookedUnderTrees.write` appear in `folder`; the finds become objects of the flight. Raises InputError
+    for a flight without GPS, with too few pictures or without a floor in focus.
     """
-    folder = Path(folder)
     Archive.open(Path(site_folder), write=False).close()  # to write would make a folder
     with Archive.open(Path(site_folder), write=True) as archive:
         name, site = flight or newest_flight(archive), archive.site()
         keyframes = [each for each in archive.sound_keyframes(name) if each.site_from_camera]
-        views: Sequence[View] = flight_views(archive, name, keyframes)
-        if len(views) < LEAST_VIEWS:
-            raise InputError(
-                f"flight {name} has {len(views)} pictures with a place; to look through trees each spot needs "
-                f"{LEAST_VIEWS} or more: map photos of strips side by side (of a video only few frames are kept)"
-            )
-        yield UnderTreesUpdate(name, "cameras", 0)
-        before = solved_before(archive, keyframes, views)
-        solved, warning = _solved(views, FlightPictures(archive, keyframes), before)
-        radial = (0.0, 0.0)
-        if solved is not None:
-            views, radial = solved.views, solved.radial
-            by_name = {each.name: each for each in keyframes}
-            keyframes = [by_name[view.name] for view in views]
-        unknown = np.zeros((0, 3)), np.nan, 1.0, radial, np.full(3, np.nan), 0
-        cameras = camera_figures(solved or Cameras3D(tuple(views), (), *unknown))
-        yield UnderTreesUpdate(name, "floor", 1)
-        pictures = FlightPictures(archive, keyframes, radial)
-        views, cell_m = _at_body_size(views)
-        colours = pictures.colour(0).astype(np.int16)
-        is_thermal = int(np.ptp(colours, axis=2).max()) <= _GRAY
-        stored = pictures.gray if is_thermal else pictures.colour
-
-        def load(number: int) -> Any:
-            size = views[number].camera.width_px, views[number].camera.height_px
-            image = np.asarray(
-                cv2.resize(stored(number), size, interpolation=cv2.INTER_AREA), np.uint8
-            )
-            # half levels take half the memory of floats: a median is at one
-            return (2 * levelled(image)).astype(np.int16)
-
-        kept = BytesCache[int, Any](_PICTURES_BYTES, lambda image: image.nbytes)
-
-        def picture(number: int) -> Floats32:
-            return np.asarray(kept.get(number, lambda: load(number)) * np.float32(0.5))
-
-        lattice = Lattice.over(ground_outlines_m(views, _FLOOR_M[0]), height_grid(site, cell_m))
-        under, floor, finds = look_under_trees(views, picture, lattice, *_FLOOR_M)
-        planted = None
-        if is_thermal:
-            yield UnderTreesUpdate(name, "planted bodies", 2)
-            planted = plant_on_floor(under, views, picture, finds.people, plants)
-        free = free_share(under, views, picture)
-        sigma_m = float(np.median([each.sigma_m for each in keyframes]))
-        if warning:  # of cameras that share a tilt, which nothing but their fixes holds
-            above_m = np.median([each.site_from_camera.translation_m[2] for each in views])
-            sigma_m = float(np.hypot(sigma_m, _TILT * (above_m - np.median(floor.up_m))))
-        found = _objects(
-            name, finds, sigma_m, keyframes, [_crop(each, views, picture) for each in finds.people]
+        views = flight_views(archive, name, keyframes)
+        by_name = {each.name: each for each in keyframes}
+        looked = yield from look_through_trees(
+            name,
+            site,
+            views,
+            lambda some, radial: (
+                FlightPictures(archive, [by_name[each.name] for each in some], radial).load
+            ),
+            {each.name: each.time_ns for each in keyframes},
+            float(np.median([each.sigma_m for each in keyframes])),
+            before=solved_before(archive, keyframes, views),
+            plants=plants,
         )
-        archive.keep_under_trees(name, found)
-        low, high = np.nanpercentile(under.contrast, [1, 99.5])
+        archive.keep_under_trees(name, looked.objects)
+        low, high = np.nanpercentile(looked.under.contrast, [1, 99.5])
+        report = looked.report | {"run": run_of(keyframes)}
         kept_floor = {
-            "run": run_of(keyframes),
-            "floor_m": float(np.median(floor.up_m)),
+            "run": report["run"],
+            "floor_m": report["floor_m"] - site.origin.height_m,
             "levels": [float(low), float(high)],
-            "cameras": cameras,
+            "cameras": looked.cameras,
         }
         file = f"flights/{name}/{UNDER_TREES}"
         with archive.replacing(file):
             atomic_write_bytes(archive.folder / file, json_bytes(kept_floor))
-        report = _report(name, site, under, floor, finds, planted, sigma_m)
-        report |= {"pictures": len(views), "warnings": [warning] if warning else []}
-        report |= {"run": run_of(keyframes), "cell_m": cell_m}
-        report["headline"]["complete"] = not warning
-        if warning:
-            report["headline"]["text"] += (
-                f"; the cameras may be off: places are good to {sigma_m:.0f} m, and people may be missed"
-            )
         report["notices"] = [asdict(each) for each in archive.notices]
-    make_folder(folder)
-    zero_m = site.origin.height_m
-    bands = under.mean, under.anomaly, under.views.astype(np.float32), free, under.floor_m + zero_m
-    names = "mean", "anomaly, sigmas", "views", "free share", f"floor, {site.height_reference}"
-    write_height_cog(
-        bands, names, lattice.first, height_grid(site, cell_m).grid, folder / "under_trees.tif"
-    )
-    features = [
-        feature({"type": "Point", "coordinates": place_deg(find.place_m, site)}, row)
-        for find, row in zip(finds.people, report["people"])
-    ]
-    collection = feature_collection("under_trees", features, is_local=False)
-    atomic_write_bytes(folder / "under_trees.geojson", geojson_bytes(collection))
-    atomic_write_bytes(folder / "under_trees.json", json_bytes(report))
-    page = under_trees_page(report, _ringed(under, finds), [each.crop_jpeg for each in found])
-    write_page(folder / "under_trees.html", page)
+    replace(looked, report=report).write(Path(folder))
     yield report
 
 
@@ -194,27 +238,37 @@ def seen_floor(folder: Path, archive: Archive, flight: str) -> SeenFloor | None:
 
 
 def _solved(
-    views: Sequence[View], pictures: FlightPictures, before: Cameras3D | None
+    views: Sequence[View],
+    colour: Callable[[int], ImageRGB],
+    before: Cameras3D | None,
+    *,
+    is_quick: bool,
 ) -> tuple[Cameras3D | None, str]:
     """The cameras in space, as solved before where heights are made, else none, and a warning where they are not what
     they should be.
 
     Where crowns share few points, cameras that are free end anywhere; then a gimbal's one tilt and the fixes hold them.
     """
+
+    def gray(number: int) -> ImageGray:
+        return gray_from_rgb(colour(number))
+
     try:
         if before is None:
-            tracks = find_tracks(views, pictures.gray)
-        free = before or solve_tracks(views, tracks)
-        # how far cameras tilt from their usual tilt: a gimbal's hardly do, those that crowns leave free do
-        ups = np.array([view.site_from_camera.rotation[2] for view in free.views])
-        swings = np.linalg.norm(ups - np.median(ups, axis=0), axis=1)
-        swing_deg, stretch = np.degrees(np.median(swings)), abs(np.log(free.focal_scale))
-        is_held = len(free.lost) <= 0.1 * len(views) and stretch < _MOST_STRETCH
-        if is_held and swing_deg < _MOST_SWING_DEG:
-            return free, ""
+            tracks = find_tracks(views, gray)
+        is_held = False
+        if not is_quick:
+            free = before or solve_tracks(views, tracks)
+            # how far cameras tilt from their usual tilt: a gimbal's hardly do, those that crowns leave free do
+            ups = np.array([view.site_from_camera.rotation[2] for view in free.views])
+            swings = np.linalg.norm(ups - np.median(ups, axis=0), axis=1)
+            swing_deg, stretch = np.degrees(np.median(swings)), abs(np.log(free.focal_scale))
+            is_held = len(free.lost) <= 0.1 * len(views) and stretch < _MOST_STRETCH
+            if is_held and swing_deg < _MOST_SWING_DEG:
+                return free, ""
         if before is not None:
             views = _by_given_lens(views, before)
-            tracks = find_tracks(views, pictures.gray)
+            tracks = find_tracks(views, gray)
         steady = solve_steady(views, tracks)
         share = steady.observations / len(tracks.view)
         why = (
@@ -246,19 +300,13 @@ def _by_given_lens(views: Sequence[View], before: Cameras3D) -> Sequence[View]:
     return [replace(view, camera=given) for view in views]
 
 
-def _at_body_size(views: Sequence[View]) -> tuple[list[View], float]:
+def _at_body_size(views: Sequence[View], lowest_m: float) -> tuple[list[View], float]:
     """The views with pixels on the lowest floor no finer than the cells, and the cells' side, m."""
     height_m = float(np.median([each.site_from_camera.translation_m[2] for each in views]))
     focal_px = views[0].camera.fx_px
     cell_m = float(f"{max(height_m / focal_px, _LEAST_CELL_M):.3g}")
-    share = min(1.0, (height_m - _FLOOR_M[0]) / focal_px / cell_m * 1.25)
-    smaller = [
-        each.camera.resized(
-            *(max(32, round(n * share)) for n in (each.camera.width_px, each.camera.height_px))
-        )
-        for each in views
-    ]
-    return [replace(view, camera=camera) for view, camera in zip(views, smaller)], cell_m
+    share = min(1.0, (height_m - lowest_m) / focal_px / cell_m * 1.25)
+    return [each.smaller(share) for each in views], cell_m
 
 
 def _report(
@@ -283,10 +331,15 @@ def _report(
             f"; probability of detection of a person lying there: {pod['pod']:.2f} (90 % interval "
             f"{pod['pod_low']:.2f} to {pod['pod_high']:.2f})"
         )
+    people = []
+    for find in finds.people:
+        longitude_deg, latitude_deg = place_deg(find.place_m, site)
+        place = {"latitude_deg": latitude_deg, "longitude_deg": longitude_deg, "sigma_m": sigma_m}
+        people.append(asdict(find) | place | {"place_m": find.place_m.tolist()})
     return {
         "flight": name,
         "headline": {"text": text},
-        "people": [_properties(each, site) | {"sigma_m": sigma_m} for each in finds.people],
+        "people": people,
         "refused": dict(finds.refused),
         "seen_m2": seen_m2,
         "views_median": float(np.median(under.views[seen])),
@@ -297,25 +350,14 @@ def _report(
     }
 
 
-def _properties(find: Find, site: Site) -> dict[str, Any]:
-    longitude_deg, latitude_deg = place_deg(find.place_m, site)
-    return asdict(find) | {
-        "latitude_deg": latitude_deg,
-        "longitude_deg": longitude_deg,
-        "pictures": list(find.pictures),
-        "place_m": find.place_m.tolist(),
-    }
-
-
 def _objects(
     name: str,
     finds: Finds,
     sigma_m: float,
-    keyframes: Sequence[StoredKeyframe],
+    times_ns: Mapping[str, int],
     crops: Sequence[Any],
 ) -> list[MapObject]:
     """The finds, each with its crop, as objects of the flight."""
-    times_ns = {each.name: each.time_ns for each in keyframes}
     return [
         MapObject(
             f"{name}-u{number}",

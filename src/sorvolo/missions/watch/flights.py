@@ -35,6 +35,7 @@ from sorvolo.missions.watch.cot_sender import check_host, cot_place
 from sorvolo.missions.watch.places import Places, over_heights, places_of
 from sorvolo.missions.watch.run import EarlyFound, WatchRun, WatchUpdate, utc_ns
 from sorvolo.missions.watch.settings import DEFAULT_FRAMES_PER_SECOND, WatchOutputs, WatchSettings
+from sorvolo.missions.watch.through_trees import ThroughTrees
 from sorvolo.missions.watch.waiting import WaitingFrames
 from sorvolo.mosaic.selection import every
 from sorvolo.paths import AnyPath, Inputs, as_text, listed
@@ -205,8 +206,12 @@ def _watch_one(
         )
         stack.callback(journal.close)
         memo = ResultCache(journal, source)
+        trees = None
+        if settings.through_trees:
+            trees = ThroughTrees(setup, places.site, folder, memo)
+            stack.callback(trees.close)
         run = stack.enter_context(
-            WatchRun(setup, places, detector, settings, outputs, folder, memo, early)
+            WatchRun(setup, places, detector, settings, outputs, folder, memo, early, trees)
         )
         if moved is not None and isinstance(source, LiveStream):
             _give_steps(source, setup, moved)
@@ -223,6 +228,8 @@ def _watch_one(
                 if not until.is_set():
                     ended = "the source ended"
                     run.log.read = passed.count  # also those after the last one that was searched
+            if trees is not None and (is_live or not until.is_set()):
+                trees.finish()
         except KeyboardInterrupt:
             ended = _STOPPED  # what was found is written below
         except Exception as error:
@@ -289,7 +296,9 @@ def _recorded(
         for frame in frames:
             passed.note(run)
             if isinstance(frame, Frame):
-                yield run.add(frame, time.monotonic())
+                update = run.add(frame, time.monotonic())
+                run.put_together(frame)
+                yield update
             else:
                 run.lose(frame)
             if until.is_set():
@@ -310,6 +319,8 @@ def _live(
 
     def came(frame: Frame) -> PointsM | None:
         memo.note_came(frame)
+        if run.trees is not None:
+            run.put_together(replace(frame, image=waiting.picture(frame.index)))
         return run.show(frame)
 
     with closing(waiting.live(came, run.new_share, run.doubtful)) as arrivals:

@@ -36,6 +36,7 @@ from sorvolo.missions.watch.files import SeenFrame, WatchFiles
 from sorvolo.missions.watch.notifier import Notifier
 from sorvolo.missions.watch.places import CONTRADICTED, Places
 from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
+from sorvolo.missions.watch.through_trees import ThroughTrees
 from sorvolo.search.looked_ground import near_ground
 from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.store.exports.detection_files import write_detections
@@ -202,8 +203,10 @@ class WatchUpdate:
     has_landed: bool
 
 
-def headline_of_watch(headline: dict[str, Any], notices: Sequence[Notice]) -> dict[str, Any]:
-    """A headline that also states what keeps it from being the whole truth."""
+def headline_of_watch(
+    headline: dict[str, Any], notices: Sequence[Notice], trees: ThroughTrees | None = None
+) -> dict[str, Any]:
+    """A headline that also states what keeps it from being the whole truth, and what is under trees."""
     limits = [
         "what was flown before the watch began was not looked at"
         if each.code == BEGUN_LATE
@@ -211,9 +214,11 @@ def headline_of_watch(headline: dict[str, Any], notices: Sequence[Notice]) -> di
         for each in notices
         if each.code in (BEGUN_LATE, CONTRADICTED, _UNCOUNTED)
     ]
-    if not limits:
-        return headline
-    return {"text": "; ".join([headline["text"], *limits]), "complete": False}
+    is_complete = headline["complete"] and not limits
+    if trees is not None:
+        limits.append(trees.headline["text"])
+        is_complete &= trees.headline["complete"]
+    return {"text": "; ".join([headline["text"], *limits]), "complete": is_complete}
 
 
 def utc_ns(setup: FlightSetup, frame_ns: int) -> int:
@@ -238,8 +243,9 @@ class WatchRun:
         folder: Path,
         memo: ResultCache,
         early: Callable[[EarlyFound], None] | None = None,
+        trees: ThroughTrees | None = None,
     ) -> None:
-        self._memo, self._early = memo, early
+        self._memo, self._early, self.trees = memo, early, trees
         self._setup, self._places, self._detector = setup, places, detector
         self._settings, self._outputs, self._folder = settings, outputs, folder
         self._classes = settings.classes or detector.info.usual_classes
@@ -367,6 +373,12 @@ class WatchRun:
             return None
         return near_ground(view.outline_m, view.site_from_camera.translation_m)
 
+    def put_together(self, frame: Frame) -> None:
+        """Take in a frame, in order of time, for what all of them show under trees."""
+        if self.trees is not None:
+            view = self._places.view(frame)
+            self.trees.take(frame, None if view is None else view.site_from_camera)
+
     def new_share(self, outline_m: PointsM) -> float:
         """The share, 0 to 1, of this ground that no frame was searched for."""
         return 1.0 if self._ground is None else self._ground.new_share(outline_m)
@@ -427,6 +439,10 @@ class WatchRun:
         seen_ids = set(taken.track_ids)
         seen = [track for track in confirmed if track.id in seen_ids]
         new = [track for track in confirmed if track.id in taken.new_ids]
+        if self.trees is not None:
+            below = self.trees.new()
+            new, seen = [*new, *below], [*seen, *below]
+            left += self.trees.tracks.values()
         counts = count_by_class([*confirmed, *left])
         log.searched(time_ns, found, () if self._places.site.is_local else sighted)
         with log.stage("hand over"):
@@ -492,6 +508,11 @@ class WatchRun:
                 }
                 tracks = self._announced.named(tracks)
                 self._notifier.withdraw(each.id for each in self._announced.left())
+            if self.trees is not None:
+                late_ids |= {track.id for track in self.trees.new()}
+                tracks += self.trees.tracks.values()
+                self._files.forget(self.trees.withdrawn)
+                self._notifier.withdraw(self.trees.withdrawn)
             for track in tracks:
                 self._files.crop_of(track)
             self._files.close()
@@ -553,10 +574,11 @@ class WatchRun:
         if log.unkept:
             text = f"{counted(log.unkept, 'frame')} did not wait for the landing: the disk is full"
             notices.append(Notice("disk_full", log.unkept, text))
-        gone = [] if self._announced is None else self._announced.left()
+        gone = 0 if self._announced is None else len(self._announced.left())
+        gone += 0 if self.trees is None else len(self.trees.withdrawn)
         if gone:
-            text = f"{counted(len(gone), 'object')} announced while live: not confirmed by all frames, not counted"
-            notices.append(Notice("not_confirmed", len(gone), text))
+            text = f"{counted(gone, 'object')} announced while live: not confirmed by all frames, not counted"
+            notices.append(Notice("not_confirmed", gone, text))
         notices += self._notifier.notices()
         classes = [each for each in self._classes if each not in hidden]
         return {
@@ -564,7 +586,7 @@ class WatchRun:
             "first_frame": utc_text(log.first_ns) if log.first_ns >= 0 else None,
             "last_frame": utc_text(log.last_ns) if log.last_ns >= 0 else None,
             "ended": ended,
-            "headline": headline_of_watch(looked.headline(counts, classes), notices),
+            "headline": headline_of_watch(looked.headline(counts, classes), notices, self.trees),
             "looked_for": list(self._classes),
             "looked_at": looked.facts(),
             "objects": {"total": len(tracks), "by_class": counts},

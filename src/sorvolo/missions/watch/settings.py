@@ -38,6 +38,7 @@ class WatchSettings:
     height_model: str = (
         ""  # a GeoTIFF of the ground's heights, in the same reference; empty: the ground is level
     )
+    through_trees: bool = False  # frames are also put together on the forest floor
     enough_looked_at: float = ENOUGH_LOOKED_AT  # share of the ground, else the result is to check
 
     def __post_init__(self) -> None:

@@ -8,9 +8,11 @@ from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from sorvolo.capture.source import LiveSource
 from sorvolo.errors import StoreError
-from sorvolo.geometry.arrays import PointsM
+from sorvolo.geometry.arrays import ImageRGB, PointsM
 from sorvolo.geometry.polygons import points_inside
 from sorvolo.store.images import image_from_jpeg, jpeg_from_image
 from sorvolo.store.site.spill import SpillFile
@@ -207,10 +209,14 @@ class WaitingFrames:
 
     def _frame(self, kept: _Kept) -> Frame | None:
         """A frame with its picture; None where that was not kept."""
+        image = self.picture(kept.index)
+        return Frame(kept.index, kept.name, kept.time_ns, image) if image.size else None
+
+    def picture(self, index: int) -> ImageRGB:
+        """The picture of a frame that came, without size where it was not kept."""
         with self._changed:
             try:
-                picture = self._pictures.get(kept.index)
+                picture = self._pictures.get(index)
             except KeyError:
-                return None
-        image = image_from_jpeg(picture, kept.name)
-        return Frame(kept.index, kept.name, kept.time_ns, image)
+                return np.zeros((0, 0, 3), np.uint8)
+        return image_from_jpeg(picture, f"{index}")

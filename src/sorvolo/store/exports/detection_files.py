@@ -75,6 +75,7 @@ _OURS = (
     REPORT,
     "report.html",
     SEARCHED,
+    *(f"under_trees.{ending}" for ending in ("html", "tif", "geojson", "json")),
 )
 _MADE_BY = "sorvolo watch"
 _OF_FIRST_PICTURE = (
