@@ -119,6 +119,6 @@ def test_demo_leaves_other_peoples_files(
 
 
 def test_bar_words() -> None:
-    update = MosaicUpdate("flight1", "7", Status.VISION, "", 40, 100, 8, 20, 7, 3, 4.0)
+    update = MosaicUpdate("flight1", "7", Status.VISION, "", 40, 100, 8, 7, 3, 4.0)
     assert words_of(update) == "10.0 frames/s, 7 of 8 frames matched"
     assert words_of(replace(update, seconds=0.0)) == "7 of 8 frames matched"

@@ -14,7 +14,6 @@ from sorvolo.geometry.planning import (
     FRONT_CRITICAL_M,
     StripSettings,
     Task,
-    focal_px_from_mm,
     footprint_size_m,
     longest_bearing_deg,
     maximum_height_m,
@@ -66,8 +65,8 @@ def test_table_3_1_bottom_facing_is_computed_not_copied(task, printed, computed)
 )
 def test_equations_3_10_to_3_15_follow_from_a_pixel_of_6_97_um(srj_px_per_m, printed_m):
     """Erratum 1: the printed 5.97 um gives heights 17 % greater."""
-    assert cut(maximum_height_m(focal_px_from_mm(1.7, 6.97), srj_px_per_m)) == printed_m
-    wrong_m = maximum_height_m(focal_px_from_mm(1.7, 5.97), srj_px_per_m)
+    assert cut(maximum_height_m(1.7 / 6.97e-3, srj_px_per_m)) == printed_m
+    wrong_m = maximum_height_m(1.7 / 5.97e-3, srj_px_per_m)
     assert wrong_m / printed_m == pytest.approx(6.97 / 5.97, rel=1e-3)
 
 
@@ -111,8 +110,6 @@ def test_at_the_maximum_height_the_task_is_just_met(height, focal_px, task, crit
     [
         lambda: required_px_per_m(Task.DETECTION, 0.0),
         lambda: required_px_per_m(Task.DETECTION, math.nan),
-        lambda: focal_px_from_mm(0.0, 3.0),
-        lambda: focal_px_from_mm(4.0, -1.0),
         lambda: px_per_m(0.0, 1000.0),
         lambda: scene_length_m(10.0, 180.0),
         lambda: minimum_frame_rate(5.0, 10.0, 1.0),

@@ -240,6 +240,12 @@ def test_a_site_is_deleted_once_its_name_is_typed(
         page = deleting.page
         page.goto(station.url)
         page.get_by_label("More of field").click()
+        page.get_by_role("button", name="Rename field").click()
+        page.get_by_label("Name", exact=True).fill("Pré fleuri")
+        page.get_by_role("dialog").get_by_role("button", name="Rename").click()
+        page.get_by_role("heading", name="Pré fleuri").wait_for()
+        expect(looking.page.locator("#title h1")).to_have_text("Pré fleuri")
+        page.get_by_label("More of field").click()
         page.get_by_role("button", name="Delete field").click()
         box = page.get_by_role("dialog")
         expect(box).to_contain_text("2 flights, 2 versions of the map")
@@ -273,7 +279,19 @@ def test_an_empty_station_leads_to_a_first_flight(browser: Any, tmp_path: Path) 
     with Served(tmp_path) as empty:
         watched = Watched(context_of(browser), empty.url)
         watched.page.goto(empty.url)
-        watched.page.get_by_text("sorvolo demo").wait_for()
+        wishes: list[Any] = []
+
+        def take(route: Any) -> None:
+            if route.request.method != "POST":
+                return route.continue_()
+            wishes.append(route.request.post_data_json)
+            return route.fulfill(status=201, json={"id": "run-1"})
+
+        watched.page.route(re.compile("/api/runs"), take)
+        watched.page.get_by_role("button", name="Try the demo").click()
+        watched.page.get_by_role("heading", name="Activity").wait_for()
+        assert wishes == [{"mission": "demo", "site": "demo"}]
+        watched.page.go_back()
         watched.page.get_by_label("Name of a new site").fill("Pré fleuri")
         watched.page.get_by_role("button", name="New site").click()
         watched.page.get_by_text("Start a mission").wait_for()

@@ -226,3 +226,17 @@ def test_what_a_killed_station_had_begun_to_delete_goes_when_the_next_one_starts
     with TestClient(station_app(StationSettings(root)), base_url=HOST) as client:
         assert client.get("/api/sites").json() == []
     assert not (root / "station" / "deleted").exists()
+
+
+def test_a_site_is_renamed_and_its_addresses_stay(client: TestClient, root: Path) -> None:
+    """As everybody sees it, at once; its rows keep their seals; not while a mission runs."""
+    assert client.put(f"{FIELD}/name", json={"name": "Pré fleuri"}).status_code == 204
+    assert client.get(FIELD).json()["name"] == "Pré fleuri"
+    assert [each["name"] for each in client.get("/api/sites").json()] == ["Pré fleuri"]
+    with Archive.open(root / "field", write=False) as archive:
+        assert archive.site().name == "Pré fleuri"
+    for wrong in ("", " ", "n" * 81):
+        assert client.put(f"{FIELD}/name", json={"name": wrong}).status_code == 422
+    assert client.put("/api/sites/nowhere/name", json={"name": "x"}).status_code == 404
+    keep_run(client, "feed", "running")
+    assert client.put(f"{FIELD}/name", json={"name": "x"}).status_code == 409

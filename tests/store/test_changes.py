@@ -301,7 +301,10 @@ def test_history_states_what_the_comparison_states(folder: Path) -> None:
         archive.review(changes[1].id, Verdict.REJECTED)
         (left,) = (each for each in found_features(archive, [], []) if each["properties"]["untold"])
     assert left["properties"]["untold"] == {"b": "disappeared"}
-    assert came_and_left(folder) == f"from a to b: 1 person left; {in_short(changes[:1])}"
+    assert (
+        came_and_left(folder)
+        == f"from a to b: {in_short(changes[:1])}; by the search alone: 1 person left"
+    )
     with Archive.open(folder, write=True) as archive, archive.begin_flight("c", "", {}) as writer:
         writer.commit([frame(0)], {}, {"flight": "c"}, "<html></html>")
     assert "no objects were searched for on c" in came_and_left(folder)

@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -40,17 +40,21 @@ def between(register: Register, before: str, after: str) -> str:
     """What came and left between two dates that were not compared, by class: "1 person came, 1 left; 12 cars left".
     Counts only what one date saw and the other looked for without finding it."""
     known = {each.date for each in register.looks if len(each.frames.outlines_m)}
-    kinds = {found: kind for kind, found in begun_and_ended(register, {before}, after)}
-    parts = _in_parts(
-        Counter(
-            (each.label or UNNAMED, "came" if kinds[each] is ChangeKind.APPEARED else "left")
-            for each in ordered(list(kinds))
-        )
-    )
+    words = in_words(begun_and_ended(register, {before}, after))
     unsearched = [date for date in (before, after) if date not in known]
-    if not parts and unsearched:
+    if not words and unsearched:
         return f"no telling what came or left: no objects were searched for on {' and '.join(unsearched)}"
-    return "; ".join(parts) or "nothing known came or left"
+    return words or "nothing known came or left"
+
+
+def in_words(came_or_left: Iterable[tuple[ChangeKind, GroundFinding]]) -> str:
+    """What came and left, by class; "" for nothing."""
+    kinds = {found: kind for kind, found in came_or_left}
+    verbs = (
+        (each.label or UNNAMED, "came" if kinds[each] is ChangeKind.APPEARED else "left")
+        for each in ordered(list(kinds))
+    )
+    return "; ".join(_in_parts(Counter(verbs)))
 
 
 Seen = TypeVar("Seen", bound=ChangeFacts)

@@ -31,7 +31,6 @@ _LIKE_SIZE = 2.5  # lengths further apart than this ratio are two things, where 
 _LIKE_CLASS = 0.1  # classes' shares that agree less are two classes
 _NAMED = 0.1  # beside a detector's own class counts that of a change: by the same frames, or one small picture
 _LEFT = 4.0  # as unlike is what the date's comparison saw leave: what came in its place is nearer
-_SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
 _FAR = 1e3  # the cost of a pair that cannot be one thing: more than all that can
 
 UNNAMED = "thing"
@@ -215,31 +214,18 @@ def begun_and_ended(
 
 def untold(
     register: Register, changes: Sequence[ChangeFacts], before: Collection[str], after: str
-) -> Iterator[ChangeFacts]:
+) -> Iterator[tuple[ChangeKind, GroundFinding]]:
     """What came or left by the detector's searches alone: none of `changes`, all those of the later date, holds it or,
-    rejected perhaps, is at its place. Its outline is the square around it."""
+    rejected perhaps, is at its place."""
     ids = {each.id for each in changes}
     places = [each for each in changes if each.kind not in (ChangeKind.AREA, ChangeKind.MOVING)]
     for kind, found in begun_and_ended(register, before, after):
-        newest, half_m = found.newest, max(_known(found.newest.length_m), _REACH_M) / 2
+        reach_m = _REACH_M + _known(found.newest.length_m) / 2
         if ids.isdisjoint(each.id for each in found.sightings) and not any(
-            np.hypot(*(each.centre_m - found.position_m)) <= _REACH_M + half_m + each.length_m / 2
+            np.hypot(*(each.centre_m - found.position_m)) <= reach_m + each.length_m / 2
             for each in places
         ):
-            yield ChangeFacts(
-                found.id,
-                kind,
-                newest.score,
-                found.position_m + half_m * _SQUARE,
-                found.first_ns,
-                found.last_ns,
-                1,
-                4 * half_m**2,
-                2 * half_m,
-                found.sigma_m,
-                class_before=found.label if kind is ChangeKind.DISAPPEARED else "",
-                class_after=found.label if kind is ChangeKind.APPEARED else "",
-            )
+            yield kind, found
 
 
 def _can_be_missed(sightings: Sequence[MissionSighting]) -> bool:

@@ -51,15 +51,6 @@ def required_px_per_m(task: Task, critical_m: float) -> float:
     return task.pixels / critical_m
 
 
-def focal_px_from_mm(focal_mm: float, pixel_um: float) -> float:
-    """The focal length in pixels, f / k."""
-    if not (np.isfinite(focal_mm) and focal_mm > 0 and np.isfinite(pixel_um) and pixel_um > 0):
-        raise SettingsError(
-            f"focal length and pixel must be positive, got {focal_mm} mm and {pixel_um} um"
-        )
-    return focal_mm / (pixel_um * 1e-3)
-
-
 def px_per_m(height_m: float, focal_px: float) -> float:
     """Ground resolution straight below (eq. 3.8); its inverse is the ground sampling distance."""
     if not (np.isfinite(height_m) and height_m > 0):

@@ -4,6 +4,7 @@ import json
 import os
 import resource
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -17,6 +18,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
 
 from sorvolo.capture.live.addresses import is_live_address, without_secret
+from sorvolo.child_process import python_command
 from sorvolo.errors import SorvoloError, UnavailableError
 
 if TYPE_CHECKING:
@@ -376,12 +378,24 @@ def run_inspect(order: Order, journal: Journal, _: threading.Event) -> Done:
     return Done("inspected")
 
 
+def run_demo(order: Order, journal: Journal, until: threading.Event) -> Done:
+    """Simulate two flights over a village, map the first into its site and compare the second."""
+    flights = Path(order.folder) / "simulation"
+    making = python_command("sorvolo", "simulate", str(flights), "--preset", "demo")
+    if subprocess.run(making, check=False).returncode:
+        raise SorvoloError("the flights could not be simulated; is the disk full?")
+    one, two = (str(flights / each / f"{each}.mp4") for each in ("flight1", "flight2"))
+    run_map(replace(order, source=one), journal, until)
+    return run_compare(replace(order, source=two), journal, until)
+
+
 MISSIONS: dict[str, Callable[[Order, Journal, threading.Event], Done]] = {
     "map": run_map,
     "compare": run_compare,
     "watch": run_watch,
     "search": run_search,
     "inspect": run_inspect,
+    "demo": run_demo,
 }
 
 

@@ -59,8 +59,9 @@ def found_features(
         properties = {each["id"]: each["properties"] for each in features}
         flights = list(dict.fromkeys(each.flight_id for each in archive.versions()))
         for number, flight in enumerate(flights[1:], 1):
-            for each in untold(register, archive.changes(flight), flights[:number], flight):
-                properties[each.id]["untold"][flight] = each.kind
+            changes = archive.changes(flight)
+            for kind, each in untold(register, changes, flights[:number], flight):
+                properties[each.id]["untold"][flight] = kind
     return features
 
 

@@ -23,7 +23,7 @@ class _Seen:
 
     mark: tuple[int, int]
     state: TilePyramid | None
-    versions: int
+    about: tuple[int, str]  # versions and name
 
 
 class MapWatch(ThreadOwner):
@@ -81,7 +81,8 @@ class MapWatch(ThreadOwner):
             return
         state = self._tiles.live(site_id) if archive.has_site else None
         versions = len(archive.versions())
-        self._seen[site_id] = _Seen(mark, state, versions)
+        about = versions, archive.site().name if archive.has_site else ""
+        self._seen[site_id] = _Seen(mark, state, about)
         if before is None:
             self._reviews.settle(site_id)  # those that waited when the station was ended
             if self._is_news(site_id, state):
@@ -90,7 +91,7 @@ class MapWatch(ThreadOwner):
         # a map, and another one than before
         if state is not None and (before.state is None or before.state.revision != state.revision):
             self._announce(site_id, archive, state, before.state)
-        if versions != before.versions:
+        if about != before.about:
             self._events.append(NewEvent("site.changed", {"versions": versions}, site_id))
             self._reviews.settle(site_id)
 

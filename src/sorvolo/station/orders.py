@@ -25,14 +25,14 @@ LOCK_VARIABLE = "SORVOLO_RUN_LOCK"
 SOURCE_VARIABLE = "SORVOLO_RUN_SOURCE"
 """Of the same: the input, whose password no file is to hold."""
 
-Mission = Literal["map", "compare", "watch", "search"]
+Mission = Literal["map", "compare", "watch", "search", "demo"]
 
 
 def writes(mission: str, has_input: bool, options: Mapping[str, Any]) -> bool:
     """Whether a mission writes into its site, as one at a time may; a search does that maps a flight first, or keeps
     whom it finds below crowns."""
     is_writing_search = has_input or bool(options.get("through_trees"))
-    return mission in ("map", "compare") or (mission == "search" and is_writing_search)
+    return mission in ("map", "compare", "demo") or (mission == "search" and is_writing_search)
 
 
 _CAMERA = r"^(aov=[0-9.]{1,8}|focal_px=[0-9.]{1,10}|[A-Za-z0-9 .+-]+)$"  # a preset's name: no path
@@ -96,7 +96,7 @@ class RunWish(Wish, extra="forbid"):
 
     @model_validator(mode="after")
     def _input_where_needed(self) -> "RunWish":
-        if self.input is None and self.mission != "search":
+        if self.input is None and self.mission not in ("search", "demo"):
             raise ValueError(
                 "map, compare and watch need an input; search without one measures the site's flights"
             )

@@ -169,7 +169,7 @@ class Runs(ThreadOwner):
                 own = each.mission, each.input is not None, each.options or {}
                 if each.site == wish.site and writes(*own):
                     raise _busy(409, each, f"writes into the site {wish.site!r}")
-            makes_site = wish.mission in ("map", "watch") or (
+            makes_site = wish.mission in ("map", "watch", "demo") or (
                 wish.mission == "search" and wish.input is not None
             )
             find = self._shelf.new_folder if makes_site else self._shelf.folder
@@ -647,7 +647,7 @@ def run_routes(runs: Runs, inputs: Inputs, ingest: Ingest) -> APIRouter:
 
     @router.post("/api/runs", status_code=201)
     def start(wish: RunWish, holder: Holder = needs(Role.OPERATE)) -> Json:
-        """Start a mission: map, compare, watch or search. 409 while another one writes into the site."""
+        """Start a mission: map, compare, watch, search or demo. 409 while another one writes into the site."""
         return run_row(runs.start(wish, holder.name))
 
     @router.get("/api/runs/{run_id}", dependencies=FOR_VIEWERS)

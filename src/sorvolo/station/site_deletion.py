@@ -1,4 +1,4 @@
-"""A site deleted for good: what would be lost with it, what stands against it, and its folder gone at once."""
+"""A site renamed, or deleted for good: what would be lost with it, what stands against it, and its folder gone at once."""
 
 import errno
 import hashlib
@@ -11,15 +11,18 @@ from pathlib import Path
 from typing import Annotated
 
 from fastapi import APIRouter, Header, Response
+from pydantic import Field
 
 from sorvolo.errors import StoreError
 from sorvolo.paths import Json
+from sorvolo.station.orders import Wish
 from sorvolo.station.problems import Problem
 from sorvolo.station.reviews import Drawings, Reviews
 from sorvolo.station.runs import Runs
 from sorvolo.station.security import FOR_OPERATORS
 from sorvolo.station.sites import SiteShelf
 from sorvolo.store.atomic import writing
+from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue_place import CATALOGUE, catalogue_file
 from sorvolo.store.site.files import COPYING, ORIGIN, BusyError, lock_folder
 
@@ -62,6 +65,14 @@ class SiteDeletion:
             "missions": len(self._runs.of_site(site_id)),
             "etag": f'"{mark}"',
         }
+
+    def rename(self, site_id: str, name: str) -> None:
+        """Give the site another name. Raises Problem: 404, 409 as `loss`."""
+        with (
+            self._runs.unused_site(site_id),
+            Archive.open(self._shelf.folder(site_id), write=True) as archive,
+        ):
+            archive.rename(name)
 
     def delete(self, site_id: str, mark: str) -> None:
         """Delete the site as `loss` counted it.
@@ -164,6 +175,12 @@ class SiteDeletion:
         return flights, len(complete), _mark(about.st_dev, about.st_ino, flights, newest)
 
 
+class NameWish(Wish):
+    """What a site shall be called."""
+
+    name: Annotated[str, Field(min_length=1, max_length=80, pattern=r"\S")]
+
+
 def site_deletion_routes(deletion: SiteDeletion) -> APIRouter:
     """What a site's deletion would take, and the deletion itself."""
     router = APIRouter(prefix="/api/sites", tags=["sites"], dependencies=FOR_OPERATORS)
@@ -175,6 +192,11 @@ def site_deletion_routes(deletion: SiteDeletion) -> APIRouter:
         found = deletion.loss(site)
         response.headers["etag"] = found["etag"]
         return found
+
+    @router.put("/{site}/name", status_code=204)
+    def rename(site: str, wish: NameWish) -> None:
+        """Give a site another name; its folder and addresses stay. 409 while a mission runs on it."""
+        deletion.rename(site, wish.name)
 
     @router.delete("/{site}", status_code=204)
     def delete(site: str, if_match: Annotated[str, Header(max_length=100)] = "") -> Response:

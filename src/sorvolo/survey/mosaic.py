@@ -173,7 +173,6 @@ class MosaicUpdate:
     frames_read: int
     frames_expected: int
     keyframes: int
-    keyframes_expected: int
     by_vision: int
     tiles_touched: int
     seconds: float

@@ -223,7 +223,6 @@ def _map_one(
                 frame.index + 1,
                 source.frame_count,
                 run.selected,
-                max(setup.plan.expected, run.selected),
                 run.by_vision,
                 painted,
                 time.monotonic() - started_s,

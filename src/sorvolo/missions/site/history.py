@@ -7,7 +7,7 @@ from datetime import datetime, time, timedelta
 from pathlib import Path
 
 from sorvolo.errors import InputError, SettingsError, StoreError
-from sorvolo.findings.importance import between, in_short
+from sorvolo.findings.importance import between, in_short, in_words
 from sorvolo.findings.register import untold
 from sorvolo.missions.heights.measure import coloured_heights
 from sorvolo.store.exports.map_pictures import write_kmz, write_preview
@@ -84,9 +84,10 @@ def came_and_left(site: Path) -> str:
         register = archive.register()
         if made[after] in archive.comparisons():
             changes = archive.changes(after)
-            others = untold(register, changes, made.keys() - {after}, after)
             kept = [each for each in changes if each.verdict is not Verdict.REJECTED]
-            words = in_short([*kept, *others], is_local=archive.site().is_local)
+            words = in_short(kept, is_local=archive.site().is_local)
+            if others := in_words(untold(register, changes, made.keys() - {after}, after)):
+                words += f"; by the search alone: {others}"
         else:
             words = between(register, before, after)
         return f"from {before} to {after}: {words}"

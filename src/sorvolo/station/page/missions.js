@@ -232,7 +232,7 @@ export class Missions {
   row(run, moving) {
     const running = run.state === "running";
     return el("article", { class: `run ${run.state}` },
-      el("header", el("b", KINDS[run.mission]?.[0] ?? run.mission), el("span.state", run.stop_asked && running ? say("stopping") : STATES[run.state] ?? run.state), el("span.soft", `${time(run.started_at)}${run.who ? `, ${nameOf(run.who)}` : ""}`)),
+      el("header", el("b", KINDS[run.mission]?.[0] ?? (run.mission === "demo" ? say("Demo") : run.mission)), el("span.state", run.stop_asked && running ? say("stopping") : STATES[run.state] ?? run.state), el("span.soft", `${time(run.started_at)}${run.who ? `, ${nameOf(run.who)}` : ""}`)),
       run.input?.name || run.input?.stream || run.input?.stream_url ? el("p.soft", run.input.name ?? run.input.stream ?? run.input.stream_url) : null,
       moving,
       run.notice ? el("p.error", { role: "status" }, run.notice) : null,

@@ -4,7 +4,7 @@ import { say } from "./languages.js";
 import { area_m2, polygonsOf } from "./places.js";
 import { day, duration, percent } from "./words.js";
 
-const ACTS = { map: say("Mapping"), compare: say("Comparing"), watch: say("Looking for people and vehicles"), search: say("Measuring the search") };
+const ACTS = { map: say("Mapping"), compare: say("Comparing"), watch: say("Looking for people and vehicles"), search: say("Measuring the search"), demo: say("Making the demo") };
 const BAD_ENDS = { failed: say("The last mission failed"), incomplete: say("The last mission is incomplete"), lost: say("The last mission broke off"), stopped: say("The last mission was stopped") };
 const LINKS = { late: say("The station answers late"), waiting: say("Connecting"), lost: say("No connection") };
 

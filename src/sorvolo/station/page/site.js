@@ -57,10 +57,16 @@ class SiteScreen {
     const tab = (name, props) => button(ALL_PANELS[name][0], () => this.open(name, true), { data: { panel: name }, "aria-controls": "panel", ...props });
     fill(rooms, this.tabs = [...Object.keys(ROOMS).map((name) => tab(name)), tab("share", { icon: "export", class: "share" })]);
     fill(main, el("div.site", this.panel, this.stage, this.wall));
-    fill(title, el("h1", siteName(data.detail)), this.people = el("span.soft.present"));
-    document.title = `${siteName(data.detail)} – Sorvolo`;
+    fill(title, this.heading = el("h1"), this.people = el("span.soft.present"));
+    this.name();
     this.tell(); // before the map is made: it lies over the map's ground
     this.begin(view);
+  }
+
+  name() {
+    const name = siteName(this.data.detail);
+    fill(this.heading, name);
+    document.title = `${name} – Sorvolo`;
   }
 
   begin(view) {
@@ -310,6 +316,7 @@ class SiteScreen {
   }
 
   draw(names) {
+    if (names.includes("detail")) this.name();
     if (this.view) {
       this.view.ready.then(() => {
         if (this.closed) return;

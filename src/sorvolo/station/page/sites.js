@@ -1,6 +1,6 @@
 // The start page: drones that send, with one button each; the sites; flights dropped on the page.
 
-import { ask, get, now, roomUrl, siteUrl } from "./api.js";
+import { ask, get, now, post, put, roomUrl, siteUrl } from "./api.js";
 import { button, dialog, el, field, fill, quiet, report } from "./dom.js";
 import { isWithin, tileColumn, tileRow } from "./places.js";
 import { DroneVideo } from "./video.js";
@@ -98,7 +98,21 @@ function card(site, may) {
       el("h3", siteName(site))),
     el("p", say("{n} flight|{n} flights", { n: site.flights }), " · ", say("{n} version|{n} versions", { n: site.versions })),
     el("p.soft", where, site.updated_at ? ` · ${words.time(site.updated_at)}` : ""),
-    remove ? el("details.more", el("summary", { "aria-label": say("More of {name}", { name: site.id }) }, "⋯"), remove) : null);
+    remove ? el("details.more", el("summary", { "aria-label": say("More of {name}", { name: site.id }) }, "⋯"), quiet(say("Rename"), () => rename(site), { "aria-label": say("Rename {name}", { name: site.id }) }), remove) : null);
+}
+
+function rename(site) {
+  const name = el("input", { required: true, maxlength: 80, ".value": siteName(site) });
+  const fault = el("p.error", { role: "alert" });
+  const box = dialog(say("Rename {name}", { name: siteName(site) }), el("form.stack", { on: { submit: async (event) => {
+    event.preventDefault();
+    try {
+      await put(`${siteUrl(site.id)}/name`, { name: name.value.trim() });
+      box.close();
+      choices.dispatchEvent(new CustomEvent("change", { detail: "name" }));
+    } catch (problem) { fill(fault, problem.words); }
+  } } }, field(say("Name"), name, say("Its folder and links stay.")), fault, el("button.main", say("Rename"))));
+  name.select();
 }
 
 /** State what would be lost with a site, and delete it when its id is typed (two may have one name); or why it cannot be deleted now. */
@@ -123,8 +137,8 @@ async function showDeletion(site) {
 /** What stands in the place of what a person may not do. */
 export const mayNot = (role = "operator") => el("p.note", role === "operator" ? say("To start missions, ask the team lead for operator access.") : say("View only. Ask the team lead for reviewer access."));
 
-/** A site as its list and title name it: its folder below the root, since two may have been made under one name. */
-export const siteName = ({ id }) => id.replaceAll(":", " / ");
+/** A site as its list and title name it: as it was renamed, else its folder below the root, since two may have been made under one name. */
+export const siteName = ({ id, name }) => (!name || name === id.split(":").at(-1) ? id.replaceAll(":", " / ") : name);
 
 /** The tiles over the site's box, laid so that the box fills the picture. */
 function preview(site) {
@@ -158,15 +172,22 @@ function newSite() {
   } } }, name, el("button", say("New site")));
 }
 
+async function tryDemo(pressed) {
+  pressed.disabled = true;
+  try {
+    await post("/api/runs", { mission: "demo", site: "demo" });
+    location.hash = roomUrl("demo");
+  } finally { pressed.disabled = false; }
+}
+
 function firstRun(station) {
   return el("div.first-run",
     el("h2", say("No site yet")),
     el("p", say("A site is a piece of ground with its maps, flight after flight. Three ways to the first one:")),
     el("ol.ways",
       el("li", el("h3", say("See it with a demo flight")),
-        el("p", say("Two simulated flights over a village, mapped and compared in about two minutes. On the station's machine, in the folder it serves:")),
-        el("pre", { tabindex: 0 }, el("code", "sorvolo demo")),
-        el("p.soft", say("The site appears here when it is done."))),
+        el("p", say("Two simulated flights over a village, mapped and compared in a few minutes.")),
+        station.operates ? button(say("Try the demo"), (event) => tryDemo(event.currentTarget).catch(report), { class: "main" }) : mayNot()),
       el("li", el("h3", say("Map a flight of yours")),
         el("p", say("Name the site, then upload a video with its telemetry, or a folder of photos.")),
         station.operates ? newSite() : mayNot()),

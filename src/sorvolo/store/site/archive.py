@@ -173,6 +173,13 @@ class Archive:
         with self.catalogue.changing() as connection:
             records.add_site(connection, site)
 
+    def rename(self, name: str) -> None:
+        """Give the site another name; its folder stays. Raises StoreError while there is none."""
+        self._require_writable()
+        self.site()
+        with self.catalogue.changing() as connection:
+            records.rename_site(connection, name)
+
     def flights(self) -> list[FlightEntry]:
         """Every flight by rank. A complete run stays listed until the run that replaces it commits."""
         return self.catalogue_rows(records.list_flights)

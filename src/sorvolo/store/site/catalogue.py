@@ -240,6 +240,12 @@ def add_site(connection: Connection, site: Site) -> None:
     schema.add_rows(connection, schema.site, [row])
 
 
+def rename_site(connection: Connection, name: str) -> None:
+    """Give the site another name."""
+    row = {**connection.execute(select(schema.site)).one()._mapping, "name": name}
+    connection.execute(update(schema.site).values(name=name, seal=schema.seal_of(schema.site, row)))
+
+
 def list_flights(connection: Connection) -> list[FlightEntry]:
     """Every flight by rank; a complete run hides the run that is about to replace it."""
     rows = connection.execute(
