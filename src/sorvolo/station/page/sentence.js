@@ -55,7 +55,8 @@ export function sentence({ link, loaded, runs, objects, changes, pod, versions, 
     if (!told.has(name)) tell(hasLanded ? name : `${name} ${duration((now - new Date(began)) / 1000)}`, "live");
     told.add(name);
   }
-  const unsearched = [...new Set([...drones, ...running.map(({ input }) => input?.stream).filter(Boolean)])].filter((each) => !running.some((run) => run.input?.stream === each && looksForPeople(run)));
+  const videoOf = ({ input }) => input?.stream ?? input?.stream_url;
+  const unsearched = [...new Set([...drones, ...running.map(videoOf).filter(Boolean)])].filter((each) => !running.some((run) => videoOf(run) === each && looksForPeople(run)));
   if (unsearched.length) tell(say("the video of {names} is not searched for people", { names: unsearched.join(", ") }), "live", "warning");
   if (!running.length) {
     const newest = versions.at(-1);
