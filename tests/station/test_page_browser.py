@@ -540,6 +540,12 @@ def test_no_filter_version_or_role_hides_a_person_from_the_sentence(
     }""")
     assert np.allclose(told, [[1, 0.8, 1], [0.5, 0.4, 0.5], [1, 0.4, 0.6], [1, 0, 0.2], [0, 0, 0]])
     page.evaluate("sessionStorage.clear()")
+    told = page.evaluate("""async () => {
+      const {sentence} = await import('/page/sentence.js');
+      const run = {state: 'running', mission: 'map', options: {model: 'none'}, input: {stream_url: 'rtsp://camera'}, started_at: '2026-05-01'};
+      return sentence({link: 'live', loaded: 'yes', runs: [run], objects: [], changes: [], pod: [], versions: []}).map(({words}) => words);
+    }""")
+    assert "the video of rtsp://camera is not searched for people" in told
 
 
 @pytest.mark.parametrize(("width", "height"), [(390, 844), (1280, 720)], ids=["phone", "laptop"])
