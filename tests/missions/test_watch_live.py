@@ -1,6 +1,7 @@
 """A watch of a flight that is going on: a real stream over the loopback, faster than the detector."""
 
 import json
+import re
 import threading
 import time
 from itertools import pairwise
@@ -19,7 +20,7 @@ from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.missions.watch.flights import watch
 from sorvolo.missions.watch.run import EarlyFound, WatchUpdate
-from sorvolo.missions.watch.settings import WatchOutputs
+from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
 from sorvolo.survey.objects import Detections
 from sorvolo.tracking.image_motion import PictureStep
 from waiting import wait_for
@@ -66,11 +67,15 @@ def test_what_was_left_while_live_is_searched_after_landing(tmp_path: Path) -> N
     port, folder = free_port(), tmp_path / "watch"
     detector = _SlowDetector()
     address, outputs = f"udp://127.0.0.1:{port}", WatchOutputs(folder=folder)
+    asked = WatchSettings(through_trees=True)
     with sending(udp_url(port), klv=True, image=_scene, count=4 * RATE) as sender:
-        updates = list(watch(address, outputs=outputs, detector=detector, live=_LIVE))
+        updates = list(watch(address, asked, outputs, detector=detector, live=_LIVE))
     assert sender.error is None
     report = json.loads((folder / "report.json").read_text())
     frames = report["frames"]
+    # a picture a step is kept for the look through trees, far fewer than came
+    kept = re.search(r"has (\d+) pictures with a place; to look", report["headline"]["text"])
+    assert kept is not None and 5 < int(kept[1]) < len(updates) / 2
     assert len(updates) >= frames["detected"] > 3 and frames["skipped"] == 0
     assert report["latency_s"]["median"] < 2.0  # of what was searched live
     assert report["georeferenced"] and report["ended"] == "the source ended"

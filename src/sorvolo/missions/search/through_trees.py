@@ -126,7 +126,7 @@ def look_through_trees(
     if len(views) < LEAST_VIEWS:
         raise InputError(
             f"flight {name} has {len(views)} pictures with a place; to look through trees each spot needs "
-            f"{LEAST_VIEWS} or more: map photos of strips side by side (of a video only few frames are kept)"
+            f"{LEAST_VIEWS} or more: fly strips side by side, and map photos or watch the flight (a map keeps few frames of a video)"
         )
     yield UnderTreesUpdate(name, "cameras", 0)
     radial = 0.0, 0.0
