@@ -795,16 +795,27 @@ def test_headings_of_a_video_that_are_far_off_are_set_right(
     assert "headings_wrong" not in before
 
 
+def _low(row: dict[str, str]) -> None:
+    """Its height above take-off a fifth too low."""
+    row["relativeHeight"] = f"{0.8 * float(row['relativeHeight']):.3f}"
+
+
+def _told(
+    flown: Path, detector: TruthDetector, out: Path, wrong: Callable[[dict[str, str]], None]
+) -> Watched:
+    """What a watch finds with a log whose rows are wrong."""
+    rows = _rows(flown)
+    for row in rows:
+        wrong(row)
+    return _watched(_video(flown), flown, detector, out, _written(rows, out.with_suffix(".csv")))
+
+
 def test_heights_that_are_off_are_set_right(
     flown: Path, detector: TruthDetector, rightly_headed: Watched, tmp_path: Path
 ) -> None:
-    """The same objects in the same places from a log whose heights above take-off are a fifth too low."""
-    rows = _rows(flown)
-    for row in rows:
-        row["relativeHeight"] = f"{0.8 * float(row['relativeHeight']):.3f}"
-    log = _written(rows, tmp_path / "low.csv")
+    """The same objects in the same places."""
     right, before = rightly_headed
-    found, notices = _watched(_video(flown), flown, detector, tmp_path / "off", log)
+    found, notices = _told(flown, detector, tmp_path / "off", _low)
     assert [each[0] for each in found] == [each[0] for each in right]
     beside_deg = np.array([each[1:] for each in found]) - np.array([each[1:] for each in right])
     assert np.abs(beside_deg).max() < 2e-5
@@ -815,13 +826,13 @@ def test_heights_of_a_log_without_angles_are_not_called_corrected(
     flown: Path, detector: TruthDetector, tmp_path: Path
 ) -> None:
     """There only the heading is taken from the pictures."""
-    rows = [
-        {name: value for name, value in row.items() if name not in _ANGLES} for row in _rows(flown)
-    ]
-    for row in rows:
-        row["relativeHeight"] = f"{0.8 * float(row['relativeHeight']):.3f}"
-    log = _written(rows, tmp_path / "low.csv")
-    _, notices = _watched(_video(flown), flown, detector, tmp_path / "off", log)
+
+    def wrong(row: dict[str, str]) -> None:
+        _low(row)
+        for name in _ANGLES & row.keys():
+            del row[name]
+
+    _, notices = _told(flown, detector, tmp_path / "off", wrong)
     assert "heights_wrong" not in notices
 
 

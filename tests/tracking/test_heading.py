@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 from sorvolo.geometry.pose import site_from_gimbal_rotation
-from sorvolo.survey.flight import CameraPrior
+from sorvolo.survey.flight import CameraPrior, Frame
+from sorvolo.survey.objects import no_detections
 from sorvolo.tracking.headings import (
     CompassError,
+    HeadingCheck,
     HeadingFromMotion,
     HeadingTurn,
     Way,
@@ -153,6 +155,17 @@ def test_a_tilt_and_a_height_that_are_off_show_on_the_way_back(
     assert off_deg < 0.3 + 0.35 * tilt_deg  # of 5 degrees what is sure
     assert np.linalg.norm(right.rotation[:2, 2]) < np.linalg.norm(rotation[:2, 2]) + 0.01
     assert right.position_sigma_m[2] == 1.0
+
+
+@pytest.mark.parametrize(("sigma_m", "least_deg"), [(0.4, 4.4), (4.0, 0.0)])
+def test_by_how_much_tilts_are_corrected_is_told(sigma_m: float, least_deg: float) -> None:
+    """4 m of 50 m are 4.6 degrees, of which what is sure counts."""
+    check = HeadingCheck(1000.0, knows_heading=True)
+    check.shown = Way(beside_m=4j, beside_sigma_m=sigma_m)
+    frame = Frame(0, "0", 0, np.zeros((240, 320, 3), np.uint8))
+    prior = CameraPrior(np.array([0.0, 0.0, 50.0]), np.ones(3), np.diag([1.0, -1, -1]), np.ones(3))
+    check.take(frame, 0, no_detections(()), prior, 0.0)
+    assert least_deg <= check.tilt_deg <= least_deg + 0.2
 
 
 def test_a_strip_without_a_turn_shows_no_tilt() -> None:

@@ -125,6 +125,11 @@ class GroundFollower:
         return 1.0 if self._check is None else self._check.shown.sure_scale
 
     @property
+    def tilt_deg(self) -> float:
+        """By how much pictures' tilts were corrected at most; 0 where none was."""
+        return 0.0 if self._check is None else self._check.tilt_deg
+
+    @property
     def contradiction(self) -> str:
         """What in the telemetry the pictures' motion contradicts; "" where nothing does, and of photos."""
         if self._check is None:

@@ -342,7 +342,8 @@ class HeadingCheck:
 
     While the drone turns nothing but a jump is judged: telemetry's clock may be off. `unturned` are the detections that
     were placed before the pictures showed a heading that is far off. `shown` is the way by which heights and tilts are
-    corrected.
+    corrected, `tilt_deg` by how much the tilts
+    were at most.
     """
 
     def __init__(self, fx_px: float, *, knows_heading: bool) -> None:
@@ -351,7 +352,7 @@ class HeadingCheck:
         self.error, self.shown = CompassError(), Way()
         self._last: tuple[int, float, float] | None = None  # time, heading, turn, as last shown
         self._steady_ns = 0  # the drone turns until then
-        self._unjudged, self.unturned = 0, 0
+        self._unjudged, self.unturned, self.tilt_deg = 0, 0, 0.0
 
     def look_ahead(
         self, coming: Iterable[tuple[Frame, CameraPrior]], below_m: Callable[[CameraPrior], float]
@@ -390,7 +391,12 @@ class HeadingCheck:
             self._unjudged += len(found)
         elif not self.error.turns_deg and abs(turn.turn_deg) > max(_FAR_OFF_DEG, turn.sigma_deg):
             self.unturned = self._unjudged
-        return righted(self.error.corrected(prior), self.shown, below_m)
+        turned_prior = self.error.corrected(prior)
+        corrected = righted(turned_prior, self.shown, below_m)
+        along = float(turned_prior.rotation[:, 2] @ corrected.rotation[:, 2])
+        tilt_deg = float(np.degrees(np.arccos(min(along, 1.0))))
+        self.tilt_deg = max(self.tilt_deg, tilt_deg)
+        return corrected
 
     def _judge(self, time_ns: int, shown: Way, prior: CameraPrior) -> None:
         """Take in what a frame's way shows of the compass, where the frame allows it."""

@@ -83,6 +83,7 @@ def over_heights(
 
 _COMPASS_REPORTED_DEG = 5.0  # by which headings are off: less is not worth a notice; by choice
 _HEIGHT_REPORTED = 0.05  # the same of heights above the ground; by choice
+_TILT_REPORTED_DEG = 3.0  # the same of where the camera looks; by choice
 _AHEAD_STEP_S = 0.2  # between frames that are looked at before the watch
 CONTRADICTED = "telemetry_contradicted"
 _OF_MAPS = (
@@ -228,6 +229,12 @@ class GroundPlaces(Places):
                 "show: corrected"
             )
             found.append(Notice("heights_wrong", 1, text))
+        if follower.tilt_deg > _TILT_REPORTED_DEG:
+            text = (
+                f"the camera looks up to {follower.tilt_deg:.0f} degrees beside where the telemetry says, as the "
+                "pictures show: corrected"
+            )
+            found.append(Notice("tilt_wrong", 1, text))
         if why_not := follower.contradiction:
             text = f"the pictures' motion contradicts the telemetry: {why_not}"
             found.append(Notice(CONTRADICTED, 1, text))
