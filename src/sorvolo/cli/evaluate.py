@@ -60,7 +60,7 @@ def evaluate() -> None:
 def detector(
     model: Annotated[
         str,
-        argument("A model's name or file, or detections.json; several seeds separated by commas."),
+        argument("A model's name or file; several seeds separated by commas."),
     ],
     data: Annotated[list[Path], argument("Labelled pictures: folders or label files.")],
     compare: ComparedModels = None,
@@ -168,10 +168,6 @@ def mosaic(
     reference: Annotated[
         Path | None, option("A reference map: a GeoTIFF of the same ground.")
     ] = None,
-    positions: Annotated[
-        Path | None,
-        option("CSV of camera positions: frame,longitude_deg,latitude_deg[,height_m]."),
-    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Measure the accuracy of a map, and how much it deviates from its own frames.
@@ -183,9 +179,7 @@ def mosaic(
     from sorvolo.lab.evaluation.mosaic import evaluate_mosaic
 
     with opened_site(site) as place:
-        measured = evaluate_mosaic(
-            place.folder, truth=truth, reference=reference, positions=positions
-        )
+        measured = evaluate_mosaic(place.folder, truth=truth, reference=reference)
     if as_json:
         print_json(measured)
     else:
@@ -305,9 +299,6 @@ def _show(measured: "MosaicEvaluation") -> None:
             ("cameras, horizontal", truth.cameras),
         ):
             _add(errors, f"{truth.flight}: {name}", spread)
-    if measured.positions is not None:
-        _add(errors, "camera positions", measured.positions.absolute)
-        _add(errors, "camera positions, shape only", measured.positions.shape)
     if errors.row_count:
         console.print(errors)
     for truth in measured.truth:

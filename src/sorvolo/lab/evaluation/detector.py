@@ -1,6 +1,5 @@
 """Measure detectors on labelled pictures, each by itself and side by side: Table 4.6 of the thesis and more."""
 
-import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -40,18 +39,15 @@ from sorvolo.survey.wording import counted
 Models: TypeAlias = AnyPath | FindsObjects | Sequence[AnyPath | FindsObjects]
 """One model, or the same one trained with several seeds."""
 
-_MADE_BY = "sorvolo evaluate detector"
-_FORMAT = 2
 _CROP_PX = 220  # side of a picture on a page
 _LABEL_COLOUR, _FOUND_COLOUR = (40, 220, 90), (255, 150, 30)
 
 
 @dataclass(frozen=True, eq=False)
 class FoundSet:
-    """What a model found in one set: its pictures' file names, one Detections a picture, and from which score on each
-    class is reported there; a model may have other thresholds for thermal frames."""
+    """What a model found in one set: one Detections a picture, and from which score on each class is reported there;
+    a model may have other thresholds for thermal frames."""
 
-    files: tuple[str, ...]
     detections: tuple[Detections, ...]
     thresholds: Mapping[str, float]
 
@@ -60,64 +56,14 @@ class FoundSet:
 class FoundSets:
     """What one model found, by the sets' names.
 
-    `seconds_per_picture` is NaN where it was not measured; `notices` are the detector's own notices.
+    `notices` are the detector's own notices.
     """
 
     name: str
     classes: tuple[str, ...]
     sets: Mapping[str, FoundSet]
-    seconds_per_picture: float = float("nan")
-    notices: tuple[str, ...] = ()
-
-
-def write_found(path: Path, found: FoundSets) -> None:
-    """Write detections.json (docs/formats.md): boxes to 0.01 px, scores to 1e-5. Raises StoreError on a full disk."""
-    content = {
-        "made_by": _MADE_BY,
-        "format": _FORMAT,
-        "model": found.name,
-        "classes": list(found.classes),
-        "sets": {
-            name: {
-                "thresholds": dict(one.thresholds),
-                "pictures": [
-                    {
-                        "file": file,
-                        "boxes_px": np.round(each.boxes_px.astype(float), 2).tolist(),
-                        "scores": np.round(each.scores, 5).tolist(),
-                        "labels": each.labels.tolist(),
-                    }
-                    for file, each in zip(one.files, one.detections)
-                ],
-            }
-            for name, one in found.sets.items()
-        },
-    }
-    atomic_write_bytes(path, (json.dumps(content, separators=(",", ":")) + "\n").encode())
-
-
-def read_found(path: Path) -> FoundSets:
-    """Read what `write_found` wrote. Raises InputError for any other file."""
-    try:
-        content = json.loads(path.read_bytes())
-        if content["format"] != _FORMAT:
-            raise ValueError(f"format {content['format']!r}, not {_FORMAT}")
-        classes = tuple(str(name) for name in content["classes"])
-        sets = {
-            str(name): FoundSet(
-                tuple(str(row["file"]) for row in one["pictures"]),
-                tuple(_detections(row, classes) for row in one["pictures"]),
-                {each: float(one["thresholds"][each]) for each in classes},
-            )
-            for name, one in content["sets"].items()
-        }
-        return FoundSets(str(content["model"]), classes, sets)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(
-            f"{path}: not detections.json of `sorvolo evaluate detector --out` ({error}); give that file, or a model"
-        ) from error
+    seconds_per_picture: float
+    notices: tuple[str, ...]
 
 
 def mistake_picture(
@@ -143,18 +89,11 @@ def mistake_picture(
     return np.asarray(crop, np.uint8)
 
 
-def _detections(row: JsonView, classes: tuple[str, ...]) -> Detections:
-    boxes = np.array(row["boxes_px"], np.float32).reshape(-1, 4)
-    return Detections(
-        boxes, np.array(row["scores"], float), np.array(row["labels"], np.int64), classes
-    )
-
-
 LEAST_SCORE = 1e-4
 """Candidates from this score on are measured: average precision needs the doubtful ones, which packaged models score
 0.0002 and more."""
 
-PAGE, NUMBERS, FOUND = "detector.html", "detector.json", "detections.json"
+PAGE, NUMBERS = "detector.html", "detector.json"
 
 _KINDS = ("false alarm", "miss", "confusion")
 _SHOWN = 12  # mistakes of a kind
@@ -217,13 +156,7 @@ def read_sets(
 
 def known_classes(arms: Iterable[Iterable[str]]) -> tuple[str, ...]:
     """All classes that any model of the arms detects. Raises InputError as `evaluate_detector`."""
-    found = (
-        read_found(Path(place)).classes
-        if Path(place).suffix == ".json"
-        else read_info(find_model(place)).classes
-        for arm in arms
-        for place in arm
-    )
+    found = (read_info(find_model(place)).classes for arm in arms for place in arm)
     return tuple(dict.fromkeys(name for classes in found for name in classes))
 
 
@@ -235,8 +168,7 @@ def evaluate_detector(
 ) -> DetectorEvaluation:
     """Measure `arms[0]` on each set, and the other arms beside it.
 
-    An arm is one model, or the same one trained with several seeds: detectors, names or files of models, or
-    detections.json of earlier evaluations, which were made on the same pictures. Measured is the model that was asked for, with the one
+    An arm is one model, or the same one trained with several seeds: detectors, or names or files of models. Measured is the model that was asked for, with the one
     that it names for thermal frames, if any. Raises InputError for models and files that cannot be
     used, for sets that label none of a model's classes, and for those of which no picture can be read; one picture
     that cannot be read is left out for all models, and named in `notices`.
@@ -281,13 +213,12 @@ def evaluate_detector(
 def write_evaluation(
     evaluation: DetectorEvaluation, folder: AnyPath, description: JsonView
 ) -> None:
-    """Write detector.html, detector.json and detections.json; `description` is what was measured on what.
+    """Write detector.html and detector.json; `description` is what was measured on what.
 
     Raises StoreError on a full disk.
     """
     folder = Path(folder)
     make_folder(folder)
-    write_found(folder / FOUND, evaluation.found)
     atomic_write_bytes(folder / NUMBERS, json_bytes(evaluation_numbers(evaluation, description)))
     page = detector_page(
         evaluation.found.name,
@@ -337,12 +268,7 @@ def _found(
     progress: Callable[[EvaluationProgress], None],
     reader: "_PictureReader",
 ) -> FoundSets:
-    """What the model of this name or file finds, or what it found by an earlier file; nothing in damaged pictures."""
-    if isinstance(place, str) and Path(place).suffix == ".json":
-        found = read_found(Path(place))
-        return replace(
-            found, sets={each.name: _same_pictures(place, found, each, reader) for each in labelled}
-        )
+    """What the model of this name or file finds; nothing in damaged pictures."""
     loaded = Detector.load(place, stand_in=False) if isinstance(place, str) else place
     detector = as_detector(loaded)
     name = place if isinstance(place, str) else detector.info.name
@@ -380,7 +306,7 @@ def _found(
                 f"{each.name}: {others} of {len(lights)} pictures are of another light than most and are reported from "
                 "other scores on; what is reported is counted by the thresholds of most"
             )
-        sets[each.name] = FoundSet(_names(each), tuple(detections), usual)
+        sets[each.name] = FoundSet(tuple(detections), usual)
     return FoundSets(
         Path(name).stem if Path(name).suffix == ".onnx" else name,
         detector.classes,
@@ -425,12 +351,12 @@ def _without(
     sets = {}
     for each in labelled:
         one = found.sets[each.name]
-        rows = [row for row, picture in enumerate(each.pictures) if picture.path not in damaged]
-        sets[each.name] = replace(
-            one,
-            files=tuple(one.files[row] for row in rows),
-            detections=tuple(one.detections[row] for row in rows),
+        kept = tuple(
+            detections
+            for detections, picture in zip(one.detections, each.pictures)
+            if picture.path not in damaged
         )
+        sets[each.name] = replace(one, detections=kept)
     return replace(found, sets=sets)
 
 
@@ -439,41 +365,6 @@ def _damage_notices(damaged: Mapping[str, str]) -> tuple[str, ...]:
         return ()
     some = "; ".join(f"{path}: {reason}" for path, reason in list(damaged.items())[:_NAMED])
     return (f"{counted(len(damaged), 'picture')} left out that cannot be read: {some}",)
-
-
-def _names(labelled: LabelledSet) -> tuple[str, ...]:
-    return tuple(Path(picture.path).name for picture in labelled.pictures)
-
-
-def _same_pictures(
-    place: str, found: FoundSets, labelled: LabelledSet, reader: _PictureReader
-) -> FoundSet:
-    """The file's detections in the order of the set's pictures; those that it lacks must be damaged ones."""
-    if labelled.name not in found.sets:
-        raise InputError(
-            f"{place}: holds detections of {', '.join(found.sets)}, none of {labelled.name}"
-        )
-    one = found.sets[labelled.name]
-    wanted = _names(labelled)
-    if one.files == wanted:
-        return one
-    by_name = dict(zip(one.files, one.detections))
-    # The set's pictures that are not known by name, and can be read
-    missing = [
-        name
-        for name, picture in zip(_names(labelled), labelled.pictures)
-        if name not in by_name and reader.read(picture.path) is not None
-    ]
-    repeats = len(by_name) < len(one.files) or len(set(wanted)) < len(wanted)
-    if missing or repeats:
-        raise InputError(
-            f"{place}: made on other pictures of {labelled.name}"
-            + (f"; {len(missing)} are missing, such as {missing[0]}" if missing else "")
-        )
-    nothing = no_detections(found.classes)
-    return replace(
-        one, files=wanted, detections=tuple(by_name.get(name, nothing) for name in wanted)
-    )
 
 
 def _side_by_side(
@@ -501,21 +392,17 @@ def _worst(
     labelled: LabelledSet, scores: SetScores, found: FoundSet
 ) -> Iterator[tuple[Mistake, str, ImageRGB]]:
     """The surest false alarms and confusions and the largest misses, with the picture's name and a crop."""
-    reader = _PictureReader()
     for kind in _KINDS:
         mistakes = [each for each in scores.mistakes if each.kind == kind]
         mistakes.sort(key=_area_px if kind == "miss" else lambda each: each.score, reverse=True)
         for mistake in _few_of_each_picture(mistakes):
             picture = labelled.pictures[mistake.picture]
             reported = _reported(found.detections[mistake.picture], found.thresholds)
-            image = reader.read(picture.path)
-            if image is not None:  # of detections.json the pictures were not needed so far
-                judged = {labelled.classes.index(each.label) for each in scores.classes}
-                judged_boxes = picture.boxes_px[
-                    [label in judged for label in picture.labels.tolist()]
-                ]
-                crop = mistake_picture(image, mistake.box_px, judged_boxes, reported)
-                yield mistake, Path(picture.path).name, crop
+            judged = {labelled.classes.index(each.label) for each in scores.classes}
+            judged_boxes = picture.boxes_px[[label in judged for label in picture.labels.tolist()]]
+            image = read_picture(Path(picture.path))
+            crop = mistake_picture(image, mistake.box_px, judged_boxes, reported)
+            yield mistake, Path(picture.path).name, crop
 
 
 def _area_px(mistake: Mistake) -> float:
