@@ -38,16 +38,6 @@ COMMANDS = {
     "review": ["review", "field"],
     "search": ["search", "field", "--out", "found"],
     "labelled": ["simulate", "labelled", "--pictures", "60", "--seed", "7"],
-    "train": [
-        "train",
-        "labelled",
-        "--out",
-        "model",
-        "--weights",
-        "default",
-        "--steps",
-        "60",
-    ],
     "detector": ["evaluate", "detector", "default", "labelled", "--out", "measured"],
     "reproduce": ["reproduce", "--simulated", "--quick", "--train-steps", "0", "--out", "chapter4"],
 }
@@ -56,7 +46,6 @@ MAKES = {  # the folder that a command makes
     "watch": "search",
     "search": "found",
     "labelled": "labelled",
-    "train": "model",
     "detector": "measured",
     "reproduce": "chapter4",
 }
@@ -66,7 +55,6 @@ PAGES = {  # name: page, width and height of the window, px
     "changes": ("field/flights/flight2/changes.html", 1100, 1500),
     "watch": ("search/report.html", 1100, 1500),
     "search": ("found/search.html", 1100, 1100),
-    "train": ("model/training.html", 1100, 900),
     "detector": ("measured/detector.html", 1100, 900),
     "reproduce": ("chapter4/reproduction.html", 1100, 1100),
 }

@@ -691,22 +691,6 @@ def test_results_go_into_the_folder_of_their_flight(
     assert "flight1.ts" in diagnosed and [each.name for each in results.iterdir()] == ["flight1"]
     assert main(["telemetry", str(site), "--flight", "flight1"]) == 1
     assert "has the diagnosis of flight1" in capsys.readouterr().err
-    with socket.socket(
-        socket.AF_INET, socket.SOCK_DGRAM
-    ) as receiver:  # the corrected track can be sent
-        receiver.bind(("127.0.0.1", 0))
-        receiver.settimeout(5)
-        assert (
-            main(["telemetry", str(site), "--cot", f"udp://127.0.0.1:{receiver.getsockname()[1]}"])
-            == 0
-        )
-        events = diagnosed["cot.xml"].splitlines()
-        assert [receiver.recv(10_000) for _ in events] == events
-    printed = capsys.readouterr().out
-    assert (
-        f"{len(events)} of {len(events)} Cursor on Target events sent" in printed
-        and "written" not in printed
-    )
     assert {each.name: each.read_bytes() for each in (results / "flight1").iterdir()} == diagnosed
     assert main(["telemetry", str(site), "--out", str(tmp_path / "other")]) == 0
     assert json.loads((tmp_path / "other" / "telemetry.json").read_text())["faults"] is None

@@ -141,7 +141,7 @@ def _show(report: Mapping[str, Any], target: Path, console: Console) -> None:
             f"  {report['cot_sent']} of {report['frames']} Cursor on Target events sent",
         )
     for name in report["files"]:
-        show_path("kept" if report["diagnosed_before"] else "written", target / name, console)
+        show_path("written", target / name, console)
 
 
 def _map_if_new(

@@ -111,11 +111,10 @@ def correct_telemetry(
     Without `flight` it is the site's only one, or that of `source`. With `source`, the flight's video or photos, its
     own telemetry is compared with the map, and a video is written again as a transport stream with corrected metadata,
     and with the detections of `watched`, the folder of a watch of this video.
-    The events of cot.xml, with their own times, are sent to `cot`. Without `source` a folder with a diagnosis is left
-    as it is: its events are sent, and `diagnosed_before` is true in the report. Raises InputError for a site without
+    The events of cot.xml, with their own times, are sent to `cot`. Raises InputError for a site without
     GPS, a flight that it has not, a source of another flight or without a fix at any of its frames, a folder that has
     another flight's files, a receiver that takes nothing or would get events without a date, and without `source` for a
-    folder with a diagnosis, which would be lost, if there is nothing to send.
+    folder with a diagnosis, which would be lost.
     """
     site_folder = Path(site_folder)
     folder = Path(folder)
@@ -130,8 +129,12 @@ def correct_telemetry(
         if source is None:
             name = _flight(archive, flight)
             _check_folder(folder, name, site)
-            if (earlier := _earlier(folder)).get("faults"):
-                return _sent_again(earlier, folder, cot)
+            if _earlier(folder).get("faults"):
+                raise InputError(
+                    f"{folder} has the diagnosis of {name} and files corrected by it, which files of the map alone "
+                    "would replace: use those, give the flight's video or photos with --site for new ones, or another "
+                    "folder with --out"
+                )
             return _written(
                 site, name, folder, _solved(archive, name, 0), None, archive.report(name), cot
             )
@@ -209,23 +212,6 @@ def _check_folder(folder: Path, name: str, site: Site) -> None:
             f"{folder} has the telemetry of {earlier.get('flight')} of {earlier.get('site')}, not of {name} of "
             f"{site.name}: give another folder with --out, or delete that one"
         )
-
-
-def _sent_again(earlier: dict[str, Any], folder: Path, cot: CotReceiver | None) -> dict[str, Any]:
-    """Send the events of the diagnosis that a folder has; its report.
-
-    Raises InputError where there is nobody to send them to, or none: files of the map alone would take the diagnosis's
-    place.
-    """
-    events = folder / "cot.xml"
-    if cot is None or "cot.xml" not in earlier["files"] or not events.is_file():
-        raise InputError(
-            f"{folder} has the diagnosis of {earlier.get('flight')} and files corrected by it, which files of the map "
-            "alone would replace: use those, give the flight's video or photos with --site for new ones, or another "
-            "folder with --out"
-        )
-    sent = send_all(events.read_bytes().splitlines(), cot.place, cot.tls)
-    return {**earlier, "cot_sent": sent, "diagnosed_before": True}
 
 
 def _first_ns(setup: FlightSetup) -> int:
@@ -410,7 +396,7 @@ def _written(
     )
     atomic_write_bytes(folder / _REPORT, json_bytes(report))
     sent = None if cot is None else send_all(texts["cot.xml"].splitlines(), cot.place, cot.tls)
-    return {**report, "cot_sent": sent, "diagnosed_before": False}
+    return {**report, "cot_sent": sent}
 
 
 def _video(source: Source) -> Path | None:

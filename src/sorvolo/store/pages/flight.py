@@ -13,7 +13,6 @@ from sorvolo.store.exports.places import SYSTEMS, place_words
 from sorvolo.store.pages.plots import (
     TrackColumns,
     gps_along,
-    gps_scatter,
     residuals_along,
     round_length,
     track_plan,
@@ -184,12 +183,11 @@ def _plots(report: Mapping[str, Any]) -> dict[str, str]:
         columns,
     )
     if not len(track):
-        return {"plan": "", "residuals": "", "scatter": "", "along": ""}
+        return {"plan": "", "residuals": "", "along": ""}
     unit = "m" if report.get("georeferenced") else ""
     return {
         "plan": track_plan(track, unit=unit),
         "residuals": residuals_along(track),
-        "scatter": gps_scatter(track, unit=unit),
         "along": gps_along(track, unit=unit),
     }
 

@@ -20,7 +20,6 @@ _PLAN_HIGHEST_PX = 620.0
 SIDE_PX = 420.0
 """A side of a square plot."""
 
-_SCATTER_PX = 360.0
 _COLOURS = 5  # styles of a line, c0 to c4; c5 is for what was rejected
 _STATUS_WORDS = {"vision": "matched", "gps-only": "GPS only", "rejected": "not placed"}
 
@@ -254,7 +253,6 @@ def residuals_along(track: TrackColumns) -> str:
         title="Misalignment of each frame along the flight",
         frame=frame,
         marks=marks,
-        circle=None,
         width=_WIDE_PX,
         height=_LOW_PX,
     )
@@ -276,47 +274,6 @@ def gps_along(track: TrackColumns, *, unit: str) -> str:
             lines.append(Line(name, points, points if len(run) == 1 else ()))
     return line_plot(
         "Camera position less GPS fix, along the flight", lines, frame, _WIDE_PX, _LOW_PX
-    )
-
-
-def gps_scatter(track: TrackColumns, *, unit: str) -> str:
-    """East and north of the GPS residual as points around zero, with the circle that holds half of them."""
-    east, north = track["gps_east_m"], track["gps_north_m"]
-    known = np.isfinite(east) & np.isfinite(north)
-    if not known.any():
-        return ""
-    reach = max(float(np.abs(np.concatenate([east[known], north[known]])).max()) * 1.12, 0.1)
-    size, low = _SCATTER_PX, _SCATTER_PX - _MARGIN_PX
-    x, y = Scale(-reach, reach, _MARGIN_PX, size - 12), Scale(-reach, reach, low, 12)
-    ticks = list(x.ticks(6))
-    labels = [PlotLabel(x(tick), low + 16, f"{tick:g}") for tick in ticks]
-    labels += [PlotLabel(_MARGIN_PX - 6, y(tick) + 4, f"{tick:g}", "end") for tick in ticks]
-    labels += [
-        PlotLabel(size - 12, size - 10, f"east, {unit}", "end"),
-        PlotLabel(8, 22, f"north, {unit}", "start"),
-    ]
-    frame = Axes(
-        _MARGIN_PX,
-        size - 12,
-        12,
-        low,
-        tuple((_line_style(tick), y(tick)) for tick in ticks),
-        tuple((_line_style(tick), x(tick)) for tick in ticks),
-        tuple(labels),
-    )
-    half_px = (
-        float(np.median(np.hypot(east[known], north[known])))
-        / (2 * reach)
-        * (size - 12 - _MARGIN_PX)
-    )
-    return render(
-        "plots/marks.svg",
-        title="Camera position less GPS fix, east and north",
-        frame=frame,
-        marks=[_mark(x(east[k]), y(north[k]), track, int(k)) for k in np.flatnonzero(known)],
-        circle=(x(0), y(0), half_px),
-        width=size,
-        height=size,
     )
 
 
