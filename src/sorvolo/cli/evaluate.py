@@ -168,6 +168,10 @@ def mosaic(
     reference: Annotated[
         Path | None, option("A reference map: a GeoTIFF of the same ground.")
     ] = None,
+    positions: Annotated[
+        Path | None,
+        option("CSV of camera positions: frame,longitude_deg,latitude_deg[,height_m]."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Measure the accuracy of a map, and how much it deviates from its own frames.
@@ -179,7 +183,9 @@ def mosaic(
     from sorvolo.lab.evaluation.mosaic import evaluate_mosaic
 
     with opened_site(site) as place:
-        measured = evaluate_mosaic(place.folder, truth=truth, reference=reference)
+        measured = evaluate_mosaic(
+            place.folder, truth=truth, reference=reference, positions=positions
+        )
     if as_json:
         print_json(measured)
     else:
@@ -299,6 +305,9 @@ def _show(measured: "MosaicEvaluation") -> None:
             ("cameras, horizontal", truth.cameras),
         ):
             _add(errors, f"{truth.flight}: {name}", spread)
+    if measured.positions is not None:
+        _add(errors, "camera positions", measured.positions.absolute)
+        _add(errors, "camera positions, shape only", measured.positions.shape)
     if errors.row_count:
         console.print(errors)
     for truth in measured.truth:

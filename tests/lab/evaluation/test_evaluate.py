@@ -275,6 +275,46 @@ def test_a_reference_that_is_none_is_refused(site, tmp_path):
         evaluate_mosaic(site, reference=tmp_path / "text.tif")
 
 
+def positions_file(folder: Path, extra: str) -> Path:
+    rows = ["frame,longitude_deg,latitude_deg,height_m"]
+    for index in range(6):
+        placed, _ = made_frame(index, Status.VISION)
+        place = placed.site_from_camera.translation_m - np.array([*MISPLACED_M, 0.0])
+        latitude, longitude, height = SITE.frame.wgs84_from_site(place[None])
+        rows.append(f"{index},{longitude[0]:.11f},{latitude[0]:.11f},{height[0]:.4f}")
+    path = folder / "positions.csv"
+    path.write_text("\n".join(rows) + "\n" + extra)
+    return path
+
+
+def test_camera_positions_are_compared(site, tmp_path):
+    extra = "none,9.2,45.5,100\n"
+    measured = evaluate_mosaic(site, positions=positions_file(tmp_path, extra=extra)).positions
+    assert measured.absolute.count == 6
+    assert measured.absolute.rms_m == pytest.approx(0.5, abs=0.02)
+    assert measured.shape.rms_m < 0.02
+    assert measured.missing == 1
+
+
+@pytest.mark.parametrize(
+    "text", ["", "a,b\n1,2\n", "frame,longitude_deg,latitude_deg\n1,x,2\n", "\0\0"]
+)
+def test_broken_positions_are_refused(site, tmp_path, text):
+    path = tmp_path / "broken.csv"
+    path.write_text(text)
+    with pytest.raises(InputError):
+        evaluate_mosaic(site, positions=path)
+
+
+def test_positions_without_a_column_state_which_there_are(site, tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("name,longitude_deg,latitude_deg\n1,9.2,45.5\n")
+    with pytest.raises(
+        InputError, match="no column frame, but name, longitude_deg, latitude_deg; needed are"
+    ):
+        evaluate_mosaic(site, positions=path)
+
+
 def test_the_command_prints_a_table_and_json(site, truth):
     runner = CliRunner()
     plain = runner.invoke(

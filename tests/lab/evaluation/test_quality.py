@@ -11,6 +11,7 @@ from sorvolo.lab.evaluation.map_quality import (
     corner_errors,
     correlation,
     deviation,
+    position_errors,
     residual_shift,
 )
 
@@ -85,6 +86,15 @@ def test_nothing_to_compare_is_not_a_number_and_no_error():
     assert np.isnan(correlation(np.zeros((4, 4)), np.eye(4), np.ones((4, 4), dtype=bool)))
     black = np.zeros((4, 4, 3), np.uint8)
     assert np.isnan(deviation(black, black, np.zeros((4, 4), dtype=bool)).share)
+
+
+def test_positions_are_compared_with_and_without_the_datum():
+    reference = np.random.default_rng(1).uniform(-100, 100, (12, 3))
+    estimated = reference + np.array([2.0, 0.0, 0.0])
+    absolute, shape = position_errors(estimated, reference, 0.05)
+    assert absolute.rms_m == pytest.approx(2.0)
+    assert shape.rms_m < 1e-9
+    assert position_errors(estimated[:2], reference[:2], 0.05)[1].count == 0
 
 
 def test_deviation_is_the_mean_gray_difference():

@@ -133,6 +133,25 @@ def corner_errors(
     return CornerErrors(absolute, shape, floor, over_floor)
 
 
+def position_errors(
+    estimated_m: PointsM, reference_m: PointsM, gsd_m: float
+) -> tuple[Spread, Spread]:
+    """Camera positions, (N, 2) or (N, 3) m, against a reference: as they lie, and after the best similarity.
+
+    The similarity acts on east and north only and needs three cameras; heights stay as they are.
+    """
+    estimated = np.asarray(estimated_m, dtype=np.float64)
+    reference = np.asarray(reference_m, dtype=np.float64)
+    absolute = spread_of(np.linalg.norm(estimated - reference, axis=1), gsd_m)
+    if len(reference) < 3:
+        return absolute, spread_of(np.zeros(0), gsd_m)
+    moved = estimated.copy()
+    moved[:, :2] = apply_homography(
+        fit_similarity(reference[:, :2], estimated[:, :2]), estimated[:, :2]
+    )
+    return absolute, spread_of(np.linalg.norm(moved - reference, axis=1), gsd_m)
+
+
 def deviation(mosaic: ImageRGB, frame: ImageRGB, mask: Mask) -> Deviation:
     """How much a piece of the mosaic differs from the frame that was warped onto it, where `mask` is True.
 

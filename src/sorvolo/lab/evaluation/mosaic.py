@@ -1,5 +1,6 @@
-"""Measure a site's map: against the truth of a simulation, its own frames, or another map."""
+"""Measure a site's map: against the truth of a simulation, its own frames, another map, or known camera places."""
 
+import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,7 @@ from sorvolo.lab.evaluation.map_quality import (
     corner_errors,
     correlation,
     frames_to_compare,
+    position_errors,
     residual_shift,
     spread_of,
     summed_up,
@@ -47,6 +49,15 @@ class TruthErrors:
     corners: CornerErrors
     gps_only: Spread
     cameras: Spread
+
+
+@dataclass(frozen=True)
+class PositionErrors:
+    """Camera positions against a table: as they lie, and after the best similarity; `missing` of its frames have none."""
+
+    absolute: Spread
+    shape: Spread
+    missing: int
 
 
 def truth_errors(
@@ -130,6 +141,8 @@ def _transform(raster: Raster) -> Affine:
 _DEVIATION_FRAMES = 120  # at most, spread over the flight: it bounds the time
 _REFERENCE_PX = 2048  # longer side at which maps are compared
 _FARTHEST_M = 10_000.0  # from the map: a truth so far away is another flight's
+_POSITION_COLUMNS = ("frame", "longitude_deg", "latitude_deg")
+_POSITIONS_NEED = "needed are the columns frame,longitude_deg,latitude_deg[,height_m][,flight]"
 
 
 @dataclass(frozen=True)
@@ -154,6 +167,7 @@ class MosaicEvaluation:
     truth: tuple[TruthErrors, ...]
     deviation: DeviationSummary
     reference: ReferenceMatch | None
+    positions: PositionErrors | None
 
 
 def evaluate_mosaic(
@@ -161,23 +175,26 @@ def evaluate_mosaic(
     *,
     truth: AnyPath | None = None,
     reference: AnyPath | None = None,
+    positions: AnyPath | None = None,
 ) -> MosaicEvaluation:
     """Measure the map in a site folder; the deviation from its own frames always, the rest where given.
 
-    `truth` is a simulation's folder or the truth folder in it, `reference` a GeoTIFF of the same ground. Raises
+    `truth` is a simulation's folder or the truth folder in it, `reference` a GeoTIFF of the same ground,
+    `positions` a CSV of camera places: frame, longitude_deg, latitude_deg, and maybe height_m and flight. Raises
     InputError for files that cannot be read or belong to another place, StoreError for a folder that is no
     site.
     """
     site = Path(site)
     truth = as_path(truth)
     reference = as_path(reference)
+    positions = as_path(positions)
     refuse_simulation(site)
     with Archive.open(site, write=False) as archive:
         described = archive.site()
         flights = map_frames(site, described)
-        if (truth or reference) and described.is_local:
+        if (truth or reference or positions) and described.is_local:
             raise InputError(
-                f"{site}: a map without geo-reference cannot be compared with truth or maps"
+                f"{site}: a map without geo-reference cannot be compared with truth, maps or positions"
             )
         tallies = _tally(flights)
         errors: tuple[TruthErrors, ...] = ()
@@ -196,6 +213,7 @@ def evaluate_mosaic(
                 [deviation.of(archive.image(each), each.site_from_image) for each in keyframes]
             ),
             _against_reference(archive.mosaic_path, reference) if reference else None,
+            _against_positions(flights, positions, described) if positions else None,
         )
 
 
@@ -285,3 +303,61 @@ def _against_reference(mosaic_path: Path, reference: Path) -> ReferenceMatch:
         mine.m_per_px,
         float(mask.sum()) * mine.m_per_px**2,
     )
+
+
+def _against_positions(
+    flights: Mapping[str, Sequence[FrameRow]], path: Path, described: Site
+) -> PositionErrors:
+    known = _positions(path)
+    cameras_m: list[list[float]] = []
+    places_m: list[list[float]] = []
+    for (flight, name), (longitude_deg, latitude_deg, height_m) in known.items():
+        found = [
+            row
+            for of, rows in flights.items()
+            for row in rows
+            if row.name == name and flight in ("", of)
+        ]
+        if len(found) > 1:
+            raise InputError(f"{path}: frame {name} is in several flights; add a column flight")
+        if found and found[0].has_camera:
+            cameras_m.append([*found[0].camera_m, found[0].camera_height_m])
+            place_m = described.frame.ground_from_lonlat([[longitude_deg, latitude_deg]])[0]
+            places_m.append([*place_m, height_m])
+    if not places_m:
+        raise InputError(
+            f"{path}: none of its {len(known)} frames has a camera in this map; check the names"
+        )
+    # heights count where all are known
+    axes = 3 if np.isfinite(cameras_m).all() and np.isfinite(places_m).all() else 2
+    errors = position_errors(
+        np.array(cameras_m)[:, :axes], np.array(places_m)[:, :axes], described.m_per_px
+    )
+    return PositionErrors(*errors, len(known) - len(places_m))
+
+
+def _positions(path: Path) -> dict[tuple[str, str], tuple[float, float, float]]:
+    """Longitude and latitude, deg, and height, m, of a table by flight ("": any) and frame; raises InputError where it cannot be read."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            table = csv.DictReader(file)
+            rows = list(table)
+        columns = table.fieldnames or ()
+        missing = [name for name in _POSITION_COLUMNS if name not in columns]
+        if missing:
+            there = ", ".join(columns) or "none at all"
+            raise InputError(
+                f"{path}: no column {', '.join(missing)}, but {there}; {_POSITIONS_NEED}"
+            )
+        return {
+            ((row.get("flight") or "").strip(), row["frame"].strip()): (
+                float(row["longitude_deg"]),
+                float(row["latitude_deg"]),
+                float(row.get("height_m") or "nan"),
+            )
+            for row in rows
+        }
+    except (OSError, UnicodeDecodeError, ValueError, AttributeError, TypeError, csv.Error) as error:
+        raise InputError(
+            f"{path}: cannot be read as camera positions ({error}); {_POSITIONS_NEED}"
+        ) from error
