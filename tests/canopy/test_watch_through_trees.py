@@ -5,7 +5,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from shutil import copy
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -32,7 +33,7 @@ from sorvolo.missions.watch.through_trees import ForestFrame, ThroughTrees
 from sorvolo.store.images import jpeg_from_image
 from sorvolo.store.site.journal import RunJournal
 from sorvolo.survey.flight import Frame
-from sorvolo.survey.objects import Detections, no_detections
+from sorvolo.survey.objects import Detections, Track, no_detections
 
 _FRAME = LocalFrame(Geodetic(48.33, 14.33, 400.0))
 _PEOPLE_M = np.array([[-4.0, -3.0], [4.0, 5.0]])
@@ -152,6 +153,29 @@ def test_frames_that_a_killed_watch_of_a_stream_kept_are_put_together_with_later
     trees.finish()
     trees.close()
     assert "photos has 9 pictures with a place" in trees.headline["text"]
+
+
+class _SeesNobodyAtTheEnd(ThroughTrees):
+    def _look_at(self, frames: Any, *, is_quick: bool) -> Any:
+        headline = {"text": "nobody under trees", "complete": True}
+        nobody = SimpleNamespace(people=())
+        return SimpleNamespace(
+            report={"headline": headline}, finds=nobody, objects=(), views=(), write=lambda _: None
+        )
+
+
+def test_a_find_that_was_announced_is_not_taken_back(photos: Path, tmp_path: Path) -> None:
+    """It may be a person; the headline says that all frames together do not show it."""
+    (source,) = open_sources([str(photos)], None, "aov=40")
+    setup = prepare(source, MapSettings(), None, telemetry_named=False)
+    memo = ResultCache(RunJournal(tmp_path / "run.journal", "asked", 0))
+    trees = _SeesNobodyAtTheEnd(setup, new_site(setup, source.name, 1.0, 0.0), tmp_path, memo)
+    announced = cast(Track, object())
+    trees.tracks[90_001] = announced
+    trees.finish()
+    trees.close()
+    assert trees.tracks == {90_001: announced}
+    assert "nobody under trees; 1 find announced before" in trees.headline["text"]
 
 
 def test_a_flight_without_headings_is_refused(photos: Path, tmp_path: Path) -> None:

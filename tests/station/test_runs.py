@@ -351,16 +351,16 @@ def test_a_search_maps_the_flight_that_it_is_given_and_measures_it(
 @pytest.mark.long
 def test_a_demo_is_simulated_mapped_and_compared(open_station: Callable[[], TestClient]) -> None:
     """A minute and a half of processor time: one site with both flights, and what they found."""
-    with open_station() as client:
-        run = client.post("/api/runs", json={"mission": "demo", "site": "demo"}).json()
-        busy = client.post("/api/runs", json={"mission": "demo", "site": "demo"})
-        assert busy.status_code == 409
-        done = ended(client, run["id"], 400)
-        assert (done["state"], done["error"]) == ("finished", None)
-        site = client.get("/api/sites/demo").json()
-        assert [each["flight"] for each in site["versions"]] == ["flight1", "flight2"]
-        found = client.get("/api/sites/demo/collections/objects/items").json()["features"]
-        assert {"person", "car"} <= {each["properties"]["class"] for each in found}
+    client = open_station()
+    run = client.post("/api/runs", json={"mission": "demo", "site": "demo"}).json()
+    busy = client.post("/api/runs", json={"mission": "demo", "site": "demo"})
+    assert busy.status_code == 409
+    done = ended(client, run["id"], 400)
+    assert (done["state"], done["error"]) == ("finished", None)
+    site = client.get("/api/sites/demo").json()
+    assert [each["flight"] for each in site["versions"]] == ["flight1", "flight2"]
+    found = client.get("/api/sites/demo/collections/objects/items").json()["features"]
+    assert {"person", "car"} <= {each["properties"]["class"] for each in found}
 
 
 def test_the_missions_of_a_site_are_not_cut_off_by_those_of_others(tmp_path: Path) -> None:

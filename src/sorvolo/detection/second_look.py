@@ -5,7 +5,6 @@ learnt what fools the first look. Only what was reported is looked at again, all
 side on one sheet a position, so that it costs little.
 """
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -24,7 +23,7 @@ Sees = Callable[[ImageRGB], Seen]
 
 # How cut-outs are laid side by side on one picture. Weights hold for the values that they were fitted with.
 CELL_PX = 128  # a cut-out's side: surroundings count, and a network's last level has 4 cells of it
-_COLUMNS = 8  # cut-outs in a row of a sheet
+_ON_A_SHEET = 8  # cut-outs, in a row; all of a large photo's at once take 0.3 GB and longer
 SHARE = 0.25  # of the picture's pixels that a position has at most; in a crowd the others keep their score
 _CUTS = (8, 96)  # cut-outs of one picture in one position, best first: at least, and at most
 SAME_IOU = 0.3  # a box that overlaps the first one so much is the same object
@@ -98,8 +97,10 @@ def opinions(
             for cut in cuts
             if position < second_look_by_label[cut.label].positions
         ]
-        for cut, score in zip(shown, _scores(shown, sees).tolist() if shown else []):
-            scores.setdefault(cut.row, []).append(score)
+        for first in range(0, len(shown), _ON_A_SHEET):
+            sheet = shown[first : first + _ON_A_SHEET]
+            for cut, score in zip(sheet, _scores(sheet, sees).tolist()):
+                scores.setdefault(cut.row, []).append(score)
     return {row: np.array(some) for row, some in scores.items()}
 
 
@@ -144,14 +145,10 @@ def cut_out(picture: ImageRGB, box_px: Floats, side_px: float) -> tuple[ImageRGB
 
 def _scores(cuts: Sequence[_Cut], sees: Sees) -> Floats:
     """(cuts,) what is made of each cut-out; all on one sheet."""
-    cell, columns = CELL_PX, min(_COLUMNS, len(cuts))
-    rows = math.ceil(len(cuts) / columns)
-    sheet = np.full((rows * cell, columns * cell, 3), _FILLING, np.uint8)
-    boxes = np.zeros((len(cuts), 4), np.float32)
-    for number, each in enumerate(cuts):
-        top, left = (cell * place for place in divmod(number, columns))
-        sheet[top : top + cell, left : left + cell] = each.picture
-        boxes[number] = each.box_px + np.array([left, top, left, top])
+    sheet = np.concatenate([each.picture for each in cuts], axis=1)
+    lefts = CELL_PX * np.arange(len(cuts))
+    boxes = np.array([each.box_px for each in cuts])
+    boxes[:, 0::2] += lefts[:, None]
     seen = sees(sheet)
     same = iou_matrix(boxes, seen.boxes_px) >= SAME_IOU
     same &= np.array([each.label for each in cuts])[:, None] == seen.labels[None]

@@ -511,8 +511,6 @@ class WatchRun:
             if self.trees is not None:
                 late_ids |= {track.id for track in self.trees.new()}
                 tracks += self.trees.tracks.values()
-                self._files.forget(self.trees.withdrawn)
-                self._notifier.withdraw(self.trees.withdrawn)
             for track in tracks:
                 self._files.crop_of(track)
             self._files.close()
@@ -575,7 +573,6 @@ class WatchRun:
             text = f"{counted(log.unkept, 'frame')} did not wait for the landing: the disk is full"
             notices.append(Notice("disk_full", log.unkept, text))
         gone = 0 if self._announced is None else len(self._announced.left())
-        gone += 0 if self.trees is None else len(self.trees.withdrawn)
         if gone:
             text = f"{counted(gone, 'object')} announced while live: not confirmed by all frames, not counted"
             notices.append(Notice("not_confirmed", gone, text))

@@ -28,6 +28,7 @@ from sorvolo.store.images import image_from_jpeg, jpeg_from_image
 from sorvolo.store.site.spill import SpillFile
 from sorvolo.survey.flight import Frame, Site
 from sorvolo.survey.objects import PERSON, Sighting, Track
+from sorvolo.survey.wording import counted
 
 _KEPT = "under trees"  # the stage of frames that a killed watch of a stream kept
 _PER_FRAME = (
@@ -79,8 +80,6 @@ class ThroughTrees:
         self._new: list[Track] = []
         self.tracks: dict[int, Track] = {}
         """The finds so far, by id."""
-        self.withdrawn: tuple[int, ...] = ()
-        """The ids of announced finds that all frames together do not show."""
         self.headline: dict[str, Any] = {
             "text": "not looked through the trees: stopped before",
             "complete": False,
@@ -142,9 +141,11 @@ class ThroughTrees:
             self.headline["text"] = f"not looked through the trees: {looked}"
             return
         self.headline = looked.report["headline"]
-        self.withdrawn = tuple(sorted(self.tracks.keys() - self._see(looked)))
-        for number in self.withdrawn:
-            del self.tracks[number]
+        if left := self.tracks.keys() - self._see(looked):  # a person may be among them
+            found = counted(len(left), "find")
+            self.headline["text"] += (
+                f"; {found} announced before, not by all frames: look there too"
+            )
         looked.write(self._folder)
 
     def _keep(self, frame: ForestFrame) -> None:
