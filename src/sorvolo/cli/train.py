@@ -115,7 +115,7 @@ def train(
             raise KeyboardInterrupt
     if not as_json:
         typer.echo(
-            f"report: {out / 'training.json'}; sorvolo evaluate detector measures the model on other pictures"
+            f"report: {out / 'training.html'}; sorvolo evaluate detector measures the model on other pictures"
         )
 
 

@@ -21,6 +21,7 @@ from sorvolo.detection.detector import Detector
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.lab.simulation.pictures import PictureSettings, simulate_pictures
 from sorvolo.lab.training.detector import TrainingUpdate, train_detector
+from sorvolo.lab.training.page import training_page
 from sorvolo.lab.training.progress import read_checkpoint
 from sorvolo.lab.training.sets import (
     DataOptions,
@@ -89,6 +90,7 @@ def test_the_command_learns_and_writes_a_model_that_runs(data: Path, tmp_path: P
         ("learnt from", 15, 3),
         ("checked on", 5, 1),
     ]
+    assert (out / "training.html").read_text().count("<svg") == 1
 
     detector = Detector.load(out / "model.onnx")
     assert (detector.classes, detector.info.preset, detector.info.thermal) == (
@@ -400,3 +402,47 @@ def test_a_model_that_finds_nothing_is_warned_of(
     assert (
         report["found_px"] == {} and report["model"]["best_px"]["car"][0] > 20
     )  # of those learnt from
+    page = (tmp_path / "out" / "training.html").read_text()
+    assert words in page and "too few found" in page
+
+
+def test_names_in_the_report_are_text() -> None:
+    report = {
+        "model": {"name": "<b>"},
+        "found_px": {"<i>": (1, 2)},
+        "held_out": {"ap50": 0.5, "classes": {"<i>": 0.5}},
+        "reported": {"<i>": {"score": 0.5, "precision": None, "recall": 0.25}},
+        "stopped_early": True,
+        "step": 2,
+        "steps": 5,
+        "seconds": 3.0,
+        "device": "cpu",
+        "notices": ["<script>"],
+        "losses": [{"step": k, "losses": {"<i>": 1.0 / k}} for k in (1, 2)],
+        "checks": [{"step": k, "ap50": 0.1 * k, "classes": {"<i>": None}} for k in (1, 2)],
+        "best_step": 2,
+        "sets": [
+            {
+                "name": "<s>",
+                "part": "learnt from",
+                "pictures": 1,
+                "videos": 1,
+                "boxes": {"<i>": 3},
+                "unlabelled": [],
+            }
+        ],
+        "settings": {"preset": "fast"},
+        "weights": "none",
+        "export": {
+            "box_px": 0.0,
+            "score": 0.0,
+            "detections": 3,
+            "undecided": 0,
+            "bytes": 5_000_000,
+        },
+    }
+    page = training_page(report)
+    assert (
+        "<i>" not in page and "<script>" not in page and "<s>" not in page and "&lt;i&gt;" in page
+    )
+    assert "then its checks no longer got better" in page and page.count("<polyline") == 2

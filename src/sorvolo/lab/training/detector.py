@@ -32,6 +32,7 @@ from sorvolo.lab.training.onnx_export import (
     export_onnx,
     round_weights,
 )
+from sorvolo.lab.training.page import training_page
 from sorvolo.lab.training.progress import (
     Check,
     History,
@@ -64,10 +65,10 @@ from sorvolo.lab.training.start import (
 )
 from sorvolo.paths import AnyPath, Inputs, listed
 from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, writing
-from sorvolo.store.exports.plain import json_bytes
+from sorvolo.store.exports.plain import json_bytes, plain_json
 from sorvolo.survey.wording import counted
 
-MODEL, REPORT = "model.onnx", "training.json"
+MODEL, REPORT, PAGE = "model.onnx", "training.json", "training.html"
 CHECKPOINT, BEST = "checkpoint.pt", "best.safetensors"
 """What a run leaves in its folder."""
 
@@ -134,7 +135,7 @@ def train_detector(
     device: str = "auto",
     resume: bool = False,
 ) -> Iterator[TrainingUpdate]:
-    """Train on the sets at `places` and leave model.onnx, training.json and checkpoints in `out`.
+    """Train on the sets at `places` and leave model.onnx, training.html, training.json and checkpoints in `out`.
 
     Closing the iterator early leaves a checkpoint, from which `resume` goes on. Raises InputError for data or weights
     that cannot be used, SettingsError for a device that is not there, for an `out` that holds another run, and for
@@ -382,6 +383,7 @@ def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
         "found_px": found_sizes_px(checked, scores, classes),
     }
     atomic_write_bytes(run.out / REPORT, json_bytes(report))
+    atomic_write_bytes(run.out / PAGE, training_page(plain_json(report)).encode())
     return check, notices
 
 
