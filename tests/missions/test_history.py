@@ -114,41 +114,6 @@ def test_maps_are_dated_by_their_flights(site: Path) -> None:
             find_version(archive, "2023-11-13")
 
 
-def test_the_map_as_jpeg_is_close_and_smaller(site: Path, tmp_path: Path) -> None:
-    export_version(site, None, tmp_path / "exact.tif")
-    export_version(site, None, tmp_path / "small.tif", compress="jpeg")
-    with (
-        rasterio.open(tmp_path / "exact.tif") as exact,
-        rasterio.open(tmp_path / "small.tif") as small,
-    ):
-        assert (
-            small.compression.name == "jpeg"
-            and small.crs == exact.crs
-            and small.transform == exact.transform
-        )
-        assert np.array_equal(small.dataset_mask() > 0, exact.dataset_mask() > 0)
-        seen = exact.read(4) > 0
-        assert np.abs(small.read()[:, seen].astype(int) - exact.read([1, 2, 3])[:, seen]).mean() < 4
-    with pytest.raises(SettingsError, match="deflate, jpeg"):
-        export_version(site, None, tmp_path / "x.tif", compress="zip")
-
-
-def test_a_map_stays_as_compressed_as_its_owner_chose(tmp_path: Path) -> None:
-    """`sorvolo map --compress jpeg`, then a comparison, which chooses nothing, then a flight mapped without loss."""
-    mosaic, written = tmp_path / "site" / "mosaic.tif", []
-    with Archive.open(tmp_path / "site", write=True) as archive:
-        archive.create_site(SITE)
-        for number, settings in enumerate(
-            ({"compress": "jpeg"}, {"votes": 3}, {"compress": "deflate"}, {})
-        ):
-            with archive.begin_flight(f"f{number}", "", settings) as writer:
-                writer.tiles[0, 0] = tile(20 + number)
-                writer.commit([frame(0)], {}, {}, "<html></html>")
-            with rasterio.open(mosaic) as opened:
-                written.append((opened.compression.name.lower(), opened.count))
-    assert written == [("jpeg", 3), ("jpeg", 3), ("deflate", 4), ("deflate", 4)]
-
-
 def test_the_map_is_written_as_it_was(site: Path, tmp_path: Path) -> None:
     for at, red in (("1", 21), ("2", 90), (None, 90)):
         assert export_version(site, at, tmp_path / "map.tif").id == (1 if at == "1" else 2)

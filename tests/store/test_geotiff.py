@@ -98,22 +98,6 @@ def test_overviews_do_not_darken_the_rim_of_what_is_seen(
     assert (red[alpha > 0] >= 199).all()
 
 
-def test_a_map_as_jpeg_has_overviews_of_what_is_seen(tmp_path: Path, site_grid: SiteGrid) -> None:
-    """GDAL's own, for the mask comes of a file that has none of ours."""
-    tiles = {(column, 0): tile(200) for column in range(3)}
-    for compress in ("deflate", "jpeg"):
-        write_cog(tiles, site_grid, tmp_path / f"{compress}.tif", compress=compress)
-    with (
-        rasterio.open(tmp_path / "deflate.tif") as exact,
-        rasterio.open(tmp_path / "jpeg.tif") as small,
-    ):
-        assert small.overviews(1) == exact.overviews(1) == [2, 4]
-        halves = [
-            each.read(1, out_shape=(each.height // 2, each.width // 2)) for each in (exact, small)
-        ]
-        assert np.abs(halves[0].astype(int) - halves[1]).mean() < 4
-
-
 def test_what_is_empty_between_two_places_is_left_out_of_the_overviews_alone(
     tmp_path: Path, site_grid: SiteGrid, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -3,7 +3,7 @@
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from sorvolo.change.compare import PairMethod
 from sorvolo.errors import SettingsError
@@ -97,9 +97,6 @@ class MapSettings:
         None  # of the ground, in the telemetry's own height reference
     )
     crs: str | None = None  # of mosaic.tif; None: the site's UTM zone
-    compress: Literal["deflate", "jpeg"] | None = (
-        None  # of mosaic.tif; None: as before, deflate for a new map
-    )
     live_s: float = 3.0  # how often the growing map is made visible
     model: str = "default"  # that looks for objects: an installed one's name, a file, or "none"
     control_sigma_m: float = 0.05  # of the control points' places, horizontal
@@ -120,10 +117,6 @@ class MapSettings:
         if not 1e-4 <= self.control_sigma_m <= 100:
             raise SettingsError(
                 f"the control points' accuracy (--gcp-accuracy) must lie in 0.0001 to 100 m, got {self.control_sigma_m}"
-            )
-        if self.compress not in (None, "deflate", "jpeg"):
-            raise SettingsError(
-                f"the compression (--compress) must be deflate or jpeg, got {self.compress!r}"
             )
         if self.m_per_px is not None and not 1e-4 <= self.m_per_px <= 100:
             raise SettingsError(

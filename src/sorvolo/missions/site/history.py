@@ -137,9 +137,7 @@ def find_version(archive: Archive, at: str) -> VersionEntry:
     return archive.version_at(_moment(at))
 
 
-def export_version(
-    site: Path, at: str | None, path: Path, *, compress: str = "deflate"
-) -> VersionEntry:
+def export_version(site: Path, at: str | None, path: Path) -> VersionEntry:
     """Write the map as it was at a version or date (see `find_version`; None: now) to a .tif, .png, .kmz, .mbtiles or .pdf
     file, or the heights of its flight in the map's colours to a .laz file.
 
@@ -161,11 +159,11 @@ def export_version(
         if not complete:
             raise InputError(f"{site} has no map yet; map a flight into it first")
         version = complete[-1] if at is None else find_version(archive, at)
-        _write_map(archive, version, path, compress)
+        _write_map(archive, version, path)
     return version
 
 
-def _write_map(archive: Archive, version: VersionEntry, path: Path, compress: str) -> None:
+def _write_map(archive: Archive, version: VersionEntry, path: Path) -> None:
     tiles, site = archive.tiles(version.id), archive.site()
     if not tiles:
         raise StoreError(
@@ -186,9 +184,7 @@ def _write_map(archive: Archive, version: VersionEntry, path: Path, compress: st
         cloud = coloured_heights(archive, version)
         write_laz(cloud, archive.site_grid().grid, site.height_reference, path)
     else:
-        write_cog(
-            tiles, archive.site_grid(), path, crs=version.export_crs or None, compress=compress
-        )
+        write_cog(tiles, archive.site_grid(), path, crs=version.export_crs or None)
 
 
 def _moment(text: str) -> datetime:

@@ -156,19 +156,6 @@ _COG = {
 }
 
 
-# of the colours; what was never seen becomes a lossless mask. GDAL makes that mask of the alpha band by a file between,
-# which has none of our overviews: it averages its own
-_JPEG = {
-    "compress": "JPEG",
-    "quality": 90,
-    "overviews": "IGNORE_EXISTING",
-    "overview_resampling": "AVERAGE",
-}
-_MOST_JPEG_LEVELS = 12.0  # mean difference of a block's colours: noise at quality 90 stays below 6
-COMPRESSIONS = ("deflate", "jpeg")
-"""How the map's GeoTIFF may be compressed: without loss, or with a tenth of the size."""
-
-
 @dataclass(frozen=True, eq=False)
 class Raster:
     """A north-up map: `rgba` (H, W, 4), the centre of pixel (0, 0) at `origin_m` in `crs` ("": none)."""
@@ -185,27 +172,16 @@ def write_cog(
     path: Path,
     *,
     crs: str | None = None,
-    compress: str = "deflate",
     pass_by: Callable[[TileIndex, ImageRGBA], None] = lambda _index, _tile: None,
 ) -> None:
     """Write the map as a Cloud Optimized GeoTIFF with alpha and overviews, in place of what was at `path`.
 
     Tiles are read one at a time, a few ahead in a thread, and each is shown to `pass_by`. `crs` reprojects (bilinear);
-    the site's own CRS is the default, a local site has none. `compress` is one of COMPRESSIONS; JPEG has three bands
-    and a mask. The file is read back before it takes its place. Raises SettingsError for an unknown `crs` or
-    `compress`, and StoreError for an empty map, a full disk, or a file that reads back differently.
+    the site's own CRS is the default, a local site has none. The file is read back before it takes its place. Raises
+    SettingsError for an unknown `crs`, and StoreError for an empty map, a full disk, or a file that reads back differently.
     """
     if not tiles:
         raise StoreError("the map has no tiles; there is nothing to write as GeoTIFF")
-    if compress not in COMPRESSIONS:
-        raise SettingsError(f"--compress {compress}: choose one of {', '.join(COMPRESSIONS)}")
-    is_jpeg = compress == "jpeg"
-    lossless = {"level", "predictor"}
-    options = (
-        {key: value for key, value in _COG.items() if key not in lossless} | _JPEG
-        if is_jpeg
-        else _COG
-    )
     grid = site_grid.grid
     target = None if crs is None or crs == grid.crs else parse_crs(crs, grid)
     with (
@@ -219,20 +195,20 @@ def write_cog(
             plain = _warped(plain, target)
         filled = None if target is not None else _filled_blocks(tiles, grid)
         with rasterio.open(_pyramid(plain, filled), driver="VRT") as source:
-            rasterio.shutil.copy(source, temporary, **options)
+            rasterio.shutil.copy(source, temporary, **_COG)
         with rasterio.open(plain, driver="GTiff") as source:
             with rasterio.open(temporary, driver="GTiff") as written:
                 if (written.width, written.height, written.count) != (
                     source.width,
                     source.height,
-                    3 if is_jpeg else 4,
+                    4,
                 ):
                     raise StoreError(_differs(temporary))
                 # the last block lies last in the file: a cut file cannot give it
                 windows = [window for _, window in written.block_windows(1)]
                 for window in _spread(windows, _VERIFIED_BLOCKS):
                     read, wanted = written.read(window=window), source.read(window=window)
-                    if not (_is_close(read, wanted) if is_jpeg else np.array_equal(read, wanted)):
+                    if not np.array_equal(read, wanted):
                         raise StoreError(_differs(temporary))
 
 
@@ -479,13 +455,6 @@ def _halved(larger: Path, path: Path, filled: set[TileIndex] | None) -> Path | N
                 halved = shrink(np.ascontiguousarray(rgba), small.width, small.height)
                 sink.write(_bands(halved), window=small)
     return path
-
-
-def _is_close(read: NDArray[np.uint8], wanted: NDArray[np.uint8]) -> bool:
-    """Whether a block's colours, (3, H, W), are those wanted, (4, H, W), up to JPEG's loss."""
-    seen = wanted[3] > 0
-    differences = np.abs(read[:, seen].astype(np.int16) - wanted[:3, seen])
-    return not seen.any() or float(differences.mean()) <= _MOST_JPEG_LEVELS
 
 
 def _spread(items: list, count: int) -> Iterator:  # type: ignore[type-arg]

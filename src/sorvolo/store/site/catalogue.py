@@ -31,7 +31,6 @@ from sorvolo.geometry.grid import TileIndex
 from sorvolo.geometry.pose import Pose
 from sorvolo.geometry.units import DAY_NS
 from sorvolo.store.exports.plain import plain_json
-from sorvolo.store.rasters.geotiff import COMPRESSIONS
 from sorvolo.store.site import schema
 from sorvolo.store.site.catalogue_place import Catalogues, open_database
 from sorvolo.store.site.database import Database, SqliteDatabase
@@ -74,8 +73,7 @@ class FlightEntry:
 class VersionEntry:
     """One state of the map; versions share the tiles in which they agree.
 
-    `flown_ns` is the time of its flight's first frame, UTC; -1 where it was not stored. `compress` is how its GeoTIFF
-    is compressed: as its flight's settings state it, else as the version before.
+    `flown_ns` is the time of its flight's first frame, UTC; -1 where it was not stored.
     """
 
     id: int
@@ -86,7 +84,6 @@ class VersionEntry:
     export_crs: str
     run_id: int
     flown_ns: int = -1
-    compress: str = "deflate"
 
     def __post_init__(self) -> None:
         datetime.fromisoformat(self.created_utc)
@@ -279,17 +276,6 @@ def list_versions(connection: Connection) -> list[VersionEntry]:
     tiles = func.count(schema.version_tiles.c.sha256)
     flown = schema.checked_rows(connection, schema.flown, select(schema.flown))
     flown_ns = {row.version_id: row.first_ns for row in flown}
-    # how the versions' GeoTIFFs are compressed, by version; a version whose flight chose nothing is as its parent
-    wishes = {
-        row.id: row.settings.get("compress") if isinstance(row.settings, dict) else None
-        for row in connection.execute(select(schema.runs.c.id, schema.runs.c.settings))
-    }
-    compressions: dict[int, str] = {}
-    for row in connection.execute(select(schema.versions).order_by(schema.versions.c.id)):
-        wish = wishes.get(row.run_id)
-        compressions[row.id] = (
-            wish if wish in COMPRESSIONS else compressions.get(row.parent_id, COMPRESSIONS[0])
-        )
     rows = connection.execute(
         select(schema.versions, tiles.label("tiles"))
         .outerjoin(schema.version_tiles, schema.version_tiles.c.version_id == schema.versions.c.id)
@@ -304,7 +290,6 @@ def list_versions(connection: Connection) -> list[VersionEntry]:
                 "flight_id": checked_name(row.flight_id, "flight"),
                 "export_crs": checked_crs(row.export_crs),
                 "flown_ns": flown_ns.get(row.id, -1),
-                "compress": compressions[row.id],
             }
         )
         for row in rows

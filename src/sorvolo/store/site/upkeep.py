@@ -87,10 +87,10 @@ def repair(files: "Archive") -> None:
 def _is_shown(files: "Archive", newest: VersionEntry, shown: int) -> bool:
     """Whether the map's files are there and are those of the newest version, or would be the same."""
     if newest.id != shown:
-        written_as = {each.id: (each.export_crs, each.compress) for each in files.versions()}
+        crs_of = {each.id: each.export_crs for each in files.versions()}
         with files.catalogue.reading() as connection:
             now, then = (records.tile_hashes(connection, each) for each in (newest.id, shown))
-        if now != then or written_as.get(shown) != (newest.export_crs, newest.compress):
+        if now != then or crs_of.get(shown) != newest.export_crs:
             return False
     names = MAP_FILES[: 2 if files.site().is_local else None]
     return not newest.tiles or all(
@@ -207,7 +207,6 @@ def _write_map_files(files: "Archive", version: VersionEntry) -> None:
                 files.site_grid(),
                 mosaic,
                 crs=version.export_crs or None,
-                compress=version.compress,
                 pass_by=pass_by,
             )
         for each in waiting:
