@@ -254,7 +254,7 @@ def test_a_watch_of_a_growing_file_goes_on(
     detector = Following(filmed)
     command = f"{sys.executable} -c \"open('{alerts}', 'a').write('{{id}} ')\""
     outputs = WatchOutputs(folder=folder, save="pictures", labels=("coco",), alert_command=command)
-    settings = WatchSettings(every=1)
+    settings = WatchSettings(frames_per_second=1000)
 
     def watched() -> Generator[WatchUpdate]:
         return watch(

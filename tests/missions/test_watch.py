@@ -263,7 +263,7 @@ def test_views_never_exceed_the_frames_searched(
     if not has_telemetry:
         video = tmp_path / "bare.mp4"
         video.write_bytes(_video(flown).read_bytes())
-    settings = WatchSettings(least_score=0.3, every=5, tiles=None)
+    settings = WatchSettings(least_score=0.3, frames_per_second=5.001 / 5, tiles=None)
     folder = tmp_path / "watch"
     found = Detector.load("default", provider="cpu", threads=1)
     deque(
@@ -473,7 +473,7 @@ def test_those_who_want_it_are_alerted(
 def test_only_the_classes_asked_for_in_the_frames_asked_for(
     flown: Path, detector: TruthDetector, tmp_path: Path
 ) -> None:
-    settings = WatchSettings(classes=("car",), every=7)
+    settings = WatchSettings(classes=("car",), frames_per_second=5.001 / 7)
     updates = _watch(flown, tmp_path / "watch", detector, settings, save="pictures")
     with av.open(str(_video(flown))) as container:
         frames = sum(1 for _ in container.decode(video=0))

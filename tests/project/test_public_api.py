@@ -114,8 +114,8 @@ def test_errors_name_arguments_in_python_and_options_in_commands(
 
 
 def test_no_error_of_python_asks_for_an_option() -> None:
-    with pytest.raises(sorvolo.SettingsError, match=r"\(every\) or .*\(frames_per_second\)"):
-        sorvolo.WatchSettings(every=2, frames_per_second=3)
+    with pytest.raises(sorvolo.SettingsError, match=r"accuracy \(control_sigma_m\) must"):
+        sorvolo.MapSettings(control_sigma_m=0)
 
 
 def test_what_cannot_be_is_named_and_nothing_is_written(

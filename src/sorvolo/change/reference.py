@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from sorvolo.geometry.arrays import ImageGray, ImageRGB, ImageRGBA, Mask, Matrix3, PointsPx
-from sorvolo.geometry.grid import Grid, TileIndex
+from sorvolo.geometry.grid import Grid, TileIndex, gather_tiles
 from sorvolo.geometry.homography import apply_homography, resized
 from sorvolo.registration.features import (
     FeatureSettings,
@@ -133,19 +133,8 @@ class ReferenceMap:
         return float(np.median(levels)) if len(levels) else 0.0
 
     def _assembled(self, level: int, x: int, y: int, width: int, height: int) -> ImageRGBA:
-        side = self._grid.tile_px
-        result = np.zeros((height, width, 4), np.uint8)
-        for row in range(y // side, (y + height - 1) // side + 1):
-            for column in range(x // side, (x + width - 1) // side + 1):
-                tile = self._tile(level, (column, row))
-                if tile is None:
-                    continue
-                x0, y0 = max(x, column * side), max(y, row * side)
-                x1, y1 = min(x + width, (column + 1) * side), min(y + height, (row + 1) * side)
-                result[y0 - y : y1 - y, x0 - x : x1 - x] = tile[
-                    y0 - row * side : y1 - row * side, x0 - column * side : x1 - column * side
-                ]
-        return result
+        window = x, y, x + width, y + height
+        return gather_tiles(window, self._grid.tile_px, lambda index: self._tile(level, index))
 
     def _tile(self, level: int, index: TileIndex) -> ImageRGBA | None:
         key = level, index

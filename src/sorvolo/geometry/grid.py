@@ -1,13 +1,13 @@
 """The endless pixel grid that is laid on a site, cut into square tiles."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 
 from sorvolo.errors import GeometryError
-from sorvolo.geometry.arrays import Matrix3, PointsM, PointsPx
+from sorvolo.geometry.arrays import ImageRGBA, Matrix3, PointsM, PointsPx
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame, Projection
 from sorvolo.geometry.homography import apply_homography
 
@@ -72,6 +72,26 @@ class Grid:
         normals = np.column_stack([-edges[:, 1], edges[:, 0]])
         a, b = outline @ normals.T, box @ normals.T
         return bool(np.all((a.max(axis=0) >= b.min(axis=0)) & (b.max(axis=0) >= a.min(axis=0))))
+
+
+def gather_tiles(
+    window: tuple[int, int, int, int], side: int, tile_at: Callable[[TileIndex], ImageRGBA | None]
+) -> ImageRGBA:
+    """(height, width, 4) a window (x0, y0, x1, y1, ends exclusive) of tiles (side, side, 4); zero where there is none."""
+    x0, y0, x1, y1 = window
+    result = np.zeros((y1 - y0, x1 - x0, 4), np.uint8)
+    for row in range(y0 // side, (y1 - 1) // side + 1):
+        for column in range(x0 // side, (x1 - 1) // side + 1):
+            tile = tile_at((column, row))
+            if tile is None:
+                continue
+            left, top = max(x0, column * side), max(y0, row * side)
+            right, bottom = min(x1, (column + 1) * side), min(y1, (row + 1) * side)
+            result[top - y0 : bottom - y0, left - x0 : right - x0] = tile[
+                top - row * side : bottom - row * side,
+                left - column * side : right - column * side,
+            ]
+    return result
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from sorvolo.geometry.arrays import (
     PointsM,
     frozen,
 )
-from sorvolo.geometry.grid import SiteGrid, TileIndex
+from sorvolo.geometry.grid import SiteGrid, TileIndex, gather_tiles
 from sorvolo.geometry.homography import apply_homography, fit_similarity
 from sorvolo.mosaic.canvas_frame import CanvasFrame, coverage, warp
 from sorvolo.registration.features import gray_from_rgb
@@ -225,8 +225,8 @@ class MapDeviation:
     """Compares frames with the map one after another; remembers the map's last tiles."""
 
     def __init__(self, tiles: Mapping[TileIndex, ImageRGBA], site_grid: SiteGrid) -> None:
-        self._tiles, self._site_grid = tiles, site_grid
-        self._tile = lru_cache(_RECENT)(tiles.__getitem__)
+        self._site_grid = site_grid
+        self._tile = lru_cache(_RECENT)(tiles.get)
 
     def of(self, image: ImageRGB, site_from_image: Matrix3) -> Deviation:
         """The deviation of one undistorted frame, (H, W, 3), from the map under it."""
@@ -255,7 +255,7 @@ class MapDeviation:
         )
         frame_from_window = cv2.getPerspectiveTransform((corners - low).astype(np.float32), ends)
         found = cv2.warpPerspective(
-            self._crop(window, self._site_grid.grid.tile_px),
+            gather_tiles(window, self._site_grid.grid.tile_px, self._tile),
             frame_from_window,
             (width_px, height_px),
         )
@@ -271,26 +271,9 @@ class MapDeviation:
         low = np.floor(frame.outline_px.min(axis=0))
         high = np.ceil(frame.outline_px.max(axis=0)) + 1
         window = int(low[0]), int(low[1]), int(high[0]), int(high[1])
-        mosaic = self._crop(window, self._site_grid.grid.tile_px)
+        mosaic = gather_tiles(window, self._site_grid.grid.tile_px, self._tile)
         mask = (coverage(frame, window) > 0) & (mosaic[..., 3] > 0)
         return np.ascontiguousarray(mosaic[..., :3]), warp(image, frame, window), mask
-
-    def _crop(self, window: tuple[int, int, int, int], side: int) -> ImageRGBA:
-        """(height, width, 4) the map in a window of grid pixels (x0, y0, x1, y1, ends exclusive)."""
-        x0, y0, x1, y1 = window
-        result = np.zeros((y1 - y0, x1 - x0, 4), np.uint8)
-        for row in range(y0 // side, (y1 - 1) // side + 1):
-            for column in range(x0 // side, (x1 - 1) // side + 1):
-                if (column, row) not in self._tiles:
-                    continue
-                left, top = max(x0, column * side), max(y0, row * side)
-                right, bottom = min(x1, (column + 1) * side), min(y1, (row + 1) * side)
-                tile = self._tile((column, row))
-                result[top - y0 : bottom - y0, left - x0 : right - x0] = tile[
-                    top - row * side : bottom - row * side,
-                    left - column * side : right - column * side,
-                ]
-        return result
 
 
 def frames_to_compare(count: int, most: int) -> list[int]:

@@ -122,8 +122,6 @@ def fly(path: PathSettings, motion: MotionSettings, rng: Generator) -> FlownPath
     plan = CubicSpline(times_s, rounded[keep])
     moving = np.asarray(plan(times_s, 1)) - _wind_m_s(motion)
     heading_deg = np.degrees(np.unwrap(np.arctan2(moving[:, 0], moving[:, 1])))
-    if not path.turns_nose:
-        heading_deg = np.full_like(heading_deg, path.heading_deg)
     roll_rms_deg = motion.roll_rms_deg
     smooth = max(1.0, 0.4 * path.speed_m_s / _STEP_M)
     heading = CubicSpline(times_s, gaussian_filter1d(heading_deg, smooth, mode="nearest"))

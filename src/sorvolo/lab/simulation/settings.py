@@ -108,7 +108,6 @@ class PathSettings(_Checked):
     strips: int = 2
     strip_spacing_m: float = 10.0
     heading_deg: float = 90.0  # of the first strip, clockwise from north
-    turns_nose: bool = True  # the nose follows the path; else it keeps the first heading
 
 
 @dataclass(frozen=True)

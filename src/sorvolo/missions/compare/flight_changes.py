@@ -43,7 +43,7 @@ class ComparePlan:
         if settings.method is None:
             fine = min(max(map_m_per_px / _FINE_M_PER_PX, 1.0), _FINER)
         return cls(
-            settings.side_px or (_VIDEO_PX if source.kind == "video" else _PHOTO_PX),
+            _VIDEO_PX if source.kind == "video" else _PHOTO_PX,
             fine if is_photos else 1.0,
             fine > 1.0 and (is_photos or not isinstance(source, LiveSource)),
             None if is_photos else _OVERLAP,

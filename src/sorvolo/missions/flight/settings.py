@@ -146,9 +146,6 @@ class CompareSettings:
     ground_elevation_m: float | None = (
         None  # of the ground, in the telemetry's own height reference
     )
-    side_px: int | None = (
-        None  # longest side at which frames are compared; None: photos larger than a video's frames
-    )
     updates_map: bool = True  # make a new version of the map where the ground changed or is new
     writes_masks: bool = False
     trusts_map: bool = False  # also a map that contradicts itself
@@ -168,8 +165,6 @@ class CompareSettings:
                 f"a change needs {self.votes} of the last {self.voters} views: the first must not exceed the second, "
                 "and both lie in 1 to 8"
             )
-        if self.side_px is not None and not 256 <= self.side_px <= 8192:
-            raise SettingsError(f"frames are compared at 256 to 8192 px, got {self.side_px}")
         check_telemetry(self.offset_s, self.ground_elevation_m)
 
     @property

@@ -412,13 +412,10 @@ def _places(
 
 
 def _wanted(source: Source, settings: WatchSettings) -> Callable[[int, int], bool]:
-    """Which frames are searched: all photos, every N-th frame, or a number a second of flight.
+    """Which frames are searched: all photos, or a number a second of flight.
 
     Of a live source those that the detector is too slow for wait until it has landed.
     """
-    if settings.every is not None:
-        step = settings.every
-        return lambda index, _: index % step == 0
     if settings.frames_per_second is not None:
         return every(1 / settings.frames_per_second)
     return every(0.0 if source.kind == "photos" else 1 / DEFAULT_FRAMES_PER_SECOND)

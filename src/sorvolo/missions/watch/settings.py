@@ -27,7 +27,6 @@ class WatchSettings:
     tiles: Literal["auto"] | int | None = (
         "auto"  # large pictures cut: by the ground's sampling distance, px, not
     )
-    every: int | None = None  # search every N-th frame; None: by time
     frames_per_second: float | None = (
         None  # of flight; None: 10, and of a live stream as many as there is time for
     )
@@ -47,12 +46,6 @@ class WatchSettings:
             raise SettingsError(f"the least score must lie in 0 to 1, got {self.least_score}")
         if isinstance(self.tiles, int) and not 64 <= self.tiles <= 16_384:
             raise SettingsError(f"tiles must be 64 to 16384 px wide, got {self.tiles}")
-        if self.every is not None and self.frames_per_second is not None:
-            raise SettingsError(
-                "give every N-th frame (--every) or this many frames a second (--fps), not both"
-            )
-        if self.every is not None and self.every < 1:
-            raise SettingsError(f"every N-th frame: N must be 1 or more, got {self.every}")
         if self.frames_per_second is not None and not 0.001 <= self.frames_per_second <= 1000:
             raise SettingsError(
                 f"frames a second must lie in 0.001 to 1000, got {self.frames_per_second}"
