@@ -263,7 +263,7 @@ def test_views_never_exceed_the_frames_searched(
     if not has_telemetry:
         video = tmp_path / "bare.mp4"
         video.write_bytes(_video(flown).read_bytes())
-    settings = WatchSettings(least_score=0.3, frames_per_second=5.001 / 5, tiles=None)
+    settings = WatchSettings(least_score=0.3, frames_per_second=5.001 / 5)
     folder = tmp_path / "watch"
     found = Detector.load("default", provider="cpu", threads=1)
     deque(
@@ -885,13 +885,7 @@ def test_a_photo_that_alone_shows_something_is_enough(
 
 @pytest.mark.parametrize(
     "wrong",
-    [
-        {"least_score": 1.2},
-        {"tiles": 10},
-        {"every": 0},
-        {"frames_per_second": 0.0},
-        {"every": 2, "frames_per_second": 1.0},
-    ],
+    [{"least_score": 1.2}, {"frames_per_second": 0.0}],
 )
 def test_settings_that_cannot_be(wrong: dict[str, Any]) -> None:
     with pytest.raises(SettingsError):

@@ -280,7 +280,7 @@ class WatchRun:
     def _found(self, frame: Frame, arrived_s: float) -> Detections:
         """Return what the detector finds in a frame; where nothing places the flight, at the scale its scene shows."""
         settings, classes, memo = self._settings, self._classes, self._memo
-        is_scaled = settings.tiles == "auto" and self._places.site.is_local and frame.image.size > 0
+        is_scaled = self._places.site.is_local and frame.image.size > 0
         m_per_px, looks = self._places.m_per_px(frame), itertools.count()
 
         def look(part: ImageRGB) -> Detections:
@@ -316,7 +316,7 @@ class WatchRun:
             Detections,
             lambda: self._detector.detect(
                 frame.image,
-                tiles=settings.tiles,
+                tiles="auto",
                 m_per_px=m_per_px,
                 least_score=settings.least_score,
                 classes=classes,

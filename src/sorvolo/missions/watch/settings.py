@@ -24,9 +24,6 @@ class WatchSettings:
     model: str = "default"  # a name or a file
     classes: tuple[str, ...] = ()  # empty: all that the model knows
     least_score: float | None = None  # of a detection; None: each class's own, as its model has it
-    tiles: Literal["auto"] | int | None = (
-        "auto"  # large pictures cut: by the ground's sampling distance, px, not
-    )
     frames_per_second: float | None = (
         None  # of flight; None: 10, and of a live stream as many as there is time for
     )
@@ -44,8 +41,6 @@ class WatchSettings:
         take_one_or_several(self, "classes")
         if self.least_score is not None and not 0 <= self.least_score <= 1:
             raise SettingsError(f"the least score must lie in 0 to 1, got {self.least_score}")
-        if isinstance(self.tiles, int) and not 64 <= self.tiles <= 16_384:
-            raise SettingsError(f"tiles must be 64 to 16384 px wide, got {self.tiles}")
         if self.frames_per_second is not None and not 0.001 <= self.frames_per_second <= 1000:
             raise SettingsError(
                 f"frames a second must lie in 0.001 to 1000, got {self.frames_per_second}"
