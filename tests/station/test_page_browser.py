@@ -2604,7 +2604,7 @@ SAME_EVERYWHERE = re.compile(  # names, formats, keys, what the station calls a 
 )
 
 
-@pytest.mark.parametrize("locale", ["de-DE", "it-IT"])
+@pytest.mark.parametrize("locale", ["de-DE", pytest.param("it-IT", marks=pytest.mark.long)])
 def test_the_page_in_another_language_fits_a_phone_and_a_laptop(
     browser: Any, served: Served, locale: str
 ) -> None:
