@@ -205,11 +205,11 @@ export class Compare {
     this.screen.stage.classList.remove("side");
     for (const each of [this.cover, this.handle, this.edge, this.names]) each?.remove();
     const { data, view } = this.screen;
-    const newest = this.versions?.at(-1).n;
+    const wasCompared = Boolean(this.versions);
     this.versions = this.other = data.versions = null;
     this.put = null;
-    if (newest !== undefined && view && !this.screen.closed) {
-      view.showVersion(data.detail.live_revision ? `live-${data.detail.live_revision}` : newest);
+    if (wasCompared && view && !this.screen.closed) {
+      view.showNewest(data.detail);
       view.show("coverage", this.hadGaps, false);
       this.screen.draw(["changes", "objects", "track", "coverage"]);
       view.put("drawings", this.screen.zones ?? []);

@@ -88,6 +88,11 @@ export class MapView {
     this.map.getSource(name)?.setData({ type: "FeatureCollection", features });
   }
 
+  /** Show the map of a site's detail as it is now: growing, or its newest version. */
+  showNewest({ live_revision: live, versions }) {
+    this.showVersion(live ? `live-${live}` : versions.at(-1)?.n);
+  }
+
   /** Show a version of the mosaic: a number, or `live-REVISION` of the growing map. */
   showVersion(version) {
     if (version === null || version === undefined || version === this.version) return;

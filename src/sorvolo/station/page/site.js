@@ -146,10 +146,10 @@ class SiteScreen {
   }
 
   async load() {
-    const { live_revision: live, versions, is_new: isNew } = this.data.detail;
+    const isNew = this.data.detail.is_new;
     const drawn = this.view?.ready.then(() => {
       if (this.closed) return;
-      this.view.showVersion(live ? `live-${live}` : versions.at(-1)?.n);
+      this.view.showNewest(this.data.detail);
       this.view.showUnderTrees(this.data.detail.under_trees);
       showStationMap(this);
       if (!this.lastPlace) {
@@ -246,7 +246,7 @@ class SiteScreen {
       if (this.view) {
         this.view.site = this.data.detail;
         if (wasNew && this.data.detail.bounds_wgs84) this.view.go(this.data.detail.bounds_wgs84);
-        if (!this.opened?.versions) this.view.showVersion(`live-${this.data.detail.live_revision}`);
+        if (!this.opened?.versions) this.view.showNewest(this.data.detail);
       }
     } catch (problem) {
       if (!this.lost(problem)) throw problem;
