@@ -1,8 +1,8 @@
 """Reports looked at again: cut out with what is around them, shown at other sizes and turned, to this model or another.
 
 A boulder that looks like a person once seldom does so at other sizes and turned, nor to a judge that
-learnt what fools the first look. Only what was reported is looked at again, all of a picture side by
-side on one sheet a position, so that it costs little.
+learnt what fools the first look. Only what was reported is looked at again, some side by side on a
+sheet, so that it costs little.
 """
 
 from collections.abc import Callable, Mapping, Sequence

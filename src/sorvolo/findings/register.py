@@ -154,6 +154,15 @@ class Register:
     findings: tuple[GroundFinding, ...] = ()
     looks: tuple[SearchedDate, ...] = ()
 
+    @cached_property
+    def changed_on(self) -> dict[str, list[GroundFinding]]:
+        """What was first seen or found gone on a date, by date."""
+        changed: dict[str, list[GroundFinding]] = {}
+        for each in self.findings:
+            for date in {each.dates[0], each.gone}:
+                changed.setdefault(date, []).append(each)
+        return changed
+
 
 def associate(
     sightings: Sequence[MissionSighting],
@@ -196,8 +205,7 @@ def begun_and_ended(
     """What came to be there, or left, between dates that both looked for it, or by the later one's comparison: appeared
     or disappeared. What moves is another's on each date."""
     searches = [each.frames for each in register.looks if each.date in before]
-    concerned = [each for each in register.findings if after in (each.dates[0], each.gone)]
-    standing = [each for each in concerned if not each.newest.moving]
+    standing = [each for each in register.changed_on.get(after, ()) if not each.newest.moving]
     new = [each for each in standing if each.dates[0] == after]
     places_m = np.array([each.position_m for each in new]).reshape(-1, 2)
     was_looked_for = looked_at(places_m, [each.label for each in new], searches)

@@ -60,7 +60,7 @@ def found_features(
         flights = list(dict.fromkeys(each.flight_id for each in archive.versions()))
         for number, flight in enumerate(flights[1:], 1):
             changes = archive.changes(flight)
-            for kind, each in untold(register, changes, flights[:number], flight):
+            for kind, each in untold(register, changes, set(flights[:number]), flight):
                 properties[each.id]["untold"][flight] = kind
     return features
 

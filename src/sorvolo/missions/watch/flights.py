@@ -319,8 +319,7 @@ def _live(
 
     def came(frame: Frame) -> PointsM | None:
         memo.note_came(frame)
-        if run.trees is not None:
-            run.put_together(replace(frame, image=waiting.picture(frame.index)))
+        run.put_together(frame, lambda: waiting.picture(frame.index))
         return run.show(frame)
 
     with closing(waiting.live(came, run.new_share, run.doubtful)) as arrivals:

@@ -373,11 +373,11 @@ class WatchRun:
             return None
         return near_ground(view.outline_m, view.site_from_camera.translation_m)
 
-    def put_together(self, frame: Frame) -> None:
+    def put_together(self, frame: Frame, picture: Callable[[], ImageRGB] | None = None) -> None:
         """Take in a frame, in order of time, for what all of them show under trees."""
         if self.trees is not None:
             view = self._places.view(frame)
-            self.trees.take(frame, None if view is None else view.site_from_camera)
+            self.trees.take(frame, None if view is None else view.site_from_camera, picture)
 
     def new_share(self, outline_m: PointsM) -> float:
         """The share, 0 to 1, of this ground that no frame was searched for."""

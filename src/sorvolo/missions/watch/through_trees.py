@@ -98,9 +98,12 @@ class ThroughTrees:
         new, self._new = self._new, []
         return new
 
-    def take(self, frame: Frame, pose: Pose | None) -> None:
-        """Keep a photo, or a video's frame that is a step from the one before."""
-        if pose is None or not frame.image.size or pose.translation_m[2] < _LEAST_UP_M:
+    def take(
+        self, frame: Frame, pose: Pose | None, picture: Callable[[], ImageRGB] | None = None
+    ) -> None:
+        """Keep a photo, or a video's frame that is a step from the one before; `picture` gives the image of one that
+        came without."""
+        if pose is None or pose.translation_m[2] < _LEAST_UP_M:
             return
         camera, last = self._lens.camera, next(reversed(self._frames.values()), None)
         shown_m = pose.translation_m[2] / camera.fx_px * min(camera.width_px, camera.height_px)
@@ -108,11 +111,14 @@ class ThroughTrees:
             way_m = math.dist(pose.translation_m, last.view.site_from_camera.translation_m)
             if way_m < shown_m / _PER_FRAME:
                 return
+        image = frame.image if picture is None else picture()
+        if not image.size:
+            return
         kept = ForestFrame(
             frame.index,
             self._setup.utc_ns(frame.time_ns),
             View(frame.name, camera, pose, np.full(3, np.nan)),
-            jpeg_from_image(self._lens.undistort(frame.image)),
+            jpeg_from_image(self._lens.undistort(image)),
         )
         if self._memo.is_of_stream:
             self._memo.keep(frame, _KEPT, kept)
