@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
-from scipy.sparse import block_array, csr_matrix, eye_array, kron
+from scipy.sparse import block_array, bsr_array, csr_matrix, eye_array, kron
 
 from sorvolo.geometry.arrays import Floats, Mask, PointsM, Rows
 from sorvolo.geometry.pose import rotation_from_vector
@@ -102,7 +102,7 @@ class _Normal:
     cost: float
     cameras: Floats  # (6 N + 5, 6 N + 2)
     gradient: Floats  # (6 N + 5,)
-    coupling: csr_matrix  # (6 N + 5, 3 P)
+    coupling: bsr_array  # (6 N + 6, 3 P), in blocks of (6, 3); the last row is 0
     points: Floats  # (P, 3, 3)
     point_gradient: Floats  # (P, 3)
 
@@ -137,10 +137,10 @@ def adjust(scene: Scene, priors: Priors, settings: AdjustmentSettings) -> Scene:
         # The steps of the cameras and shared unknowns, (6 N + 5,), and of the points, (P, 3).
         damped = normal.points * (1 + damping * np.eye(3)) + 1e-9 * np.eye(3)
         inverse: Floats = np.asarray(np.linalg.inv(damped), np.float64)
-        reduced, through = _eliminated(normal, inverse)
-        system = normal.cameras - reduced.toarray()
+        reduced, pulled = _eliminated(normal, inverse)
+        system = normal.cameras - reduced
         system[np.diag_indices_from(system)] += damping * np.diag(normal.cameras) + 1e-9
-        gradient = normal.gradient - through @ normal.point_gradient.ravel()
+        gradient = normal.gradient - pulled
         if settings.is_steady:
             free = _steady(scene)
             cameras = free @ _solution(free.T @ (free.T @ system).T, free.T @ gradient)
@@ -149,17 +149,17 @@ def adjust(scene: Scene, priors: Priors, settings: AdjustmentSettings) -> Scene:
         points = np.einsum(
             "pij,pj->pi",
             inverse,
-            normal.point_gradient - (normal.coupling.T @ cameras).reshape(-1, 3),
+            normal.point_gradient - (normal.coupling.T @ np.append(cameras, 0)).reshape(-1, 3),
         )
         moved = _advance(scene, *(cameras, points))
         trial = _linearise(moved, priors, settings)
         if not trial.cost <= normal.cost:
-            damping *= 20
+            damping *= 4
             if damping > 1e4:
                 break
             continue
         gain = normal.cost - trial.cost
-        scene, normal, damping = moved, trial, max(damping / 8, 1e-8)
+        scene, normal, damping = moved, trial, max(damping / 3, 1e-8)
         if gain < 1e-5 * normal.cost:
             break
     return scene
@@ -194,9 +194,9 @@ def height_deviations(scene: Scene, priors: Priors, settings: AdjustmentSettings
     count = len(inverse)
     rows, columns = np.repeat(np.arange(count), 3), np.arange(3 * count)
     up = csr_matrix((inverse[:, 2].ravel(), (rows, columns)), shape=(count, 3 * count))
-    moved = -(up @ normal.coupling.T).toarray()
+    moved = -(up @ normal.coupling.T).toarray()[:, :-1]
     moved -= moved.mean(axis=0)
-    system = normal.cameras - _eliminated(normal, inverse)[0].toarray()
+    system = normal.cameras - _eliminated(normal, inverse)[0]
     half = np.linalg.solve(np.linalg.cholesky(system + 1e-9 * np.eye(len(system))), moved.T)
     return np.asarray(np.sqrt((half**2).sum(axis=0)))
 
@@ -252,22 +252,17 @@ def _linearise(scene: Scene, priors: Priors, settings: AdjustmentSettings) -> _N
     shared_coupling = _summed(_products(by_shared, by_point), scene.point, points).reshape(
         -1, _SHARED, 3
     )
-    # (6 N + 5, 3 P) how cameras, (M, 6, 3), and shared unknowns, (P, 5, 3), depend on points.
-    rows = [
-        (6 * scene.view[:, None] + _SIX)[:, :, None],
-        np.full((len(shared_coupling), 1, 1), size - _SHARED) + np.arange(_SHARED)[:, None],
-    ]
-    columns = [
-        3 * scene.point[:, None, None] + np.arange(3),
-        3 * np.arange(len(shared_coupling))[:, None, None] + np.arange(3),
-    ]
-    values = [_products(by_camera, by_point).reshape(-1, 6, 3), shared_coupling]
-    flat_rows = np.concatenate([np.broadcast_to(r, v.shape).ravel() for r, v in zip(rows, values)])
-    flat_columns = np.concatenate(
-        [np.broadcast_to(c, v.shape).ravel() for c, v in zip(columns, values)]
+    # The lens counts as one more camera here: its block has a row of zeros, so that all blocks have one shape.
+    order = np.argsort(scene.view, kind="stable")
+    values = np.concatenate(
+        [
+            _products(by_camera, by_point).reshape(-1, 6, 3)[order],
+            np.pad(shared_coupling, ((0, 0), (0, 1), (0, 0))),
+        ]
     )
-    flat = np.concatenate([v.ravel() for v in values])
-    coupling = csr_matrix((flat, (flat_rows, flat_columns)), shape=(size, 3 * len(shared_coupling)))
+    columns = np.concatenate([scene.point[order], np.arange(points)])
+    starts = np.cumsum([0, *np.bincount(scene.view, minlength=views), points])
+    coupling = bsr_array((values, columns, starts), shape=(size + 1, 3 * points))
     return _Normal(cost, system, gradient, coupling, blocks, point_gradient)
 
 
@@ -327,16 +322,15 @@ def _add_priors(
     return float(9.0 * np.log1p(squared)[known].sum() + weight * (axis**2).sum())
 
 
-def _eliminated(normal: _Normal, inverse: Floats) -> tuple[csr_matrix, csr_matrix]:
-    """What the points, their blocks (P, 3, 3) inverted, take from the cameras' system, and the cameras through them."""
-    count = len(inverse)
-    at = np.arange(3 * count).reshape(-1, 3)
-    spread = csr_matrix(
-        (inverse.ravel(), (np.repeat(at, 3, axis=1).ravel(), np.tile(at, (1, 3)).ravel())),
-        shape=(3 * count, 3 * count),
+def _eliminated(normal: _Normal, inverse: Floats) -> tuple[Floats, Floats]:
+    """What the points, their blocks (P, 3, 3) inverted, take from the cameras' system and from its gradient."""
+    coupling = normal.coupling
+    through = bsr_array(
+        (coupling.data @ inverse[coupling.indices], coupling.indices, coupling.indptr),
+        shape=coupling.shape,
     )
-    through = normal.coupling @ spread
-    return through @ normal.coupling.T, through
+    taken = (through @ coupling.T).toarray()
+    return taken[:-1, :-1], (through @ normal.point_gradient.ravel())[:-1]
 
 
 def _advance(scene: Scene, cameras: Floats, points: Floats) -> Scene:
@@ -353,7 +347,7 @@ def _advance(scene: Scene, cameras: Floats, points: Floats) -> Scene:
 
 def _products(left: Floats, right: Floats) -> Floats:
     """(M, a * b) left^T right of each observation, (M, 2, a) and (M, 2, b)."""
-    return np.einsum("mki,mkj->mij", left, right).reshape(len(left), -1)
+    return (left.transpose(0, 2, 1) @ right).reshape(len(left), -1)
 
 
 def _pulls(derivative: Floats, residual: Floats) -> Floats:
