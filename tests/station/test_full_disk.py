@@ -74,7 +74,7 @@ class Drone:
         )
         self._held, self.stop = HeldFootage(footage, before=32), threading.Event()
         url = stream_url(station.url, "scout")
-        settings = StreamSettings(speed=4.0, flush_s=0.5)
+        settings = StreamSettings(speed=2.0, flush_s=0.5)
         self.client = StreamClient(
             self._held, Spool(spool, 50_000_000), url, "", settings, self.stop
         )

@@ -18,6 +18,7 @@ from starlette.testclient import TestClient
 
 from small_flights import simulate_into, small_flight
 from sorvolo.errors import StoreError
+from sorvolo.missions.worker import Journal, Order, run_watch, work
 from sorvolo.station import runs as runs_module
 from sorvolo.station.app import station_app
 from sorvolo.station.orders import InputWish, RunOrder, RunWish
@@ -265,6 +266,34 @@ def test_a_watch_that_is_stopped_keeps_what_it_found_and_states_that_it_was(tmp_
         "stopped before the flight's end: "
     )
     assert done["progress"]["frames"] < done["progress"]["frames_expected"]
+
+
+def test_a_stop_between_two_frames_keeps_what_a_watch_found(
+    flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A signal strikes anywhere, also while the journal is written: what the watch found is no less there."""
+    struck: list[int] = []
+
+    def strike(journal: Journal, data: dict[str, Any]) -> None:
+        if not struck:
+            struck.append(data["searched"])
+            signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(Journal, "progress", strike)
+    handlers = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)}
+    video, out = str(flown / "flight1" / "flight1.mp4"), tmp_path / "watch"
+    order = Order("watch", "", video, folder=str(out), options={"model": "default"})
+    try:
+        with (tmp_path / "lines").open("wb") as file:
+            journal = Journal(file)
+            code = work(order, journal, lambda stop: run_watch(order, journal, stop.until))
+    finally:
+        for each, handler in handlers.items():
+            signal.signal(each, handler)
+    last = json.loads((tmp_path / "lines").read_text().splitlines()[-1])
+    assert (last["type"], code) == ("run.finished", 3), last
+    assert last["data"]["headline"].startswith("stopped before the flight's end: ")
+    assert struck == [1] and (out / "report.json").is_file()
 
 
 DEAF = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('ready', flush=True); time.sleep(60)"

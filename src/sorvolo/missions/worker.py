@@ -132,13 +132,16 @@ class Journal:
 
 
 class Stop:
-    """The first signal ends a live source, whose flight is then finished. Any other signal stops the mission."""
+    """The first signal ends a live source, whose flight is then finished, and a watch, which writes what it found.
 
-    def __init__(self, *, is_live: bool) -> None:
+    Any other signal stops the mission wherever it is.
+    """
+
+    def __init__(self, *, is_live: bool, is_watch: bool) -> None:
         self.until = threading.Event()
         self.why = ""  # it is stopped although nobody asked for that
         self.cuts_short = False  # a recorded flight was not searched to its end
-        self._is_live = is_live
+        self._is_live, self._is_watch = is_live, is_watch
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._take)
 
@@ -150,19 +153,21 @@ class Stop:
         os.kill(os.getpid(), signal.SIGTERM)
 
     def _take(self, _: int, __: FrameType | None) -> None:
-        if self._is_live and not self.until.is_set():
+        is_first = not self.until.is_set()
+        self.cuts_short = not (self._is_live and is_first)
+        if is_first and (self._is_live or self._is_watch):
             self.until.set()
             return
-        self.cuts_short = True
         raise KeyboardInterrupt
 
 
-def work(source: str, journal: Journal, fly: Callable[[Stop], Done]) -> int:
+def work(order: Order, journal: Journal, fly: Callable[[Stop], Done]) -> int:
     """Run a mission over a source; its last line and exit code state how it ended.
 
     The details of an error that is none of ours go to standard error.
     """
-    stop = Stop(is_live=is_live_address(source))
+    source = order.source
+    stop = Stop(is_live=is_live_address(source), is_watch=order.mission == "watch")
     try:
         done = fly(stop)
     except KeyboardInterrupt:
@@ -569,7 +574,7 @@ def main() -> int:
     order = Order(**json.loads(sys.stdin.buffer.readline()))
     threading.Thread(target=_end_with_parent, daemon=True).start()
     mission = MISSIONS[order.mission]
-    return work(order.source, journal, lambda stop: mission(order, journal, stop.until))
+    return work(order, journal, lambda stop: mission(order, journal, stop.until))
 
 
 def _end_with_parent() -> None:

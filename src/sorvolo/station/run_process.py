@@ -35,7 +35,7 @@ def main(folder: Path) -> int:
     order = RunOrder.read(folder)
     with (folder / JOURNAL_FILE).open("ab") as file:
         journal = Journal(file)
-        return work(order.source, journal, lambda stop: _fly_watched(order, folder, journal, stop))
+        return work(order, journal, lambda stop: _fly_watched(order, folder, journal, stop))
 
 
 def _fly_watched(order: RunOrder, folder: Path, journal: Journal, stop: Stop) -> Done:
