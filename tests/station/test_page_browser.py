@@ -1083,6 +1083,21 @@ def running(served: Served, page: Any, *runs: str) -> None:
         page.locator(".run.running", has_text=run.removeprefix("run-").capitalize()).wait_for()
 
 
+def test_an_older_list_of_missions_that_comes_later_hides_none(
+    served: Served, opened: Watched
+) -> None:
+    page = opened.page
+    page.locator("#rooms [data-panel=live]").click()
+    held: list[Any] = []
+    page.route(re.compile(r"/api/runs\?"), lambda route: held.append(route))
+    served.station.events.append(NewEvent("run.started", {"id": "run-x"}, "field", "run-x"))
+    wait_for(lambda: page.wait_for_timeout(20) or held)
+    running(served, page, "run-map")
+    held[0].fulfill(json=[])
+    page.wait_for_timeout(200)
+    assert page.locator(".run.running").count() == 1
+
+
 def test_a_flight_is_followed_live(served: Served, opened: Watched) -> None:
     page = opened.page
     lon, lat = changes(served)[0]["geometry"]["coordinates"][0][0]

@@ -187,7 +187,10 @@ class SiteScreen {
   }
 
   async loadRuns() {
-    this.runs = await get(`/api/runs?site=${encodeURIComponent(this.data.id)}`);
+    const asked = this.asked = get(`/api/runs?site=${encodeURIComponent(this.data.id)}`);
+    const runs = await asked;
+    if (asked !== this.asked) return this.asked; // an older answer that came later
+    this.runs = runs;
     this.opened?.running?.();
     this.video?.look();
     this.tell();
