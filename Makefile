@@ -11,9 +11,9 @@ TRAINS := $(VENV)/.trains
 demo: $(READY)
 	$(BIN)/sorvolo demo demo-site
 
-# One worker more than two cores: a quarter of the tests' time is waiting for streams, processes and browsers.
+# Two workers more than two cores: much of the tests' time is waiting for streams, processes and browsers.
 test: check $(TRAINS)
-	$(BIN)/python -m pytest -n 3 --dist worksteal -m "not long"
+	$(BIN)/python -m pytest -n 4 --dist worksteal -m "not long"
 
 test-long: $(TRAINS)
 	$(BIN)/python -m pytest -m long
