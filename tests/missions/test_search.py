@@ -4,6 +4,7 @@ import json
 import re
 from dataclasses import asdict, replace
 from pathlib import Path
+from shutil import copy, copytree
 from typing import Any
 
 import numpy as np
@@ -84,6 +85,28 @@ def test_a_blind_detector_finds_nothing_and_the_headline_reports_it(
     assert sum(report["classes"]["car"]["holes_m2"].values()) == pytest.approx(
         report["classes"]["car"]["area_m2"]
     )
+
+
+def test_a_flight_without_a_place_is_left_out_and_named(
+    site: Path, photographed: Path, tmp_path: Path
+) -> None:
+    """Its key frames are gone: the other flight is measured all the same."""
+    both, photos = tmp_path / "site", tmp_path / "later"
+    copytree(site, both)
+    photos.mkdir()
+    for each in sorted((photographed / "flight1" / "photos").glob("*.jpg"))[:7]:
+        copy(each, photos)
+    settings = MapSettings(model="none")
+    map_flights([photos], both, settings, camera=photographed / "camera.xml").result()
+    for each in both.rglob("flights/later/**/*.*p*g"):
+        each.unlink()
+    with pytest.warns(match="gone"):
+        report = _report(both, tmp_path / "out", Comparing(site), replace(_CARS, plants=10))
+    assert [each["name"] for each in report["flights"]] == ["photos"]
+    assert "; no frame of later has a place" in report["headline"]["text"]
+    assert not report["headline"]["complete"]
+    with pytest.raises(InputError, match="no mapped flight with a place"), pytest.warns():
+        _report(both, tmp_path / "none", Comparing(site), _CARS, flights=("later",))
 
 
 def _triangles(site: Path, path: Path, *away_deg: float, swapped: bool = False) -> Path:

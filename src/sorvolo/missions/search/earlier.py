@@ -3,13 +3,11 @@
 import json
 from collections import deque
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
 from sorvolo.build import build
-from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import PointsM
 from sorvolo.missions.flight.request import software
 from sorvolo.missions.search.measure import (
@@ -180,12 +178,13 @@ class EarlierFlights:
         self._measured: list[tuple[Cells, MeasuredFlight]] = []
         self.frames: dict[str, tuple[SearchFrame, ...]] = {}
         """Of the flights that count, by their names."""
+        self.unplaced: list[str] = []
         self._outlines_m: dict[str, list[PointsM]] = {}
         for name in flights_to_search(archive, ()):
-            frames: list[SearchFrame] = []
-            with suppress(InputError):  # one that would have to be mapped again has none
-                frames = [] if name == but else search_frames(archive, name)
-            if not frames:
+            if name == but:
+                continue
+            if not (frames := search_frames(archive, name)):
+                self.unplaced.append(name)
                 continue
             self._outlines_m[name] = [each.placed.outline_m for each in frames]
             above, mark = marked_heights(archive, name)

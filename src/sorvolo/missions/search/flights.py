@@ -53,10 +53,11 @@ def search_site(
         site = site_with_metres(archive)
         check_area(area, site)
         names = flights_to_search(archive, outputs.flights)
-        frames = {name: search_frames(archive, name) for name in names}
+        frames = {name: own for name in names if (own := search_frames(archive, name))}
         if not frames:
             raise InputError(
-                f"{site_folder} has no mapped flight: sorvolo map INPUT --site {site_folder} makes one"
+                f"{site_folder} has no mapped flight with a place on the ground: sorvolo map INPUT --site {site_folder} "
+                "makes one"
             )
         outlines_m = [each.placed.outline_m for own in frames.values() for each in own]
         cells = cells_of(outlines_m, site, None if area is None else area.polygons_m(site.frame))
@@ -70,6 +71,7 @@ def search_site(
             {name: tuple(own) for name, own in frames.items()},
             prepared.segments,
             [name for name in frames if name not in looked],
+            [name for name in names if name not in frames],
             prepared.cut_outs,
         )
         return write_search(

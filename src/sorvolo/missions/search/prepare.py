@@ -55,17 +55,12 @@ def _mapped(archive: Archive) -> list[str]:
 
 
 def search_frames(archive: Archive, flight_id: str) -> list[SearchFrame]:
-    """The frames of a flight that have a place. Raises InputError where none has."""
-    frames = [
+    """The frames of a flight that have a place."""
+    return [
         frame
         for stored in archive.sound_keyframes(flight_id)
         if (frame := search_frame(archive, stored)) is not None
     ]
-    if not frames:
-        raise InputError(
-            f"no frame of the flight {flight_id} has a place on the ground; map it again"
-        )
-    return frames
 
 
 def search_frame(archive: Archive, stored: StoredKeyframe) -> SearchFrame | None:

@@ -88,7 +88,8 @@ class SoFar:
 @dataclass(frozen=True, eq=False)
 class Searched:
     """All that was measured of a site; `segments` are names, areas and the probability that the missing is in each.
-    `unlooked` are flights in whose own pictures nobody looked for the first class: only their plants were."""
+    `unlooked` are flights in whose own pictures nobody looked for the first class: only their plants were. `unplaced`
+    could not be measured: none of their frames has a place."""
 
     site: Site
     cells: Cells
@@ -96,6 +97,7 @@ class Searched:
     frames: Mapping[str, tuple[SearchFrame, ...]]
     segments: Sequence[tuple[str, Area, float]]
     unlooked: Sequence[str] = ()
+    unplaced: Sequence[str] = ()
     cut_outs: tuple[CutOut, ...] = ()
 
     @property
@@ -227,12 +229,16 @@ def build_search_report(
         )
     )
     headline = {"text": text, "complete": is_complete, "hole_share": total}
-    if searched.unlooked:
-        names = ", ".join(searched.unlooked)
-        headline["text"] += (
-            f"; nobody has looked for a {first} in {names}: map it again with a model"
-        )
-        headline["complete"] = False
+    for flights, lack in (
+        (searched.unlooked, f"nobody has looked for a {first} in {{}}: map it again with a model"),
+        (
+            searched.unplaced,
+            "no frame of {} has a place on the ground, so it is left out: map it again",
+        ),
+    ):
+        if flights:
+            headline["text"] += "; " + lack.format(", ".join(flights))
+            headline["complete"] = False
     report = {
         "site": searched.site.name,
         "model": detector.info.name,

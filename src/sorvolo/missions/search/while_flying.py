@@ -239,6 +239,7 @@ class SearchWhileFlying:
             (*earlier.on(cells), flight),
             {**earlier.frames, flight.name: tuple(measure.frames)},
             self._prepared.segments,
+            unplaced=earlier.unplaced,
             cut_outs=self._prepared.cut_outs,
         )
 
