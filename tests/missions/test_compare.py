@@ -493,6 +493,8 @@ def test_steps_within_the_site_folder_are_refused(tmp_path):
     [
         lambda: CompareSettings(votes=4, voters=3),
         lambda: CompareSettings(views_per_second=0.0),
+        lambda: CompareSettings(method="nope"),
+        lambda: MapSettings(method=ThesisComparison()),
     ],
 )
 def test_settings_are_checked(make: Callable[[], object]):

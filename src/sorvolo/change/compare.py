@@ -1,7 +1,7 @@
 """What changed between two aligned pictures: the room's public function."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ class Comparison(NamedTuple):
     boxes: Boxes
 
 
+@runtime_checkable
 class PairMethod(Protocol):
     """Another way to compare two aligned pictures than the robust one. A frozen record of its own choices."""
 

@@ -137,11 +137,12 @@ class Stop:
     Any other signal stops the mission wherever it is.
     """
 
-    def __init__(self, *, is_live: bool, is_watch: bool) -> None:
+    def __init__(self, order: Order) -> None:
         self.until = threading.Event()
         self.why = ""  # it is stopped although nobody asked for that
         self.cuts_short = False  # a recorded flight was not searched to its end
-        self._is_live, self._is_watch = is_live, is_watch
+        self._is_live = is_live_address(order.source)
+        self._ends_well = self._is_live or order.mission == "watch"
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._take)
 
@@ -155,7 +156,7 @@ class Stop:
     def _take(self, _: int, __: FrameType | None) -> None:
         is_first = not self.until.is_set()
         self.cuts_short = not (self._is_live and is_first)
-        if is_first and (self._is_live or self._is_watch):
+        if is_first and self._ends_well:
             self.until.set()
             return
         raise KeyboardInterrupt
@@ -166,8 +167,7 @@ def work(order: Order, journal: Journal, fly: Callable[[Stop], Done]) -> int:
 
     The details of an error that is none of ours go to standard error.
     """
-    source = order.source
-    stop = Stop(is_live=is_live_address(source), is_watch=order.mission == "watch")
+    stop, source = Stop(order), order.source
     try:
         done = fly(stop)
     except KeyboardInterrupt:

@@ -3,7 +3,7 @@
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from sorvolo.change.compare import PairMethod
 from sorvolo.errors import SettingsError
@@ -67,6 +67,16 @@ def check_telemetry(offset_s: float | None, ground_elevation_m: float | None) ->
         )
 
 
+def check_method(method: object, kind: type) -> None:
+    """Raise SettingsError for what cannot map or compare; `kind` is the protocol that it would have to follow."""
+    if method is not None and not isinstance(method, kind):
+        raise SettingsError(
+            f"method must be None or an object that is a {kind.__name__}, got {method!r}; those of the thesis are "
+            "sorvolo.lab.thesis.mapping.ThesisMapping() and sorvolo.lab.thesis.changes.ThesisComparison()"
+        )
+
+
+@runtime_checkable
 class MapMethod(Protocol):
     """Another way to map a flight than fitting all of its frames together. A frozen record of its own choices."""
 
@@ -112,6 +122,7 @@ class MapSettings:
 
     def __post_init__(self) -> None:
         take_one_or_several(self, "classes", "checks")
+        check_method(self.method, MapMethod)
         check_enough(self.enough_looked_at)
         memory_budget_bytes(self.memory_mb)
         if not 1e-4 <= self.control_sigma_m <= 100:
@@ -155,6 +166,7 @@ class CompareSettings:
 
     def __post_init__(self) -> None:
         take_one_or_several(self, "classes")
+        check_method(self.method, PairMethod)
         check_enough(self.enough_looked_at)
         if not 0.05 <= self.views_per_second <= 240:
             raise SettingsError(
