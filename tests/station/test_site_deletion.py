@@ -6,7 +6,7 @@ import shutil
 from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import pytest
 from fake_flights import SITE, map_flight
@@ -14,6 +14,7 @@ from starlette.testclient import TestClient
 from watch_runs import watch_run
 
 from sorvolo.station.app import station_app
+from sorvolo.station.orders import LOCK_FILE
 from sorvolo.station.runs import Run
 from sorvolo.station.settings import StationSettings
 from sorvolo.station.state import StationState, compact_json, utc_now
@@ -32,15 +33,17 @@ def mark_of(client: TestClient, path: str = FIELD) -> dict[str, str]:
     return {"if-match": client.get(f"{path}/deletion").headers["etag"]}
 
 
-def keep_run(client: TestClient, run: str, state: str) -> None:
-    """A watch of the site `field` in some state, as the station keeps it."""
+def keep_run(client: TestClient, run: str, state: str) -> IO[str]:
+    """A watch of the site `field` in some state, as the station keeps it; its lock: held, as by the run's process."""
     station = client.app.state.station  # type: ignore[attr-defined]
-    watch_run(station, run)
+    lock = (watch_run(station, run).parent / LOCK_FILE).open("w")
+    fcntl.flock(lock, fcntl.LOCK_EX)
     record = asdict(Run(run, "watch", "field", state, "ada", utc_now()))
     with station.state.changing() as connection:
         connection.execute(
             "UPDATE runs SET state = ?, record = ? WHERE id = ?", (state, compact_json(record), run)
         )
+    return lock
 
 
 def events(client: TestClient) -> list[tuple[str, str | None]]:
@@ -238,5 +241,5 @@ def test_a_site_is_renamed_and_its_addresses_stay(client: TestClient, root: Path
     for wrong in ("", " ", "n" * 81):
         assert client.put(f"{FIELD}/name", json={"name": wrong}).status_code == 422
     assert client.put("/api/sites/nowhere/name", json={"name": "x"}).status_code == 404
-    keep_run(client, "feed", "running")
-    assert client.put(f"{FIELD}/name", json={"name": "x"}).status_code == 409
+    with keep_run(client, "feed", "running"):
+        assert client.put(f"{FIELD}/name", json={"name": "x"}).status_code == 409
