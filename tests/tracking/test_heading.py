@@ -12,6 +12,7 @@ from sorvolo.tracking.headings import (
     HeadingFromMotion,
     HeadingTurn,
     Way,
+    contradiction,
     heading_deg,
     righted,
 )
@@ -180,3 +181,36 @@ def test_a_strip_without_a_turn_shows_no_tilt() -> None:
     assert way.beside_sigma_m > 4
     prior = CameraPrior(np.array([80.0, 0.0, 50.0]), np.ones(3), np.diag([1.0, -1, -1]), np.ones(3))
     assert np.allclose(righted(prior, way, 0.0).rotation, prior.rotation, atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("ahead_s", "strip_m", "words"),
+    [
+        (3, 60, "about -3.0 s more"),
+        (8, 60, "about -8.0 s more"),
+        (-8, 60, "about +8.0 s more"),
+        (15, 60, "about -15.0 or +15.0 s more"),  # strips to and fro repeat themselves
+        (
+            8,
+            30,
+            "mirror image: latitude and longitude swapped, or a sign lost, or its clock is off: about -8.0",
+        ),  # and half a lap on they are each other's mirror image
+        (0, 60, ""),
+    ],
+)
+def test_a_clock_that_is_off_is_named_with_every_offset_that_fits(
+    ahead_s: float, strip_m: float, words: str
+) -> None:
+    """Four seconds were searched, and "about -4.0" or a mirror image was said of clocks that are farther off."""
+    rng, times_s = np.random.default_rng(1), np.arange(5.0, 65.0, 0.5)
+    corners = np.cumsum([0, *[strip_m, 15j, -strip_m, 15j] * 4])
+    passed_s = np.append(0.0, np.cumsum(np.abs(np.diff(corners)))) / 5
+    told_m = np.interp(times_s + ahead_s, passed_s, corners)
+    told_m = told_m + 0.2 * (rng.normal(size=(2, len(times_s))) * [[1], [1j]]).sum(axis=0)
+    seen_px = np.interp(times_s, passed_s, corners) * np.exp(0.4j) * 400 / 30
+    places = [
+        (1, round(time_s * 1e9), seen, told, 30.0)
+        for time_s, seen, told in zip(times_s, seen_px, told_m)
+    ]
+    found = contradiction(places, 400.0, knows_tilt=True)
+    assert words in found and bool(found) is bool(words)

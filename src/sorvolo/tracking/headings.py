@@ -128,8 +128,10 @@ _APART = (
     "its positions do not follow the pictures: a receiver that stopped, a wrong clock, or a camera "
     "that looks elsewhere than stated"
 )
-_LATE = "its clock is off: about {:+.1f} s more --offset fits the pictures"
-_SHIFTS_S = np.arange(-4.0, 4.01, 0.25)
+_LATE = "its clock is off: about {} s more --offset fits the pictures"
+_SHIFTS_S = np.arange(-20.0, 20.01, 0.25)
+_COVERED = 0.6  # of a stretch's pictures that telemetry must place at a shift
+_APART_S = 2.0  # between shifts that are named each where they fit alike
 _LATE_S = 0.75  # receivers lag, and clocks of one second round, by less; by choice
 _TILT = 0.21  # of the height, on the ground: 12 degrees
 _HEIGHTS = (
@@ -143,7 +145,9 @@ def contradiction(places: Sequence[SeenPlace], fx_px: float, *, knows_tilt: bool
 
     Without `knows_tilt` a camera that does not look straight down is a while ahead, or behind, all the way.
     """
-    reasons, later_s = list[str](), list[float]()
+    reasons, late_m = list[str](), list[list[float]]()
+    every_s = np.array([time_ns / 1e9 for _, time_ns, *_ in places])
+    every_m = np.array([told_m for *_, told_m, _ in places])
     for _, stretch in groupby(places, lambda each: (each[0], (each[1] - places[0][1]) // _WAY_NS)):
         _, time_ns, seen_px, told_m, height_m = np.array([*stretch]).T
         up_m, times_s = float(np.median(height_m.real)), time_ns.real / 1e9
@@ -158,17 +162,19 @@ def contradiction(places: Sequence[SeenPlace], fx_px: float, *, knows_tilt: bool
         misses_m = []
         for shift_s in _SHIFTS_S:
             at_s = times_s + shift_s
-            inside = (at_s >= times_s[0]) & (at_s <= times_s[-1])
-            then_m = np.interp(at_s[inside], times_s, told_m)
-            misses_m.append(_miss_m(seen_m[inside], then_m) if len(then_m) > 4 else np.inf)
+            inside = (at_s >= every_s[0]) & (at_s <= every_s[-1])
+            then_m = np.interp(at_s[inside], every_s, every_m)
+            is_covered = inside.mean() > _COVERED
+            misses_m.append(_miss_m(seen_m[inside], then_m) if is_covered else np.inf)
         best_s = float(_SHIFTS_S[int(np.argmin(misses_m))])
         gone_m = abs(np.interp(times_s + best_s, times_s, told_m) - told_m).mean()
         is_late = abs(best_s) >= _LATE_S and gone_m > (0.0 if knows_tilt else _TILT) * up_m
+        if is_late and miss_m > max(_MISS_M, 2 * min(misses_m)):
+            late_m.append(misses_m)
         if abs(fit[1]) > 2 * abs(fit[0]) and miss_m > max(_MISS_M, 2 * left_m):
             reasons.append(_MIRRORED)
-        elif is_late and miss_m > max(_MISS_M, 2 * min(misses_m)):
+        elif late_m and late_m[-1] is misses_m:
             reasons.append(_LATE)
-            later_s.append(best_s)
         elif miss_m >= _ASTRAY * told_way_m:
             reasons.append(_APART)
         else:
@@ -177,7 +183,14 @@ def contradiction(places: Sequence[SeenPlace], fx_px: float, *, knows_tilt: bool
     worst = max(filter(None, reasons), key=reasons.count, default="")
     if 4 * reasons.count(worst) <= len(reasons):
         return ""
-    return worst.format(np.median(later_s or 0.0))
+    if worst not in (_MIRRORED, _LATE) or not late_m:
+        return worst
+    together_m = np.ma.masked_invalid(late_m).mean(axis=0).filled(np.inf)
+    alike = np.flatnonzero(together_m <= 2 * max(together_m.min(), _MISS_M / 4))
+    apart = np.split(alike, np.flatnonzero(np.diff(_SHIFTS_S[alike]) > _APART_S) + 1)
+    fits_s = [float(_SHIFTS_S[each[np.argmin(together_m[each])]]) for each in apart]
+    late = _LATE.format(" or ".join(f"{each:+.1f}" for each in sorted(fits_s, key=abs)))
+    return late if worst == _LATE else f"{_MIRRORED}, or {late}"
 
 
 def _miss_m(seen_m: NDArray[np.complex128], told_m: NDArray[np.complex128]) -> float:
