@@ -24,6 +24,7 @@ from sorvolo.missions.flight.headline import (
     MapQuality,
     _angle_warnings,
     clock_doubts,
+    clock_remarks,
     map_headline,
     unlevelled,
 )
@@ -82,6 +83,19 @@ def test_a_clock_that_the_pictures_contradict_is_never_silent() -> None:
         frames, flight_figures(frames, _CAMERA.fx_px), is_video=True, others=[text]
     )
     assert doubted.quality is MapQuality.DOUBTFUL
+
+
+def test_a_clock_without_a_witness_is_said_to_be_unchecked() -> None:
+    """A straight flight fits any offset: nan is left over at its clock's own."""
+    setup = SimpleNamespace(clock=SimpleNamespace(tie="both carry UTC", sigma_s=2.0))
+    for sigma_s in (np.inf, 5.0):
+        unseen = OffsetEstimate(0.0, sigma_s, np.nan, np.nan)
+        assert clock_doubts(setup, unseen, None) == []
+        (remark,) = clock_remarks(setup, unseen)
+        assert "could not be checked (both carry UTC)" in remark and "includes 2 s" in remark
+    assert clock_remarks(setup, OffsetEstimate(0.1, 0.2, 0.5, 0.5)) == []
+    setup.clock.sigma_s = 0.35  # each photo's own fix
+    assert clock_remarks(setup, OffsetEstimate(0.0, np.inf, np.nan, np.nan)) == []
 
 
 def test_frames_that_fit_each_other_are_a_map() -> None:

@@ -13,6 +13,7 @@ from sorvolo.capture.video import VideoSource
 from sorvolo.geometry.camera import Camera
 from sorvolo.missions.flight.headline import (
     clock_doubts,
+    clock_remarks,
     flight_warnings,
     map_headline,
     place_doubts,
@@ -165,6 +166,7 @@ def build_report(
         "notices": [asdict(each) for each in (*source.telemetry.notices, *setup.notices, *notices)],
         "warnings": [
             *flight_warnings(placed, figures, setup, log, agreement, plane, others),
+            *clock_remarks(setup, None if settings.offset_s is not None else result.offset),
             *([coarse] if is_coarse else ()),
             *(result.control.remarks if result.control else ()),
         ],
