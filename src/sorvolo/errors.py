@@ -2,6 +2,8 @@
 
 import errno
 import re
+from enum import EnumMeta
+from typing import get_args, get_type_hints
 
 _ARGUMENT_OF = {  # options whose argument in Python is not called the same
     "at": "places", "cell": "cell_m", "check": "checks", "fps": "frames_per_second", "gcp": "control",
@@ -38,6 +40,16 @@ class GeometryError(SorvoloError):
 
 class SettingsError(SorvoloError):
     """A setting or option is out of its range or contradicts another."""
+
+
+def check_choices(record: object) -> None:
+    """Raise SettingsError for a record, while it is made, with a field that is none of its Literal's or enum's words."""
+    for name, kind in get_type_hints(type(record)).items():
+        known = list(kind) if isinstance(kind, EnumMeta) else get_args(kind)
+        texts = [each for each in known if isinstance(each, str)]
+        value = getattr(record, name)
+        if texts and len(texts) == len(known) and value not in texts:
+            raise SettingsError(f"{name} must be one of {', '.join(texts)}, got {value!r}")
 
 
 class StoreError(SorvoloError):

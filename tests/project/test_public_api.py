@@ -4,8 +4,10 @@ import inspect
 import os
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import is_dataclass
+from enum import EnumMeta
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_origin, get_type_hints
 
 import numpy as np
 import pytest
@@ -74,6 +76,21 @@ def test_records_of_outputs_take_text() -> None:
     assert sorvolo.WatchOutputs(folder="found").folder == Path("found")  # type: ignore[arg-type]
     outputs = sorvolo.SearchOutputs("results", refly=("holes.kmz",))  # type: ignore[arg-type]
     assert (outputs.folder, outputs.refly) == (Path("results"), (Path("holes.kmz"),))
+
+
+def test_a_word_that_is_no_choice_is_refused_by_the_record() -> None:
+    """Also by every public record that gains such a field: a batch with the mission "nope" was made in silence."""
+    tried = []
+    for name in sorvolo.__all__:
+        record = getattr(sorvolo, name)
+        if not (is_dataclass(record) and name.endswith(("Settings", "Outputs"))):
+            continue
+        for field, kind in get_type_hints(record).items():
+            if isinstance(kind, EnumMeta) or get_origin(kind) is Literal:
+                with pytest.raises(sorvolo.SettingsError, match=f"{field} must be one of .*'nope'"):
+                    record(**{field: "nope"})
+                tried.append(f"{name}.{field}")
+    assert len(tried) >= 4, tried
 
 
 def test_every_type_that_a_public_function_takes_or_gives_is_public() -> None:

@@ -24,7 +24,7 @@ from sorvolo.cluster.flights import (
     find_flights,
     sites_of,
 )
-from sorvolo.errors import SettingsError, StoreError
+from sorvolo.errors import SettingsError, StoreError, check_choices
 from sorvolo.missions.flight.request import software
 from sorvolo.missions.worker import Order
 from sorvolo.store.atomic import atomic_write_bytes, make_folder, take_lock, writing
@@ -64,6 +64,7 @@ class BatchSettings:
         from sorvolo.detection.session import read_info
         from sorvolo.missions.flight.settings import MapSettings
 
+        check_choices(self)
         MapSettings(m_per_px=self.m_per_px)  # states what is out of range
         if self.model not in ("none", "default"):
             demand_searching(read_info(find_model(self.model)))

@@ -10,7 +10,7 @@ from sorvolo.capture.camera_presets import find_presets
 from sorvolo.detection.models import demand_searching, find_model
 from sorvolo.detection.session import read_info
 from sorvolo.detection.tiling import needed_px_per_m
-from sorvolo.errors import InputError, SettingsError
+from sorvolo.errors import InputError, SettingsError, check_choices
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.planning import (
     BOTTOM_CRITICAL_M,
@@ -71,6 +71,7 @@ class PlanSettings:
     strip_bearing_deg: float | None = None  # clockwise from north; None: along the area
 
     def __post_init__(self) -> None:
+        check_choices(self)
         if not self.max_height_m > 0:
             raise SettingsError(f"--max-height must be positive, got {self.max_height_m} m")
         if self.height_m is not None and self.height_m > self.max_height_m:

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.sparse import lil_array
 from scipy.sparse.linalg import spsolve
 
-from sorvolo.errors import SettingsError
+from sorvolo.errors import SettingsError, check_choices
 from sorvolo.geometry.arrays import (
     Bytes,
     Descriptors,
@@ -54,8 +54,7 @@ class RoiStitchingSettings:
     ransac_px: float = 3.0  # OpenCV's own for homographies
 
     def __post_init__(self) -> None:
-        if self.transform not in ("similarity", "homography"):
-            raise SettingsError(f"transform is {self.transform!r}; give similarity or homography")
+        check_choices(self)
         if self.max_features < 1:
             raise SettingsError(f"max_features is {self.max_features}; give 1 or more")
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from sorvolo.errors import SettingsError
+from sorvolo.errors import SettingsError, check_choices
 
 
 @dataclass(frozen=True)
@@ -20,13 +20,7 @@ class TrainSettings:
     patience: int = 8  # checks without a better AP50 before it stops; 0 never does
 
     def __post_init__(self) -> None:
-        choices = (
-            ("preset", self.preset, ("fast", "thesis")),
-            ("rpn", self.rpn, ("standard", "extended")),
-        )
-        for name, value, known in choices:
-            if value not in known:
-                raise SettingsError(f"{name} must be one of {', '.join(known)}, got {value!r}")
+        check_choices(self)
         for name, number, low, high in (
             ("steps", self.steps, 1, 10**8),
             ("batch", self.batch, 1, 1024),

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from sorvolo.errors import SettingsError
+from sorvolo.errors import SettingsError, check_choices
 from sorvolo.missions.flight.looked_at import ENOUGH_LOOKED_AT, check_enough
 from sorvolo.missions.flight.settings import check_telemetry
 from sorvolo.missions.watch import alerts
@@ -74,8 +74,7 @@ class WatchOutputs:
         for name in ("folder", "below"):
             object.__setattr__(self, name, as_path(getattr(self, name)))
         take_one_or_several(self, "labels")
-        if self.save not in ("none", "video", "pictures"):
-            raise SettingsError(f"save must be none, video or pictures, got {self.save!r}")
+        check_choices(self)
         if unknown := sorted(set(self.labels) - set(_LABEL_FORMATS)):
             raise SettingsError(
                 f"labels are written as {' and '.join(_LABEL_FORMATS)}, not as {unknown[0]!r}"
