@@ -216,7 +216,7 @@ def begun_and_ended(
         if by_change or (is_known and _can_be_missed(found.sightings)):
             yield ChangeKind.APPEARED, found
     for found in standing:
-        if found.gone == after and any(each in found.dates for each in before):
+        if found.gone == after and any(each in before for each in found.dates):
             yield ChangeKind.DISAPPEARED, found
 
 

@@ -1,5 +1,6 @@
 """The register as features on Earth: what missions of a site and its watches found, each thing once."""
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
@@ -20,7 +21,7 @@ from sorvolo.paths import Json
 from sorvolo.store.exports.change_files import finding_feature, objects_geojson
 from sorvolo.store.exports.plain import rounded
 from sorvolo.store.site.archive import Archive
-from sorvolo.store.site.change_records import StoredObject
+from sorvolo.store.site.change_records import StoredChange, StoredObject
 from sorvolo.survey.flight import Site
 from sorvolo.survey.objects import PERSON
 
@@ -57,11 +58,14 @@ def found_features(
     features = [_feature(each, site, objects, watched) for each in ordered(register.findings)]
     if archive is not None:
         properties = {each["id"]: each["properties"] for each in features}
-        flights = list(dict.fromkeys(each.flight_id for each in archive.versions()))
-        for number, flight in enumerate(flights[1:], 1):
-            changes = archive.changes(flight)
-            for kind, each in untold(register, changes, set(flights[:number]), flight):
+        changes = defaultdict[str, list[StoredChange]](list)
+        for change in archive.changes():
+            changes[change.flight_id].append(change)
+        before = set[str]()
+        for flight in dict.fromkeys(each.flight_id for each in archive.versions()):
+            for kind, each in untold(register, changes[flight], before, flight):
                 properties[each.id]["untold"][flight] = kind
+            before.add(flight)
     return features
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 
 from sorvolo.errors import GeometryError
-from sorvolo.geometry.arrays import Floats, Mask, PointsM, frozen
+from sorvolo.geometry.arrays import Floats, Mask, PointsM, Rows, frozen
 from sorvolo.survey.mosaic import PlacedFrame
 
 _LOOKS = 2  # frames that must show a place before what was not found there is not there
@@ -66,6 +66,7 @@ class SearchedFrames:
 
     outlines_m: Floats
     searched_for: Mapping[str, Mask] | None = None
+    _trees: dict[str, shapely.STRtree] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "outlines_m", frozen(np.reshape(self.outlines_m, (-1, 4, 2))))
@@ -88,6 +89,13 @@ class SearchedFrames:
         if self.searched_for is None:
             return self.outlines_m
         return self.outlines_m[self.searched_for.get(label, np.zeros(len(self.outlines_m), bool))]
+
+    def shown(self, places_m: PointsM, label: str) -> Rows:
+        """How many frames that were searched for a class show each of the places (N, 2)."""
+        if label not in self._trees:
+            self._trees[label] = shapely.STRtree(shapely.polygons(self.for_class(label)))
+        places, _ = self._trees[label].query(shapely.points(places_m), predicate="intersects")
+        return np.bincount(places, minlength=len(places_m))
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,16 +120,12 @@ def looked_at(places_m: PointsM, labels: Sequence[str], searches: Sequence[Searc
     result = np.zeros(len(places_m), bool)
     for label in set(labels):
         own = np.flatnonzero([each == label for each in labels])
-        outlines_m = np.concatenate(
-            [np.zeros((0, 4, 2)), *(each.for_class(label) for each in searches)]
-        )
-        result[own] = _shown_often(places_m[own], outlines_m)
+        counts, frames = np.zeros(len(own), int), 0
+        for search in searches:
+            rare = np.flatnonzero(counts < _LOOKS)
+            if not rare.size:
+                break
+            frames += len(search.for_class(label))
+            counts[rare] += search.shown(places_m[own[rare]], label)
+        result[own] = counts >= max(min(_LOOKS, frames), 1)
     return result
-
-
-def _shown_often(places_m: PointsM, outlines_m: Floats) -> Mask:
-    needed = min(_LOOKS, len(outlines_m))
-    frames = shapely.STRtree(shapely.polygons(outlines_m))
-    shown, _ = frames.query(shapely.points(places_m), predicate="intersects")
-    counts = np.bincount(shown, minlength=len(places_m))
-    return np.asarray((counts >= needed) & (needed > 0), bool)
