@@ -173,7 +173,7 @@ def test_padding_is_what_training_fills_with(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     for size in ((33, 65), (5, 7), (64, 32)):
         picture = rng.integers(0, 256, (*size, 3)).astype(np.uint8)
-        batch = opened.input_from(picture)
+        batch = opened._padded(opened._shown(picture, 1.0))
         assert batch.shape[2] % 32 == batch.shape[3] % 32 == 0
         expected = np.full((*batch.shape[2:], 3), 114)
         expected[: size[0], : size[1]] = picture

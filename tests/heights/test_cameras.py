@@ -7,6 +7,7 @@ import pytest
 from scenes import hills_with_houses, photo, survey_views, texture
 
 from sorvolo.errors import InputError
+from sorvolo.geometry.arrays import ImageGray
 from sorvolo.geometry.pose import NADIR_CAMERA_NORTH_UP, Pose, rotation_from_vector
 from sorvolo.heights.adjustment import (
     AdjustmentSettings,
@@ -18,7 +19,7 @@ from sorvolo.heights.adjustment import (
     matched_deviations,
     triangulate,
 )
-from sorvolo.heights.cameras import Cameras3D, find_tracks, solve_tracks
+from sorvolo.heights.cameras import Cameras3D, Matches, find_tracks, solve_tracks
 from sorvolo.heights.figures import camera_warnings
 from sorvolo.heights.smooth_sigma import SmoothSigma
 from sorvolo.registration.features import gray_from_rgb
@@ -231,6 +232,24 @@ def test_one_strip_is_named_as_weak(survey) -> None:
     views, pictures = survey
     solved = solve_tracks(views[:4], find_tracks(views[:4], lambda number: pictures[number]))
     assert any("one strip" in each for each in camera_warnings(solved))
+
+
+def test_what_was_found_before_is_not_sought_again(survey) -> None:
+    """Two looks at more and more of a flight end in the points that one look at all of it finds."""
+    views, pictures = survey
+    before, opened = Matches(), list[int]()
+
+    def gray(number: int) -> ImageGray:
+        opened.append(number)
+        return pictures[number]
+
+    first, whole = find_tracks(views[:4], gray, before), find_tracks(views[:6], gray, before)
+    assert first.count > 50 and opened == [*range(6)]
+    alone = find_tracks(views[:6], lambda number: pictures[number])
+    for field in ("view", "point", "seen"):
+        np.testing.assert_array_equal(getattr(whole, field), getattr(alone, field))
+    before.shared.clear()
+    assert find_tracks(views[:6], gray, before).count == whole.count and len(opened) == 6
 
 
 def test_an_oblique_orbit_is_named_as_weak() -> None:

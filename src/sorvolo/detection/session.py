@@ -91,11 +91,6 @@ class Session:
             self._rest()
             self._buffer = np.zeros((1, 3, 0, 0), np.uint8)
 
-    def input_from(self, picture: ImageRGB) -> Planes:
-        """(1, 3, H, W) what the model is given for a picture, (H, W, 3): a size of its own, padded."""
-        with self._lock:
-            return self._padded(self._shown(picture, 1.0)).copy()
-
     def _shown(self, picture: ImageRGB, scale: float) -> ImageRGB:
         most = self.fixed_px or (math.inf, math.inf)
         return _resized(picture, min(scale, most[0] / picture.shape[0], most[1] / picture.shape[1]))

@@ -65,13 +65,33 @@ class Tracks:
     count: int
 
 
-def find_tracks(views: Sequence[View], gray: Callable[[int], ImageGray]) -> Tracks:
-    """The points that pictures have in common; `gray(i)` is the picture of view i at any size."""
-    found = [_features(gray(number), view) for number, view in enumerate(views)]
+@dataclass(eq=False)
+class Matches:
+    """What `find_tracks` found in a flight before: the last views' features, and what any two views share, by name."""
+
+    features: dict[str, "_Found"] = field(default_factory=dict)
+    shared: dict[tuple[str, str], NDArray[np.uint16]] = field(default_factory=dict)
+
+
+def find_tracks(
+    views: Sequence[View], gray: Callable[[int], ImageGray], before: Matches | None = None
+) -> Tracks:
+    """The points that pictures have in common; `gray(i)` is the picture of view i at any size.
+
+    What was found `before` in views that are as they were is not sought again; what is found now is added to it.
+    """
+    before = before or Matches()
+    found = [
+        before.features.get(view.name) or _features(gray(number), view)
+        for number, view in enumerate(views)
+    ]
+    before.features = {each.view.name: each for each in found}
     starts = np.concatenate([[0], np.cumsum([len(each.rays) for each in found])])
     left, right = [], []
     for i, j in _pairs(views):
-        matched = _shared(found[i], found[j])
+        names = views[i].name, views[j].name
+        if (matched := before.shared.get(names)) is None:
+            before.shared[names] = matched = _shared(found[i], found[j]).astype(np.uint16)
         if len(matched):
             left.append(starts[i] + matched[:, 0])
             right.append(starts[j] + matched[:, 1])

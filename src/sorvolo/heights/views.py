@@ -18,6 +18,8 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.ground import footprint
 from sorvolo.geometry.pose import Pose
 
+_SAMPLES = 12  # each way, of a picture
+
 
 @dataclass(frozen=True, eq=False)
 class View:
@@ -54,11 +56,11 @@ def outline_m(view: View, up_m: float = 0.0) -> PointsM:
     return footprint(view.camera, pose)
 
 
-def overlaps(views: list[View], samples: int = 12) -> Floats:
+def overlaps(views: list[View]) -> Floats:
     """(N, N) the share of view i's ground that view j sees, on level ground at height 0."""
     shares = np.zeros((len(views), len(views)))
     for i, view in enumerate(views):
-        grid = np.linspace(0.02, 0.98, samples)
+        grid = np.linspace(0.02, 0.98, _SAMPLES)
         x, y = np.meshgrid(grid * (view.camera.width_px - 1), grid * (view.camera.height_px - 1))
         rays = (
             view.camera.rays_from_pixels(np.column_stack([x.ravel(), y.ravel()]))
@@ -70,7 +72,7 @@ def overlaps(views: list[View], samples: int = 12) -> Floats:
         for j, other in enumerate(views):
             if j != i and len(ground):
                 shares[i, j] = (
-                    inside(other.pixels_from_site(ground), other.camera).sum() / samples**2
+                    inside(other.pixels_from_site(ground), other.camera).sum() / _SAMPLES**2
                 )
     return shares
 

@@ -8,6 +8,7 @@ from sorvolo.geometry.arrays import Mask, Matrix3, PointsPx
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.survey.mosaic import Features
 
+_RATIO = 0.85  # Lowe's
 _EMPTY = np.zeros((0, 2), np.int64)
 
 
@@ -16,7 +17,6 @@ def match(
     old: Features,
     new_from_old: Matrix3 | None,
     search_px: float,
-    ratio: float = 0.85,
 ) -> NDArray[np.int64]:
     """(N, 2) index pairs (new, old), nearest neighbours that pass Lowe's ratio test and are mutual.
 
@@ -39,7 +39,7 @@ def match(
         new.descriptors[keep_new], old.descriptors[keep_old], -1, normType=norm, K=count
     )
     accepted = (
-        np.flatnonzero(distance[:, 0] < ratio * distance[:, -1])
+        np.flatnonzero(distance[:, 0] < _RATIO * distance[:, -1])
         if count == 2
         else np.zeros(0, np.int64)
     )

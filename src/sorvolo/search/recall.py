@@ -20,6 +20,7 @@ _FARTHEST = 2.5  # standard deviations: beyond what plants covered, nothing is e
 _LEAST_SPREAD = 0.05  # of a condition: what hardly varies explains nothing
 _DRAWS = 400  # of the weights, for the interval
 _STEPS = 40  # of Newton's method, at most
+_PARTS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,11 +112,11 @@ def map_chances(recall: Recall | None, columns: Floats, hidden: Mask) -> Chances
     )
 
 
-def held_out_chances(columns: Floats, found: Mask, parts: int = 5) -> Floats:
-    """(N,) each plant's probability by a regression on the others: every `parts`-th is left out in turn."""
+def held_out_chances(columns: Floats, found: Mask) -> Floats:
+    """(N,) each plant's probability by a regression on the others: a fifth is left out in turn."""
     chances = np.full(len(found), np.nan)
-    for part in range(min(parts, len(found))):
-        out = np.arange(len(found)) % parts == part
+    for part in range(min(_PARTS, len(found))):
+        out = np.arange(len(found)) % _PARTS == part
         if out.any() and not out.all():
             chances[out] = fit_recall(columns[~out], found[~out]).of(columns[out]).mean
     return chances

@@ -18,6 +18,7 @@ from sorvolo.station.state import StationState, compact_json, utc_now
 
 _IN_MEMORY = 4000  # for browsers that come back after a break; older ones are read from the disk
 _AT_ONCE = 500  # in one answer, some 200 kB; by choice
+_MOST_KEPT = 200_000
 LOST = "events.lost"
 """What a page gets that asks for events that are no longer kept: it has to load the site anew."""
 
@@ -35,8 +36,8 @@ class NewEvent:
 class EventLog:
     """All events of a station. `append` adds some, each with the next number; threads may share it."""
 
-    def __init__(self, state: StationState, most_kept: int = 200_000) -> None:
-        self._state, self._most_kept = state, most_kept
+    def __init__(self, state: StationState) -> None:
+        self._state = state
         self._lock = threading.Lock()
         rows = state.rows("SELECT * FROM events ORDER BY seq DESC LIMIT ?", (_IN_MEMORY,))
         self._recent: deque[Json] = deque(
@@ -73,7 +74,7 @@ class EventLog:
                 yield connection
                 if made and made[-1]["seq"] % 1000 < len(made):
                     connection.execute(
-                        "DELETE FROM events WHERE seq <= ?", (made[-1]["seq"] - self._most_kept,)
+                        "DELETE FROM events WHERE seq <= ?", (made[-1]["seq"] - _MOST_KEPT,)
                     )
             self._recent.extend(made)
             self._last = made[-1]["seq"] if made else self._last

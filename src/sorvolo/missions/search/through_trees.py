@@ -14,7 +14,7 @@ from sorvolo.canopy.integral import LEAST_VIEWS, Floor, Picture, UnderTrees, lay
 from sorvolo.canopy.planting import PlantedFloor, free_share, plant_on_floor
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats32, ImageGray, ImageRGB, ImageRGBA, Numbers
-from sorvolo.heights.cameras import Cameras3D, find_tracks, solve_steady, solve_tracks
+from sorvolo.heights.cameras import Cameras3D, Matches, find_tracks, solve_steady, solve_tracks
 from sorvolo.heights.field import HeightField
 from sorvolo.heights.figures import camera_figures
 from sorvolo.heights.lattice import Lattice
@@ -115,13 +115,15 @@ def look_through_trees(
     before: Cameras3D | None = None,
     floor_m: tuple[float, float] = FLOOR_M,
     plants: int = 80,
+    matches: Matches | None = None,
     is_quick: bool = False,
 ) -> Generator[UnderTreesUpdate, None, LookedUnderTrees]:
     """Put a flight's views together on the floor, yielding progress.
 
     `opened` gives the pictures of views by number, the left-over distortion taken out; `sigma_m` is what places err by
-    where cameras are solved. `before` are cameras that were solved before; `is_quick` takes all tilts as one, and plants nothing. Raises
-    InputError for too few pictures, or without a floor in focus.
+    where cameras are solved. `before` are cameras that were solved before, `matches` what earlier looks at the
+    flight's views left; `is_quick` takes all tilts as one, and plants nothing. Raises InputError for too few pictures,
+    or without a floor in focus.
     """
     if len(views) < LEAST_VIEWS:
         raise InputError(
@@ -130,7 +132,7 @@ def look_through_trees(
         )
     yield UnderTreesUpdate(name, "cameras", 0)
     radial = 0.0, 0.0
-    solved, warning = _solved(views, opened(views, radial), before, is_quick=is_quick)
+    solved, warning = _solved(views, opened(views, radial), before, matches, is_quick=is_quick)
     if solved is not None:
         views, radial = solved.views, solved.radial
     unknown = np.zeros((0, 3)), np.nan, 1.0, radial, np.full(3, np.nan), 0
@@ -241,6 +243,7 @@ def _solved(
     views: Sequence[View],
     colour: Callable[[int], ImageRGB],
     before: Cameras3D | None,
+    matches: Matches | None,
     *,
     is_quick: bool,
 ) -> tuple[Cameras3D | None, str]:
@@ -255,7 +258,9 @@ def _solved(
 
     try:
         if before is None:
-            tracks = find_tracks(views, gray)
+            tracks = find_tracks(views, gray, matches)
+        if matches is not None and not is_quick:  # the last look
+            matches.features.clear()
         is_held = False
         if not is_quick:
             free = before or solve_tracks(views, tracks)

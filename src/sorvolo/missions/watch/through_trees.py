@@ -15,6 +15,7 @@ from sorvolo.capture.source import LiveSource
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.geometry.pose import Pose
+from sorvolo.heights.cameras import Matches
 from sorvolo.heights.views import View, inside
 from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.flight.setup import FlightSetup
@@ -75,6 +76,7 @@ class ThroughTrees:
         self._pictures, self._lock = SpillFile(folder), threading.Lock()
         self._thread = ThreadPoolExecutor(1, initializer=lower_priority)
         self._look: Future[LookedUnderTrees | InputError] | None = None
+        self._matches = Matches()
         self._looked = 0  # frames that looks began with
         self._shown_m: dict[int, dict[str, Floats]] = {}  # of all finds that were ever announced
         self._new: list[Track] = []
@@ -171,6 +173,7 @@ class ThroughTrees:
             {each.view.name: each.time_ns for each in frames},
             self._sigma_m,
             floor_m=_FLOOR_M,
+            matches=self._matches,
             is_quick=is_quick,
         )
         try:

@@ -101,7 +101,7 @@ def copy(
 
 
 def verify(
-    source: SiteEnd, copied: SiteEnd, scratch: Path, *, threads: int = 4
+    source: SiteEnd, copied: SiteEnd, scratch: Path
 ) -> Generator[CopyUpdate, None, CopyOutcome]:
     """Compare a copy with the site, each file by its SHA-256, writing nothing to either.
 
@@ -130,7 +130,7 @@ def verify(
         return "" if found == expected else "damaged" if file.sha256 else "differs"
 
     done = done_bytes = 0
-    for file, fault in zip(both, in_order(compare, both, threads=threads)):
+    for file, fault in zip(both, in_order(compare, both, threads=4)):
         if fault:
             faults[file.path] = fault
         done, done_bytes = done + 1, done_bytes + file.size
