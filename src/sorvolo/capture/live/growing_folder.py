@@ -43,6 +43,8 @@ class GrowingFolder:
 
     kind = "photos"
     is_live = True
+    is_reread = is_stream = False
+    skipped = 0
     frame_rate_hz = ground_elevation_m = nan
     telemetry_tie, telemetry_sigma_s = PHOTO_TIE, FIX_DELAY_S
 
@@ -95,26 +97,11 @@ class GrowingFolder:
         """Whether the next photo is there already, for whoever looks at them is slower than they come."""
         return bool(self._ready)
 
-    @property
-    def skipped(self) -> int:
-        """No photo is skipped."""
-        return 0
-
     def wait_for_first_fixes(self) -> None:
         """The first photo, which was waited for, has its own."""
 
     def wait_for_telemetry(self, time_ns: int) -> None:
         """Each photo carries its own fix."""
-
-    @property
-    def is_reread(self) -> bool:
-        """Photos that were taken are not taken again."""
-        return False
-
-    @property
-    def is_stream(self) -> bool:
-        """The photos stay."""
-        return False
 
     def samples(self, since: int) -> tuple[TimesNs, Floats]:
         """Positions after the first this many, as `FlightSoFar` has them."""
