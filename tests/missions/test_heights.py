@@ -27,7 +27,6 @@ from sorvolo.lab.simulation.settings import (
     SensorSettings,
     SimulationSettings,
 )
-from sorvolo.missions.compare.flights import _without_heights
 from sorvolo.missions.compare.report import with_height_changes
 from sorvolo.missions.compare.run import _earlier_pictures
 from sorvolo.missions.flight.settings import MapSettings
@@ -36,6 +35,7 @@ from sorvolo.missions.heights.measure import (
     measure_profile,
     measure_volume,
     read_field,
+    without_heights,
     write_contours,
 )
 from sorvolo.missions.heights.run import make_heights
@@ -372,9 +372,9 @@ def test_damaged_heights_are_named_and_no_comparison_stops_at_them(
         with Archive.open(mapped, write=False) as archive:
             _earlier_pictures(archive, "later")
             assert heights_stamps(archive, but="later") == {}
-            (notice,) = _without_heights(archive, "later")
+            (notice,) = without_heights(archive, "later")
             assert report.parent.name in notice.text and "sorvolo heights" in notice.text
-            assert _without_heights(archive, report.parent.name) == ()
+            assert without_heights(archive, report.parent.name) == ()
     finally:
         report.unlink() if kept is None else report.write_bytes(kept)
 

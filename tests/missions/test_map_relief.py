@@ -104,7 +104,12 @@ def _goes_on_with_another_battery(folder: Path) -> None:
         (folder / "rest").mkdir(exist_ok=True)
         shutil.copy(made / "flight1" / "photos" / name, folder / "rest")
     with_camera = ["--camera", str(made / "camera.xml"), "--model", "none", "--heights"]
-    assert main(["map", str(folder / "rest"), "--site", str(site), *with_camera]) == 0
+    shutil.copytree(site, folder / "damaged")
+    (folder / "damaged" / "flights" / "half" / "heights.json").write_text('{"cell_m": 1e999}')
+    for each, is_held in ((folder / "damaged", False), (site, True)):
+        assert main(["map", str(folder / "rest"), "--site", str(each), *with_camera]) == 0
+        report = json.loads((each / "flights" / "rest" / "report.json").read_text())
+        assert ("the heights of half are damaged" in report["shape"]["why"]) is not is_held
     with Archive.open(site, write=False) as archive:
         flights = flights_over_heights(archive, but="")
         assert flights == ["half", "rest"]

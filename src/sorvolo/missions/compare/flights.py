@@ -33,7 +33,7 @@ from sorvolo.missions.flight.setup import (
     repeated,
 )
 from sorvolo.missions.flight.threads import read_ahead
-from sorvolo.missions.heights.measure import damaged_heights, heights_stamps, own_heights_stamp
+from sorvolo.missions.heights.measure import heights_stamps, own_heights_stamp, without_heights
 from sorvolo.missions.mission import FlightOutcome, mission
 from sorvolo.mosaic.selection import StretchSelection, every
 from sorvolo.paths import AnyPath, Inputs, as_path, as_text, listed
@@ -41,7 +41,7 @@ from sorvolo.registration.lens import single_threaded_opencv
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.area import Area
 from sorvolo.survey.findings import Change, CompareUpdate, ViewStatus
-from sorvolo.survey.flight import Frame, LostFrame, Notice, PosedFrame
+from sorvolo.survey.flight import Frame, LostFrame, PosedFrame
 from sorvolo.survey.mosaic import FrameView
 
 _AHEAD = 2  # frames that are compared while the evidence of one is gathered: a thread for each
@@ -154,21 +154,6 @@ def _check_map(archive: Archive, site: Path, settings: CompareSettings) -> None:
             )
 
 
-def _without_heights(archive: Archive, flight: str) -> tuple[Notice, ...]:
-    """The notice of heights that could not be used: what stands is then compared as if it were flat."""
-    damaged = damaged_heights(archive, but=flight)
-    if not damaged:
-        return ()
-    return (
-        Notice(
-            "damaged heights",
-            len(damaged),
-            f"the heights of {', '.join(damaged)} cannot be read and were left out (heights.json is damaged); make them "
-            f"again: sorvolo heights {archive.folder} --flight {damaged[0]}",
-        ),
-    )
-
-
 def _compare_one(
     flight: OpenedFlight,
     archive: Archive,
@@ -180,7 +165,7 @@ def _compare_one(
 ) -> Generator[CompareUpdate]:
     started_s, source = time.monotonic(), flight.setup.source
     flight = flight.noting(
-        *repeated(archive, flight.setup, "compared"), *_without_heights(archive, source.name)
+        *repeated(archive, flight.setup, "compared"), *without_heights(archive, source.name)
     )
     setup = flight.setup
     if settings.updates_map:

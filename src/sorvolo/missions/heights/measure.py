@@ -24,7 +24,7 @@ from sorvolo.store.rasters.height_model import PointCloud, read_height_cog
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import VersionEntry
 from sorvolo.store.site.files import DamagedError, HeightFile
-from sorvolo.survey.flight import Site
+from sorvolo.survey.flight import Notice, Site
 
 _MOST_BYTES = 16_000_000  # of heights.json, which has kilobytes; by choice
 
@@ -219,15 +219,22 @@ def flights_with_heights(archive: Archive, but: str) -> Iterator[str]:
             yield flight_id
 
 
-def damaged_heights(archive: Archive, but: str) -> list[str]:
-    """The flights, `but` one, whose heights are there and cannot be used: their report is damaged."""
-    return [
+def without_heights(archive: Archive, but: str) -> tuple[Notice, ...]:
+    """The notice of heights of flights, `but` one, that are there and cannot be used."""
+    damaged = [
         each.id
         for each in archive.flights()
         if each.id != but
         and archive.height_path(each.id, HeightFile.REPORT).exists()
         and _read_report(archive, each.id) is None
     ]
+    if not damaged:
+        return ()
+    text = (
+        f"the heights of {', '.join(damaged)} are damaged and were left out; make them again: sorvolo heights "
+        f"{archive.folder} --flight {damaged[0]}"
+    )
+    return (Notice("damaged heights", len(damaged), text),)
 
 
 def heights_stamps(archive: Archive, but: str) -> dict[str, int]:

@@ -21,7 +21,12 @@ from sorvolo.heights.terrain import closed, filled
 from sorvolo.heights.views import View, fix_from_residual, ground_outlines_m, inside
 from sorvolo.missions.flight.report import LEVEL, MapShape
 from sorvolo.missions.flight.result_cache import ResultCache
-from sorvolo.missions.heights.measure import flights_with_heights, radial_of, read_field
+from sorvolo.missions.heights.measure import (
+    flights_with_heights,
+    radial_of,
+    read_field,
+    without_heights,
+)
 from sorvolo.missions.heights.run import FlightPictures, GroundModel, height_grid, model_ground
 from sorvolo.mosaic.graph_report import GraphReport
 from sorvolo.store.site.archive import Archive
@@ -132,12 +137,15 @@ class MapGround:
     surface: OrthoSurface | None
     stands: dict[str, tuple[Camera, Pose]] = field(default_factory=dict)
     keyframes: dict[str, StoredKeyframe] = field(default_factory=dict)
+    remarks: list[str] = field(default_factory=list)
+    """What keeps the flight from being held."""
 
     @classmethod
     def of_map(cls, archive: Archive, but: str, keyframes: Sequence[StoredKeyframe]) -> Self:
         """That of the newest map, without a flight; `keyframes` are the others'."""
         flights = flights_over_heights(archive, but)
         found = cls(map_surface(archive, flights))
+        found.remarks.extend(each.text for each in without_heights(archive, but))
         for each in keyframes:
             if each.flight_id in flights and each.site_from_camera is not None:
                 name = f"{each.flight_id}/{each.name}"
@@ -194,6 +202,10 @@ class MapGround:
             map_m.append(met_m[is_on])
         own, known = np.concatenate(own_m), np.concatenate(map_m)
         if len(own) < _LEAST_POINTS:
+            if len(own_m) > 1:
+                self.remarks.append(
+                    "too few of the flight's points lie on the map's heights, so that it stands by its fixes alone"
+                )
             return solved
         agree = np.ones(len(own), bool)
         for _ in range(_ROUNDS):

@@ -415,6 +415,7 @@ class PlanarRun(FlightRun):
                 shape = MapShape(True, f"the map is flat, for heights could not be made: {found}")
             else:
                 model = found
+                shape = replace(shape, why="; ".join([shape.why, *known.remarks]))
         if model is None:
             painter.finish()
             return placed, shape, None
