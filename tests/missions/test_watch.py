@@ -854,6 +854,14 @@ def test_a_heading_that_shows_only_later_makes_no_clean_headline(
         "headings are far off, which showed only after" in headline["text"]
         and not headline["complete"]
     )
+    for each in _read(tmp_path / "off" / "tracks.geojson")["features"]:
+        place = np.array(each["geometry"]["coordinates"])
+        off_m = min(
+            np.linalg.norm(_metres(place - middle, place[1]))
+            for name, middle in _seen_objects(flown).values()
+            if name == each["properties"]["class"]
+        )
+        assert off_m < 3 * each["properties"]["sigma_m"], each["properties"]
 
 
 @pytest.mark.parametrize("shown_by", [1, 2])

@@ -99,6 +99,7 @@ class GroundFollower:
             else None
         )
         self._path: list[Floats] = []
+        self._reach_m = 0.0  # between a detection's place and its camera's, at most
         self.unlocated: Counter[str] = Counter()
 
     def m_per_px(self, prior: CameraPrior) -> float | None:
@@ -185,15 +186,31 @@ class GroundFollower:
         if located.camera_m is not None:
             if len(self._path) < _MOST_DRONE_PLACES:
                 self._path.append(located.camera_m)
+            for each in filter(None, located.sightings):
+                away_m = float(np.linalg.norm(each.position_m - located.camera_m))
+                self._reach_m = max(self._reach_m, away_m)
         return _taken(located, update)
 
     def tracks(self) -> Sequence[Track]:
         """All tracks as they are known now."""
-        return self._tracker.tracks()
+        return self._doubted(self._tracker.tracks())
 
     def finish(self) -> Sequence[Track]:
         """All tracks when nothing more comes."""
-        return self._tracker.finish()
+        return self._doubted(self._tracker.finish())
+
+    def _doubted(self, tracks: Sequence[Track]) -> Sequence[Track]:
+        """What was placed before a heading showed that is far off may stand by that turn elsewhere around its camera."""
+        if self._check is None or not self._check.unturned:
+            return tracks
+        beside_m = 2 * self._reach_m * np.sin(self._check.shown_rad / 2)
+        more_m2 = beside_m**2 * np.eye(2)
+        return [
+            replace(each, covariance_m2=each.covariance_m2 + more_m2)
+            if each.first_seen_ns < self._check.shown_ns
+            else each
+            for each in tracks
+        ]
 
     def path_m(self) -> PointsM:
         """(N, 2) where the camera was, in site metres."""

@@ -354,7 +354,7 @@ class HeadingCheck:
     """A video's cameras corrected by the motion that their pictures show, where they look about straight down.
 
     While the drone turns nothing but a jump is judged: telemetry's clock may be off. `unturned` are the detections that
-    were placed before the pictures showed a heading that is far off. `shown` is the way by which heights and tilts are
+    were placed before the pictures showed, at `shown_ns`, a heading that is far off, by `shown_rad`. `shown` is the way by which heights and tilts are
     corrected, `tilt_deg` by how much the tilts
     were at most.
     """
@@ -366,6 +366,7 @@ class HeadingCheck:
         self._last: tuple[int, float, float] | None = None  # time, heading, turn, as last shown
         self._steady_ns = 0  # the drone turns until then
         self._unjudged, self.unturned, self.tilt_deg = 0, 0, 0.0
+        self.shown_ns, self.shown_rad = 0, 0.0
 
     def look_ahead(
         self, coming: Iterable[tuple[Frame, CameraPrior]], below_m: Callable[[CameraPrior], float]
@@ -404,6 +405,7 @@ class HeadingCheck:
             self._unjudged += len(found)
         elif not self.error.turns_deg and abs(turn.turn_deg) > max(_FAR_OFF_DEG, turn.sigma_deg):
             self.unturned = self._unjudged
+            self.shown_ns, self.shown_rad = time_ns, np.radians(turn.turn_deg)
         turned_prior = self.error.corrected(prior)
         corrected = righted(turned_prior, self.shown, below_m)
         along = float(turned_prior.rotation[:, 2] @ corrected.rotation[:, 2])
