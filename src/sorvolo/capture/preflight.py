@@ -99,26 +99,9 @@ def frame_facts(source: Source, samples: Sequence[Frame]) -> FrameFacts:
     camera = source.camera.camera
     seen = [sharpness_and_texture(frame.image) for frame in samples]
     sharp, texture = np.median(seen, axis=0).tolist() if seen else (math.nan, math.nan)
-    if isinstance(source, VideoSource):
-        info = source.info
-        return FrameFacts(
-            info.frame_count,
-            info.frame_rate_hz,
-            math.nan,
-            info.duration_s,
-            camera.width_px,
-            camera.height_px,
-            info.codec,
-            info.container,
-            info.path.stat().st_size,
-            info.start_ns,
-            info.start_origin,
-            sharp,
-            texture,
-            _shared_view(samples),
-        )
-    suffixes, container, size = _file_facts(source)
+    codec, container, size = _file_facts(source)
     times_s = _times_s(source, samples)
+    is_video = isinstance(source, VideoSource)
     return FrameFacts(
         source.frame_count,
         source.frame_rate_hz,
@@ -126,19 +109,21 @@ def frame_facts(source: Source, samples: Sequence[Frame]) -> FrameFacts:
         float(np.ptp(times_s)) if len(times_s) else math.nan,
         camera.width_px,
         camera.height_px,
-        suffixes,
+        codec,
         container,
         size,
         source.start_ns,
         source.start_origin,
         sharp,
         texture,
-        math.nan,
+        _shared_view(samples) if is_video else math.nan,
     )
 
 
 def _file_facts(source: Source) -> tuple[str, str, int]:
-    """Codec or endings, container, and bytes of photos or of a stream; "" and 0 for what is not known."""
+    """Codec or endings, container, and bytes; "" and 0 for what is not known."""
+    if isinstance(source, VideoSource):
+        return source.info.codec, source.info.container, source.info.path.stat().st_size
     if isinstance(source, LiveStream):
         return source.facts.codec, source.facts.container, 0
     if not isinstance(source, PhotoSource):
@@ -149,12 +134,12 @@ def _file_facts(source: Source) -> tuple[str, str, int]:
 
 
 def _times_s(source: Source, samples: Sequence[Frame]) -> Floats:
-    """(N,) when photos were taken, or when a live source's samples came; none where a source has no such times."""
+    """(N,) when photos were taken, a live source's samples came, or a video begins and ends; none of others."""
     if isinstance(source, LiveSource):
         return np.array([frame.time_ns for frame in samples]) / SECOND_NS
     if isinstance(source, PhotoSource):
         return np.array([photo.time_ns for photo in source.album.photos]) / SECOND_NS
-    return np.zeros(0)
+    return np.array([0.0, source.info.duration_s] if isinstance(source, VideoSource) else [])
 
 
 def _shared_view(samples: Sequence[Frame]) -> float:

@@ -63,12 +63,11 @@ def telemetry_command(
         chosen_flight,
         correct_telemetry,
     )
-    from sorvolo.missions.watch.cot_sender import CotTls, check_host, cot_place
+    from sorvolo.missions.watch.cot_sender import CotTls, check_cot, check_host, cot_place
 
     _check_source(source, site, has_own_options=bool(telemetry or camera or detections))
     tls = CotTls(cot_ca, cot_cert)
-    if tls != CotTls() and not cot.startswith("tls://"):
-        raise SettingsError("--cot-ca and --cot-cert are for --cot tls://host:port")
+    check_cot(cot, tls)
     receiver = None
     if cot:  # checked before minutes of work
         receiver = CotReceiver(cot_place(cot), tls)

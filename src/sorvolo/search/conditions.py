@@ -72,8 +72,7 @@ def crowns_in(
         thrower = plants & ~dark & _towards_sun(dark, sunward, m_per_px)
         single |= _opened(thrower, _SHADOWS_M[0], m_per_px)
     around = _odd_px(_AROUND_M, m_per_px)
-    mean = cv2.blur(lightness, (around, around))
-    roughness = _rms(lightness, around) / np.maximum(mean, _LEAST_GREY)
+    roughness = _rough(lightness, around, _LEAST_GREY)
     is_rough = cv2.blur(roughness, (wide, wide)) > _ROUGH
     wood = _wood(plants & (is_rough | single), m_per_px) & plants
     return _closed(single | wood, m_per_px)
@@ -90,7 +89,7 @@ def _leaf_roughness(
     )
     around = _odd_px(_LEAVES_M, max(m_per_px, _LEAF_M))
     # over the frame's lightness where it is darker there: shadows are rough over their own mean by their rims alone
-    rough = _rms(fine, around) / np.maximum(cv2.blur(fine, (around, around)), usual)
+    rough = _rough(fine, around, usual)
     return np.asarray(
         cv2.resize(rough, (shape[1], shape[0]), interpolation=cv2.INTER_AREA), np.float32
     )
@@ -110,24 +109,24 @@ def _towards_sun(dark: Mask, sunward: Floats, m_per_px: float) -> Mask:
 
 def _wood(rough: Mask, m_per_px: float) -> Mask:
     """The wide parts of rough plants, with the narrow gaps in them."""
-    spare = round(_WOOD_M / m_per_px)
-    # beyond the picture the forest may go on: what lies at its edge is judged by what the picture shows
-    wide = cv2.copyMakeBorder(
-        rough.astype(np.uint8), spare, spare, spare, spare, cv2.BORDER_REFLECT
-    )
+    wide, spare = _widened(rough, round(_WOOD_M / m_per_px))
     closed = cv2.morphologyEx(wide, cv2.MORPH_CLOSE, _disc(_STAND_M, m_per_px))
     return _opened(closed > 0, _WOOD_M, m_per_px)[spare:-spare, spare:-spare]
 
 
 def _closed(crowns: Mask, m_per_px: float) -> Mask:
     """The crowns (H, W) with the narrow gaps between them, where they are those of a stand of trees."""
-    spare = max(3, round(_GAP_M / m_per_px))
-    wide = cv2.copyMakeBorder(
-        crowns.astype(np.uint8), spare, spare, spare, spare, cv2.BORDER_REFLECT
-    )
+    wide, spare = _widened(crowns, max(3, round(_GAP_M / m_per_px)))
     stand = _opened(wide > 0, _STAND_M, m_per_px).astype(np.uint8)
     closed = cv2.morphologyEx(stand, cv2.MORPH_CLOSE, _disc(_GAP_M, m_per_px))
     return np.asarray(crowns | (closed[spare:-spare, spare:-spare] > 0), bool)
+
+
+def _widened(mask: Mask, spare: int) -> tuple[NDArray[np.uint8], int]:
+    """A mask with so many pixels more on each side: beyond the picture the forest may go on, and what lies at its edge is
+    judged by what the picture shows."""
+    around = (spare, spare, spare, spare)
+    return np.asarray(cv2.copyMakeBorder(mask.astype(np.uint8), *around, cv2.BORDER_REFLECT)), spare
 
 
 def _opened(mask: Mask, width_m: float, m_per_px: float) -> Mask:
@@ -141,9 +140,11 @@ def _disc(width_m: float, m_per_px: float) -> NDArray[np.uint8]:
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side_px, side_px)), np.uint8)
 
 
-def _rms(lightness: _Grey, around_px: int) -> _Grey:
+def _rough(lightness: _Grey, around_px: int, least: float) -> _Grey:
+    """Rms of lightness around each pixel over its mean there, or over `least` where it is darker."""
     mean = cv2.blur(lightness, (around_px, around_px))
-    return np.sqrt(np.maximum(cv2.blur(lightness**2, (around_px, around_px)) - mean**2, 0))
+    rms = np.sqrt(np.maximum(cv2.blur(lightness**2, (around_px, around_px)) - mean**2, 0))
+    return rms / np.maximum(mean, least)
 
 
 def _odd_px(width_m: float, m_per_px: float) -> int:
@@ -249,11 +250,7 @@ def look_at(
     size = max(8, round(camera.width_px / scale)), max(8, round(camera.height_px / scale))
     small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
     lightness = small.mean(axis=2)
-    around = max(3, 2 * round(_WINDOW * _LOOK_M / small_m / 2) + 1)
-    mean = cv2.blur(lightness, (around, around))
-    texture = np.sqrt(
-        np.maximum(cv2.blur(lightness**2, (around, around)) - mean**2, 0)
-    ) / np.maximum(mean, 8)
+    texture = _rough(lightness, _odd_px(_WINDOW * _LOOK_M, small_m), _LEAST_GREY)
     crowns = crowns_in(image, small, m_per_px, small_m, _sunward(site_from_camera, sun))
     return FrameLook(
         camera,
@@ -349,10 +346,7 @@ class Gathering:
                 means[:, 0],
                 log_views,
                 np.where(views > 0, views == 1, np.nan),
-                means[:, 1],
-                means[:, 2],
-                means[:, 3],
-                means[:, 4],
+                means[:, 1:],
                 share,
             ]
         )

@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 from math import atan2, cos, degrees, hypot, isfinite, nan, radians, sin
 from pathlib import Path
 
-from sorvolo.errors import SettingsError
 from sorvolo.geometry.units import M_PER_DEG_LATITUDE
-from sorvolo.missions.watch.cot_sender import CotSender, CotTls, check_host, cot_place
+from sorvolo.missions.watch.cot_sender import CotSender, CotTls, check_cot, check_host, cot_place
 from sorvolo.paths import JsonView
 from sorvolo.station.events import EventLog
 from sorvolo.station.ingest import Ingest
@@ -57,10 +56,7 @@ class OutwardSettings:
             webhook(each)
         if self.mqtt:
             mqtt_place(self.mqtt, self.mqtt_password)
-        if self.cot:
-            cot_place(self.cot)
-        if self.cot_tls != CotTls() and not self.cot.startswith("tls://"):
-            raise SettingsError("--cot-ca and --cot-cert are for --cot tls://host:port")
+        check_cot(self.cot, self.cot_tls)
 
 
 class Outward:

@@ -89,6 +89,14 @@ def cot_place(url: str) -> CotPlace:
     return CotPlace(transport, parts.hostname, port or _DEFAULT_PORTS[transport])
 
 
+def check_cot(url: str, tls: CotTls) -> None:
+    """Raise SettingsError for a place, "" for none, that `cot_place` refuses, and for certificates of another."""
+    if tls != CotTls() and not url.startswith("tls://"):
+        raise SettingsError("--cot-ca and --cot-cert are for --cot tls://host:port")
+    if url:
+        cot_place(url)
+
+
 def check_host(place: CotPlace) -> None:
     """Ask for the host's address. Raises InputError where nothing knows it."""
     try:

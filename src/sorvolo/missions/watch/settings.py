@@ -8,7 +8,7 @@ from sorvolo.errors import SettingsError, check_choices
 from sorvolo.missions.flight.looked_at import ENOUGH_LOOKED_AT, check_enough
 from sorvolo.missions.flight.settings import check_telemetry
 from sorvolo.missions.watch import alerts
-from sorvolo.missions.watch.cot_sender import CotTls, cot_place
+from sorvolo.missions.watch.cot_sender import CotTls, check_cot
 from sorvolo.paths import as_path, take_one_or_several
 
 DEFAULT_FRAMES_PER_SECOND = 10.0
@@ -83,10 +83,7 @@ class WatchOutputs:
             raise SettingsError(
                 "events are sent every 0 s or more, and are stale after more than 0 s"
             )
-        if self.cot:
-            cot_place(self.cot)
-        if self.cot_tls != CotTls() and not self.cot.startswith("tls://"):
-            raise SettingsError("--cot-ca and --cot-cert are for --cot tls://host:port")
+        check_cot(self.cot, self.cot_tls)
         if self.alert_command:
             alerts.alert_command(self.alert_command)
         if self.alert_url:
