@@ -282,6 +282,12 @@ def test_geopackage_mixes_polygons_and_odd_names(tmp_path: Path) -> None:
     assert CRS.from_wkt(definition).to_epsg() == 4326
     envelope_bytes = {0: 0, 1: 32}[(blob[3] >> 1) & 7]
     assert shapely.from_wkb(blob[8 + envelope_bytes :]).bounds == place[1:]
+    write_geopackage(tmp_path / "local.gpkg", {"some": features}, is_local=True)
+    with sqlite3.connect(tmp_path / "local.gpkg") as file:  # a map without GPS is nowhere on Earth
+        (blob,) = file.execute("SELECT geom FROM some").fetchone()
+        tables = ("gpkg_contents", "gpkg_geometry_columns")
+        stated = [file.execute(f"SELECT srs_id FROM {each}").fetchone() for each in tables]
+    assert stated == [(0,), (0,)] and struct.unpack_from("<i", blob, 4) == (0,)
 
 
 def test_profile_of_a_site_without_heights(client: TestClient) -> None:

@@ -270,7 +270,7 @@ def export_routes(shelf: SiteShelf, collections: SiteCollections, reviews: Revie
             styles = {name: qml_of(style) for name, style in LAYER_STYLES.items()}
             with tempfile.TemporaryDirectory(prefix="sorvolo-") as folder:
                 path = Path(folder) / _GEOPACKAGE
-                write_geopackage(path, layers, styles)
+                write_geopackage(path, layers, styles, is_local=archive.site().is_local)
                 made = path.read_bytes()  # another time other bytes: whole, no ranges
             headers = _as_file(f"{_plain_name(site)}.gpkg")
             return Response(made, media_type="application/octet-stream", headers=headers)

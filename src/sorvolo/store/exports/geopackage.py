@@ -27,7 +27,7 @@ _TIME = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d{1,9})?(Z|[+-]\d\d:\d\d)
 _LENGTH = re.compile("_(m2?|px|deg)$")  # names of numbers, also where none is known
 _APPLICATION = 0x47504B47  # "GPKG"
 _VERSION = 10300  # GeoPackage 1.3.0, as its requirement 2 writes it
-_WGS84 = 4326
+_WGS84, _NOWHERE = 4326, 0  # by EPSG; degrees of no known datum
 _NOW = "strftime('%Y-%m-%dT%H:%M:%S.000Z', 'now')"
 _WGS84_WKT = (
     'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],PRIMEM["Greenwich",0],'
@@ -54,8 +54,10 @@ def write_geopackage(
     path: Path,
     layers: Mapping[str, Sequence[Feature]],
     styles: Mapping[str, str] = MappingProxyType({}),
+    *,
+    is_local: bool = False,
 ) -> None:
-    """Write a layer for each name that has features; GeoJSON features in WGS84.
+    """Write a layer for each name that has features; GeoJSON features in WGS84; `is_local`: in degrees that are nowhere on Earth.
 
     `styles` are QML documents by layer, which QGIS takes as the layers' own. Raises StoreError on a full disk.
     """
@@ -71,18 +73,20 @@ def write_geopackage(
             "INSERT INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, '')",
             [
                 ("Undefined cartesian", -1, "NONE", -1, "undefined"),
-                ("Undefined geographic", 0, "NONE", 0, "undefined"),
+                ("Undefined geographic", _NOWHERE, "NONE", _NOWHERE, "undefined"),
                 ("WGS 84", _WGS84, "EPSG", _WGS84, _WGS84_WKT),
             ],
         )
         for name, features in layers.items():
             if features:
-                _write_layer(file, name, features)
+                _write_layer(file, name, features, _NOWHERE if is_local else _WGS84)
         _write_styles(file, {name: qml for name, qml in styles.items() if layers.get(name)})
         file.execute("COMMIT")
 
 
-def _write_layer(file: sqlite3.Connection, name: str, features: Sequence[Feature]) -> None:
+def _write_layer(
+    file: sqlite3.Connection, name: str, features: Sequence[Feature], srs_id: int
+) -> None:
     shapes = _alike([shapely.force_2d(shape(each["geometry"])) for each in features])
     kind = (
         shapes[0].geom_type.upper() if len({each.geom_type for each in shapes}) == 1 else "GEOMETRY"
@@ -98,8 +102,8 @@ def _write_layer(file: sqlite3.Connection, name: str, features: Sequence[Feature
         f"INSERT INTO {_quoted(name)} ({names}) VALUES ({marks})",
         [
             (
-                # magic, version, flags (little-endian, no envelope), EPSG code, ISO WKB
-                struct.pack("<2sBBi", b"GP", 0, 1, _WGS84)
+                # magic, version, flags (little-endian, no envelope), srs_id, ISO WKB
+                struct.pack("<2sBBi", b"GP", 0, 1, srs_id)
                 + bytes(shapely.to_wkb(geometry, byte_order=1, flavor="iso")),
                 *(_plain(each["properties"].get(name), sql) for name, sql in columns.items()),
             )
@@ -109,10 +113,10 @@ def _write_layer(file: sqlite3.Connection, name: str, features: Sequence[Feature
     bounds = shapely.total_bounds(shapes)
     file.execute(
         f"INSERT INTO gpkg_contents VALUES (?, 'features', ?, '', {_NOW}, ?, ?, ?, ?, ?)",
-        (name, name, *(float(each) for each in bounds), _WGS84),
+        (name, name, *(float(each) for each in bounds), srs_id),
     )
     file.execute(
-        "INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, ?, 0, 0)", (name, kind, _WGS84)
+        "INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, ?, 0, 0)", (name, kind, srs_id)
     )
 
 
