@@ -216,7 +216,9 @@ def headline_of_watch(
     ]
     is_complete = headline["complete"] and not limits
     if trees is not None:
-        limits.append(trees.headline["text"])
+        seen = len(trees.tracks)
+        own = f"{seen} of the people only through the trees: " if seen else ""
+        limits.append(f"{own}{trees.headline['text']}")
         is_complete &= trees.headline["complete"]
     return {"text": "; ".join([headline["text"], *limits]), "complete": is_complete}
 
