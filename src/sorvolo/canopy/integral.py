@@ -13,7 +13,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, median_filter
 
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Floats, Floats32, Mask, Numbers
+from sorvolo.geometry.arrays import Floats, Floats32, Mask, Numbers, shrunk
 from sorvolo.geometry.ground import laid_pixels
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.views import View, inside
@@ -236,16 +236,14 @@ def focus(
         for k, (total, count) in enumerate(_sums(views, picture, window, floors_m)):
             shape = x1 - x0, y1 - y0
             seen = count.sum(axis=0).astype(np.float32)
-            often[y0:y1, x0:x1] = cv2.resize(seen, shape, interpolation=cv2.INTER_AREA)
+            often[y0:y1, x0:x1] = shrunk(seen, shape)
             for part, halves in enumerate(([0, 1], [0], [1])):
                 seen = count[halves].sum(axis=0)
                 mean = _mean(total[halves].sum(axis=0), seen, LEAST_VIEWS // 2)
                 sharp = np.nan_to_num(against_surroundings(mean, fine.cell_m)) ** 2
                 # few views leave noise; squared once more, for a floor may show little but what lies on it
                 sharp = (sharp.sum(axis=2) * np.minimum(seen / _MANY_VIEWS, 1)) ** 2
-                score[part, k, y0:y1, x0:x1] = cv2.resize(
-                    sharp, shape, interpolation=cv2.INTER_AREA
-                )
+                score[part, k, y0:y1, x0:x1] = shrunk(sharp, shape)
     score = gaussian_filter(score, (0, 0.7, 1.0, 1.0))
     # what few views show is crowns that have not blurred away
     pooled = score[0][:, often >= often.max() / 2].mean(axis=1)

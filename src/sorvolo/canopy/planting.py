@@ -15,7 +15,7 @@ from sorvolo.canopy.integral import (
     pixels_from_cells,
     seeing,
 )
-from sorvolo.geometry.arrays import Floats, Floats32, PointsM
+from sorvolo.geometry.arrays import Floats, Floats32, PointsM, shrunk
 from sorvolo.geometry.summary import wilson
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.views import View
@@ -93,7 +93,7 @@ def free_share(under: UnderTrees, views: Sequence[View], picture: Picture) -> Fl
     """(H, W) the share of the views of each cell that crowns leave free; NaN where none sees it."""
     lattice = under.lattice.coarser(max(1, round(_COARSE_M / under.lattice.cell_m)))
     size = lattice.shape[::-1]
-    floor_m = np.asarray(cv2.resize(under.floor_m, size, interpolation=cv2.INTER_AREA), np.float32)
+    floor_m = shrunk(under.floor_m, size)
     share = np.full(lattice.shape, np.nan, np.float32)
     for x0, y0, x1, y1 in lattice.windows(_WINDOW_CELLS):
         box, window = np.s_[y0:y1, x0:x1], lattice.window(x0, y0, x1, y1)

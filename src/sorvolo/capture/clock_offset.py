@@ -139,7 +139,7 @@ class _Compared:
 
     def _inside(self, offset_s: float) -> Mask:
         at = self.times_s + offset_s
-        return np.asarray((at >= self.path_s[0]) & (at <= self.path_s[-1]))
+        return (at >= self.path_s[0]) & (at <= self.path_s[-1])
 
     def misfit(self, offset_s: float) -> tuple[float, float, float]:
         """How far the fixes, turned, shifted and scaled, miss the seen path, rms, units; infinite where they cover too

@@ -181,7 +181,7 @@ class FlightTelemetry:
 
     @property
     def _known(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-        return np.asarray(np.isfinite(self.track.east_north_m[:, 0]))
+        return np.isfinite(self.track.east_north_m[:, 0])
 
 
 def duration_s(source: Source) -> float:

@@ -11,7 +11,6 @@ from itertools import pairwise
 from pathlib import Path
 from statistics import median_low
 
-import cv2
 import numpy as np
 
 from sorvolo.capture.decoding import LARGEST_FRAME_PX, decode_photo, is_same_shape, other_size
@@ -26,7 +25,7 @@ from sorvolo.capture.photo_metadata import (
 from sorvolo.capture.photo_positions import read_positions
 from sorvolo.capture.telemetry.cleaning import clean, notice
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.geometry.arrays import ImageRGB, shrunk
 from sorvolo.geometry.units import DAY_NS, SECOND_NS
 from sorvolo.survey.flight import (
     TELEMETRY_COLUMNS,
@@ -512,7 +511,7 @@ def _fit(image: ImageRGB, orientation: int, width_px: int, height_px: int) -> Im
         # a camera that looks straight down cannot feel what is up: its orientation tag may be wrong
         shown = image if image.shape[1::-1] == size_px else _turn(shown, _QUARTER_TURN)
     if shown.shape[1::-1] != size_px:
-        return np.asarray(cv2.resize(shown, size_px, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        return shrunk(shown, size_px)
     return np.ascontiguousarray(shown, dtype=np.uint8)
 
 

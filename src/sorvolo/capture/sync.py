@@ -145,7 +145,7 @@ def _covered(fix_s: Floats, frames_s: Floats) -> Mask:
     gap_s = fix_s[at] - fix_s[before]
     beyond_s = np.minimum(abs(frames_s - fix_s[before]), abs(frames_s - fix_s[at]))
     is_inside = (gap_s > 0) & (gap_s <= max(4 * interval_s, 3.0))
-    return np.asarray(is_inside | (beyond_s <= 1.5 * interval_s + 0.5))
+    return is_inside | (beyond_s <= 1.5 * interval_s + 0.5)
 
 
 def _no_time_in_common(fix_s: Floats, frames_s: Floats, given_s: float) -> str:

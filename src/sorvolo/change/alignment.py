@@ -23,6 +23,7 @@ from sorvolo.geometry.arrays import (
     PointsM,
     PointsPx,
     Vector3,
+    shrunk,
 )
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
@@ -281,9 +282,7 @@ class Aligner:
         """The size (width, height) at which a frame is aligned, and its gray there."""
         scale = min(1.0, _ALIGNMENT_SIDE_PX / max(image.shape[:2]))
         size = max(16, round(image.shape[1] * scale)), max(16, round(image.shape[0] * scale))
-        return size, np.asarray(
-            cv2.resize(gray_from_rgb(image), size, interpolation=cv2.INTER_AREA), np.uint8
-        )
+        return size, shrunk(gray_from_rgb(image), size)
 
     def _by_homographies(self, frame: _Frame, *, is_cheap: bool = False) -> MapPlace | NotAligned:
         """The frame placed by the first guess that its points confirm to a part of a pixel, or why none is."""
@@ -378,7 +377,7 @@ class Aligner:
         seen = self._seen(placed.site_from_image @ _small_from(fine, frame.even.camera), fine)
         if seen is None:
             return None
-        gray: ImageGray = cv2.resize(gray_from_rgb(frame.image), size, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
+        gray: ImageGray = shrunk(gray_from_rgb(frame.image), size)
         m_per_px = float(placed.pose.translation_m[2]) / fine.fx_px
         return fit_locally(gray_from_rgb(seen[0]), gray, seen[1], m_per_px)
 
@@ -493,7 +492,7 @@ class Aligner:
         old = normalised(*seen).astype(np.float32)
         size = old.shape[1], old.shape[0]
         step_x, step_y = new.camera.width_px / size[0], new.camera.height_px / size[1]
-        fresh = cv2.resize(new.gray, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+        fresh = shrunk(new.gray, size).astype(np.float32)
         window = cv2.createHanningWindow(size, cv2.CV_32F)
         (dx, dy), response = cv2.phaseCorrelate(old, fresh, window)
         if response < 0.05 or abs(dx) > 0.4 * size[0] or abs(dy) > 0.4 * size[1]:
@@ -544,9 +543,7 @@ class Aligner:
             )
             grid_from_site = self._site_grid.grid_from_site_affine(np.zeros(2), 50.0)
             near_m = apply_homography(np.linalg.inv(grid_from_site), centre_px[None])[0]
-            site_from_grid = np.asarray(
-                np.linalg.inv(self._site_grid.grid_from_site_affine(near_m, 50.0))
-            )
+            site_from_grid = np.linalg.inv(self._site_grid.grid_from_site_affine(near_m, 50.0))
             found = self._matched(
                 features, old, grid_from_image, 0.0, site_from_grid @ grid_from_image
             )
@@ -673,7 +670,7 @@ def _spread_of(points_px: PointsPx, known: Mask) -> float:
     """The share of the frame's cells on known ground, this many across and down, that hold points."""
     height, width = known.shape
     cells = np.array(_CELLS)
-    on_map = cv2.resize(known.astype(np.float32), _CELLS, interpolation=cv2.INTER_AREA) > 0.5
+    on_map = shrunk(known.astype(np.float32), _CELLS) > 0.5
     held = np.zeros_like(on_map)
     x, y = (points_px * cells / [width, height]).astype(int).clip(0, cells - 1).T
     held[y, x] = True

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sorvolo.change.ground import GroundSums
 from sorvolo.change.light import OCTAVES
 from sorvolo.change.outlines import measures, outline_of, place_sigma_m
-from sorvolo.geometry.arrays import Bytes, Floats32, ImageRGB, Mask, Matrix3
+from sorvolo.geometry.arrays import Bytes, Floats32, ImageRGB, Mask, Matrix3, shrunk
 from sorvolo.geometry.homography import resized
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView
 
@@ -66,9 +66,7 @@ def area_signs(view: ComparedView, leans: Mask | None = None) -> AreaSigns:
     height, width = view.valid.shape
     size = _small(view.image)
     valid = view.valid if leans is None else view.valid & ~leans
-    known = np.asarray(
-        cv2.resize(valid.view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) == 255
-    )
+    known = shrunk(valid.view(np.uint8) * np.uint8(255), size) == 255
     before, after = (_octaves(image, size) for image in (view.reference, view.image))
     levels = [_level(each) for each in (before, after)]
     likeness, detail, _ = _structure(levels[0], levels[1])
@@ -99,9 +97,7 @@ def leaning(reference: Signs, picture: ImageRGB, seen: Mask) -> Mask:
     found = (likeness < _LEANS) & (rough > _ROUGH)
     window = np.ones((_WINDOW_PX, _WINDOW_PX), np.uint8)
     whole = cv2.morphologyEx(found.view(np.uint8), cv2.MORPH_CLOSE, window)
-    return np.asarray(
-        (cv2.resize(whole, (width, height), interpolation=cv2.INTER_NEAREST) > 0) & seen
-    )
+    return (cv2.resize(whole, (width, height), interpolation=cv2.INTER_NEAREST) > 0) & seen
 
 
 def _small(picture: ImageRGB) -> tuple[int, int]:
@@ -173,7 +169,7 @@ def _colour(octaves: Signs) -> Signs:
 
 
 def _octaves(image: Bytes, size: tuple[int, int]) -> Signs:
-    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    small = shrunk(image, size)
     return np.asarray(cv2.LUT(small, OCTAVES), np.float32)
 
 
@@ -309,9 +305,7 @@ def _share(rim: Mask, cells: Mask) -> float:
 
 def _rim(cells: Mask, reach: int) -> Mask:
     """The cells around, up to this many away."""
-    return np.asarray(
-        (cv2.dilate(cells.view(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) > 0) & ~cells
-    )
+    return (cv2.dilate(cells.view(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) > 0) & ~cells
 
 
 def _connected(cells: Mask, own: Mask) -> Mask:
@@ -335,7 +329,7 @@ def _whole(cells: Mask, gap: int = 2) -> Mask:
     for outline in outlines:
         if cv2.contourArea(outline) < 40:
             cv2.drawContours(closed, [outline], -1, 1.0, cv2.FILLED)
-    return np.asarray(closed > 0)
+    return closed > 0
 
 
 def _units(change: Cells) -> Cells:

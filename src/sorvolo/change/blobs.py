@@ -133,7 +133,7 @@ def _foot_m(
         return None
     middle = near + width_m - m_per_px
     corners = np.array([[near, left], [middle, left], [middle, right], [near, right]])
-    return np.asarray(corners @ site_from_lean + camera_m[:2])
+    return corners @ site_from_lean + camera_m[:2]
 
 
 def _is_known_around(valid: Mask, x: int, y: int, w: int, h: int) -> bool:

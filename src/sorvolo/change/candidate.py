@@ -178,7 +178,7 @@ class Pictures:
         near = (
             cv2.warpAffine(grown, patch_from_cells[:2], window.size_px, flags=cv2.INTER_NEAREST) > 0
         )
-        majority = np.asarray((2 * self._yes.astype(np.int16) > self._asked) & near)
+        majority = (2 * self._yes.astype(np.int16) > self._asked) & near
         least_m2 = _LEAST_MAJORITY * np.count_nonzero(cells) * cell_m**2
         return majority if np.count_nonzero(majority) * window.m_per_px**2 >= least_m2 else None
 

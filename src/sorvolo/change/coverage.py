@@ -148,7 +148,7 @@ class GroundCoverage:
                     corners = np.rint(at).astype(np.int32)
                     cv2.fillPoly(cells, [corners], 1)
                     cv2.polylines(cells, [corners], isClosed=True, color=1, thickness=wide)
-            explained = np.asarray(cells > 0)
+            explained = cells > 0
             labels = self._labels(chunk, explained, plain, faint)
             for label, x0, x1, y in _runs(labels):
                 west, north = (column * CHUNK + x0) * _CELL_M, -(row * CHUNK + y) * _CELL_M

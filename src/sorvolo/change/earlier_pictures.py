@@ -64,7 +64,7 @@ class EarlierPictures:
                 index, picture, site_from_picture, site_from_image, (width_px, height_px)
             )
             bgr = np.asarray(cv2.cvtColor(seen, cv2.COLOR_RGBA2BGR), np.uint8)
-            yield bgr, np.asarray(cv2.extractChannel(seen, 3) == 255)
+            yield bgr, cv2.extractChannel(seen, 3) == 255
 
     def _as_coarse(self, index: int, site_from_other: Matrix3) -> tuple[ImageRGBA, Matrix3] | None:
         """A picture, and its (3, 3) place, made so much smaller that resampling it for another raster skips no pixels;

@@ -553,16 +553,14 @@ class EvidenceMap:
         enough = ((evidence.changed >= needed) & (seen < settings.n)) | (
             evidence.votes >= settings.k
         )
-        return np.asarray(enough & (evidence.owner == 0))
+        return enough & (evidence.owner == 0)
 
     def _single_cells(self, seed: Candidate, evidence: CellEvidence) -> Mask:
         """The cells of a seed that one view shows, where no other saw them; none unless it is very sure and shows all
         of it: at a rim walls lean in whole."""
         tally = seed.tally
         is_sure = tally.score_sum >= _SINGLE_VIEW_SCORE * tally.views and tally.whole > 0
-        return np.asarray(
-            (evidence.owner == 0) & (evidence.changed == 1) & (evidence.seen == 1) & is_sure
-        )
+        return (evidence.owner == 0) & (evidence.changed == 1) & (evidence.seen == 1) & is_sure
 
     def _is_confirmed(
         self, seed: Candidate, cells: Mask, confirms: Callable[[PointsM], bool]

@@ -7,7 +7,16 @@ import cv2
 import numpy as np
 
 from sorvolo.change.map_search import MapSearch
-from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, Mask, Matrix3, PointsM, Rows
+from sorvolo.geometry.arrays import (
+    Floats,
+    ImageGray,
+    ImageRGB,
+    Mask,
+    Matrix3,
+    PointsM,
+    Rows,
+    shrunk,
+)
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import apply_homography, fit_similarity
 from sorvolo.geometry.pose import Pose
@@ -136,7 +145,7 @@ class FlightOnMap:
         """What `find` needs of an undistorted photo, (H, W, 3)."""
         scale = min(1.0, _SIDE_PX / max(image.shape[:2]))
         size = round(image.shape[1] * scale), round(image.shape[0] * scale)
-        gray: ImageGray = cv2.resize(gray_from_rgb(image), size, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
+        gray: ImageGray = shrunk(gray_from_rgb(image), size)
         return PhotoFeatures(camera.resized(*size), learned_features(gray, _POINTS))
 
     def find(

@@ -21,6 +21,7 @@ from sorvolo.geometry.arrays import (
     Mask,
     Matrix3,
     PointsM,
+    shrunk,
 )
 from sorvolo.geometry.homography import apply_homography, resized
 from sorvolo.survey.findings import ComparedView, Patch
@@ -191,7 +192,7 @@ def lay(view: ComparedView, cell_m: float, ignored: Mask, held: Mask, legs: Labe
         if shrink == 1:
             return image
         cut = image[: rows * shrink, : columns * shrink]
-        return np.asarray(cv2.resize(cut, (columns, rows), interpolation=cv2.INTER_AREA), np.uint8)
+        return shrunk(cut, (columns, rows))
 
     changed = small(view.changed)
     valid = small(view.valid.view(np.uint8) * np.uint8(255))

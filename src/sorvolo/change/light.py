@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import Bytes, Floats, Floats32, Ints32, Mask
+from sorvolo.geometry.arrays import Bytes, Floats, Floats32, Ints32, Mask, shrunk
 from sorvolo.kernels import detail_products, relight, slopes
 
 Bgr = NDArray[np.uint8]
@@ -51,7 +51,7 @@ class PairLight:
     def brightness(self) -> Floats:
         """(3,) by which factor a middle grey of the reference is brighter in the query."""
         middle = np.log2(100.0 + BLACK_LEVEL)
-        return np.asarray(2.0 ** (self.offsets + (self.exponents - 1.0) * middle))
+        return 2.0 ** (self.offsets + (self.exponents - 1.0) * middle)
 
 
 def fit_light(reference: Bgr, query: Bgr, known: Mask | None = None) -> PairLight:
@@ -139,7 +139,7 @@ def _logarithm(image: Bytes) -> Floats32:
 
 
 def _smaller(image: NDArray[Any], size: tuple[int, int]) -> Bytes:
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+    return shrunk(image, size)
 
 
 def _surely(known: Mask | None, size: tuple[int, int]) -> Mask | None:

@@ -7,7 +7,16 @@ import cv2
 import numpy as np
 from cv2.typing import MatLike
 
-from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, ImageRGB, Mask, PointsPx, Rows
+from sorvolo.geometry.arrays import (
+    Floats,
+    Floats32,
+    ImageGray,
+    ImageRGB,
+    Mask,
+    PointsPx,
+    Rows,
+    shrunk,
+)
 
 # How a displacement is searched; cells and pixels are those of the small copies of the pictures.
 _SIDE_PX = 480  # longest side of the copies: fine texture is what two dates share
@@ -90,11 +99,11 @@ def fit_locally(
     cells = max(1, round(size[0] / _CELL_PX)), max(1, round(size[1] / _CELL_PX))
     if min(cells) < 4 or min(size) < 4 * reach:
         return None
-    share = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    share = shrunk(known.astype(np.float32), size)
     seen = cv2.erode(
         (share > 0.99).astype(np.float32), np.ones((5, 5), np.uint8)
     )  # no gradients of the map's rim
-    on_map = np.asarray(cv2.resize(seen, cells, interpolation=cv2.INTER_AREA), np.float32)
+    on_map = np.asarray(shrunk(seen, cells), np.float32)
     still, moving = (_even_gradients(image, size) for image in (reference, query))
     agreement = _agreement((still[0] * seen, still[1] * seen), moving, reach, cells)
     checks = np.indices(cells[::-1]).sum(axis=0) % 2 == 0
@@ -107,7 +116,7 @@ def fit_locally(
 
 def _even_gradients(image: ImageGray, size: tuple[int, int]) -> tuple[MatLike, MatLike]:
     """Gradients in x and y, (h, w) each, of a small copy, of like strength everywhere: light falls out of them."""
-    gray = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    gray = shrunk(image, size).astype(np.float32)
     across, down = (cv2.Scharr(gray, cv2.CV_32F, 1 - axis, axis, scale=1 / 16) for axis in (0, 1))
     strength = cv2.add(cv2.multiply(across, across), cv2.multiply(down, down))
     around = cv2.blur(strength, (_EVEN_PX, _EVEN_PX))
@@ -134,7 +143,7 @@ def _agreement(
         cv2.multiply(still[0], padded[0][y : y + height, x : x + width], dst=across)
         cv2.multiply(still[1], padded[1][y : y + height, x : x + width], dst=down)
         cv2.add(across, down, dst=across)
-        result[index] = cv2.resize(across, cells, interpolation=cv2.INTER_AREA)
+        result[index] = shrunk(across, cells)
     return result
 
 

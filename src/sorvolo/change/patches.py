@@ -6,7 +6,16 @@ import cv2
 import numpy as np
 
 from sorvolo.change.outlines import mask_of
-from sorvolo.geometry.arrays import Bytes, Floats, ImageGray, ImageRGB, ImageRGBA, Matrix3, PointsM
+from sorvolo.geometry.arrays import (
+    Bytes,
+    Floats,
+    ImageGray,
+    ImageRGB,
+    ImageRGBA,
+    Matrix3,
+    PointsM,
+    shrunk,
+)
 from sorvolo.geometry.homography import apply_homography, resized
 from sorvolo.survey.findings import ComparedView, Patch
 
@@ -161,7 +170,7 @@ def patch_of(window: PatchWindow, pictures: Cut, outline_m: PointsM) -> Patch:
 def _shrunk(image: Bytes, factor: int) -> Bytes:
     rows, columns = image.shape[0] // factor, image.shape[1] // factor
     part = image[: rows * factor, : columns * factor]
-    return np.asarray(cv2.resize(part, (columns, rows), interpolation=cv2.INTER_AREA), np.uint8)
+    return shrunk(part, (columns, rows))
 
 
 def quality(view: ComparedView, low_m: Floats, high_m: Floats) -> float:

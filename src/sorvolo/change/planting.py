@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from sorvolo.change.light import BLACK_LEVEL
-from sorvolo.geometry.arrays import Bytes, Floats, Floats32, ImageRGB, Mask
+from sorvolo.geometry.arrays import Bytes, Floats, Floats32, ImageRGB, Mask, shrunk
 from sorvolo.survey.findings import ComparedView
 
 _COLOURS = np.array(
@@ -88,7 +88,7 @@ class Sensitivity:
             ]
         )
         needed = np.log(_LEAST / (1 - _LEAST))
-        return ~np.asarray(logit >= needed)
+        return ~(logit >= needed)
 
 
 class Planting:
@@ -156,7 +156,7 @@ def texture(view: ComparedView) -> Floats32:
     level = np.log2(gray.astype(np.float32) + np.float32(BLACK_LEVEL))
     detail = cv2.absdiff(level, cv2.blur(level, (9, 9)))
     size = max(1, gray.shape[1] // 4), max(1, gray.shape[0] // 4)
-    coarse = cv2.resize(cv2.blur(detail, (13, 13)), size, interpolation=cv2.INTER_AREA)
+    coarse = shrunk(cv2.blur(detail, (13, 13)), size)
     return np.asarray(np.maximum(coarse, 2e-3), np.float32)
 
 
@@ -234,7 +234,7 @@ def _draw(
     under = ground * (1 - _SHADE * contrast * shadow)
     painted = under * (1 - body) + body * (ground + contrast * (thing - ground))
     picture[window] = np.clip(np.rint(painted), 0, 255).astype(np.uint8)
-    return window, np.asarray(body[..., 0] > 0.5)
+    return window, body[..., 0] > 0.5
 
 
 def _rectangle(side_px: int, middle: Floats, sides: Floats, turn_deg: float) -> Floats32:
@@ -242,9 +242,7 @@ def _rectangle(side_px: int, middle: Floats, sides: Floats, turn_deg: float) -> 
     corners = cv2.boxPoints((middle.tolist(), sides.tolist(), turn_deg))
     fine: Bytes = np.zeros((8 * side_px,) * 2, np.uint8)
     cv2.fillPoly(fine, [np.rint(corners * 8).astype(np.int32)], 255)
-    mask = (
-        cv2.resize(fine, (side_px, side_px), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
-    )
+    mask = shrunk(fine, (side_px, side_px)).astype(np.float32) / 255
     return np.asarray(cv2.GaussianBlur(mask, (0, 0), 0.6), np.float32)
 
 

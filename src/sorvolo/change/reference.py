@@ -7,7 +7,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import ImageGray, ImageRGB, ImageRGBA, Mask, Matrix3, PointsPx
+from sorvolo.geometry.arrays import ImageGray, ImageRGB, ImageRGBA, Mask, Matrix3, PointsPx, shrunk
 from sorvolo.geometry.grid import Grid, TileIndex, gather_tiles
 from sorvolo.geometry.homography import apply_homography, resized
 from sorvolo.registration.features import (
@@ -69,7 +69,7 @@ class ReferenceMap:
         )
         if shrink > 1:
             small = window.shape[1] // shrink, window.shape[0] // shrink
-            window = np.asarray(cv2.resize(window, small, interpolation=cv2.INTER_AREA), np.uint8)
+            window = shrunk(window, small)
             image_from_small = resized(width_px / size[0], height_px / size[1])
             window_from_image = (
                 resized(1 / shrink, 1 / shrink) @ window_from_image @ image_from_small
@@ -160,7 +160,7 @@ class ReferenceMap:
         for (dx, dy), child in children.items():
             if child is not None:
                 large[dy * side : (dy + 1) * side, dx * side : (dx + 1) * side] = child
-        small = np.asarray(cv2.resize(large, (side, side), interpolation=cv2.INTER_AREA), np.uint8)
+        small = shrunk(large, (side, side))
         small[small[..., 3] < 255] = 0  # half-known pixels are darkened by the unknown half
         return small
 

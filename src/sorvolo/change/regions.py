@@ -427,7 +427,7 @@ def _green(image: Image, boxes: Ints32) -> Floats:
         for start, step, side in ((rows, y, image.shape[0]), (columns, x, image.shape[1]))
     )
     blue, green, red = image[y, x].mean(axis=(1, 2)).T
-    return np.asarray(green - (red + blue) / 2)
+    return green - (red + blue) / 2
 
 
 def _details(logarithm: Image, to: Image) -> None:

@@ -94,7 +94,7 @@ class OrthoSurface:
         eye = np.append(apply_homography(self.cells_from_site, eye_m[None, :2])[0], eye_m[2])
         found = hidden(self.up_m, x, y, self._at(x, y), eye, _HIDES_M)
         whole = cv2.resize(found.view(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-        return np.asarray(whole > 0)
+        return whole > 0
 
     def _at(self, x: Floats32, y: Floats32) -> Floats32:
         """(h, w) heights at columns and rows."""

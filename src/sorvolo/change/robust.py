@@ -30,6 +30,7 @@ from sorvolo.geometry.arrays import (
     ImageRGB,
     Ints32,
     Mask,
+    shrunk,
 )
 from sorvolo.kernels import held_parts, tree_margins
 from sorvolo.survey.findings import Shade
@@ -50,7 +51,7 @@ def how_sure(features: Floats, trees: Trees) -> Floats:
     if len(features) == 0:
         return np.zeros(0)
     margin = trees.prior + tree_margins(features, trees.features, trees.thresholds, trees.leaves)
-    return np.asarray(1 / (1 + np.exp(-margin)))
+    return 1 / (1 + np.exp(-margin))
 
 
 @lru_cache(maxsize=1)
@@ -172,7 +173,7 @@ def _is_thing(mask: Image, strength: Image, limit: float) -> bool:
     ):
         return False
     inner, outer = (cv2.dilate(mask, np.ones((px, px), np.uint8)) for px in (5, 9))
-    beside = np.asarray(outer > inner)
+    beside = outer > inner
     return not beside.any() or _quantile(strength, beside, 0.75) <= _BESIDE * limit
 
 
@@ -312,14 +313,12 @@ def _half_known(valid: Mask | None, half: tuple[int, int]) -> Mask | None:
     if height % 2 == 0 and width % 2 == 0:
         pairs = np.ascontiguousarray(valid).view(np.uint16) == 0x0101  # two True side by side
         return np.logical_and(pairs[::2], pairs[1::2])
-    return np.asarray(
-        cv2.resize(valid.astype(np.uint8) * 255, half, interpolation=cv2.INTER_AREA) == 255
-    )
+    return shrunk(valid.astype(np.uint8) * 255, half) == 255
 
 
 def _without_rim(known: Mask, rim_px: int) -> Mask:
     window = np.ones((2 * rim_px + 1,) * 2, np.uint8)
-    return np.asarray(cv2.erode(known.astype(np.uint8), window, borderValue=1) > 0)
+    return cv2.erode(known.astype(np.uint8), window, borderValue=1) > 0
 
 
 def _result(
@@ -402,7 +401,7 @@ def _went(regions: Regions) -> Mask:
         place = slice(y, y + high), slice(x, x + wide)
         part[region] = parts[place].flat[(regions.labels[place] == region + 1).argmax()]
     came = np.bincount(part, regions.came, minlength=1)
-    return np.asarray(came[part] < 0)
+    return came[part] < 0
 
 
 def _filled(chosen: Mask, regions: Regions, pieces: Mapping[int, ThingPixels]) -> ImageGray:

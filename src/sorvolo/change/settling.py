@@ -9,7 +9,7 @@ import numpy as np
 from cv2.typing import MatLike
 
 from sorvolo.change.regions import LOGARITHMS
-from sorvolo.geometry.arrays import Bytes, Floats, Mask, Matrix3
+from sorvolo.geometry.arrays import Bytes, Floats, Mask, Matrix3, shrunk
 from sorvolo.kernels import fit_moves, flow_on_grid
 
 _GRID = (28, 16)  # columns and rows of the flow that is fitted; the cached `_rows` are its
@@ -45,10 +45,7 @@ def settle(reference: Bytes, query: Bytes, known: Mask | None = None) -> Settlin
     height, width = query.shape
     small = max(16, width // 2), max(16, height // 2)
     scale = np.array([width / small[0], height / small[1]])
-    details = [
-        _details(cv2.resize(image, small, interpolation=cv2.INTER_AREA))
-        for image in (reference, query)
-    ]
+    details = [_details(shrunk(image, small)) for image in (reference, query)]
     if min(small) < _LEAST_FLOW_PX:
         return Settling(np.eye(3), 0.0, 0.0)
     start: Any = None
@@ -59,9 +56,7 @@ def settle(reference: Bytes, query: Bytes, known: Mask | None = None) -> Settlin
     flow_px, texture = grid[:, :2] * scale, grid[:, 2]
     trust = np.clip(texture.astype(np.float64) / 8, 0.05, 1)
     if known is not None:
-        trust *= (
-            cv2.resize(known.astype(np.float32), _GRID, interpolation=cv2.INTER_AREA).ravel() > 0.99
-        )
+        trust *= shrunk(known.astype(np.float32), _GRID).ravel() > 0.99
     if np.count_nonzero(trust) < _LEAST_PLACES:
         return Settling(np.eye(3), 0.0, 0.0)
     matrix, rest_px = _near_homography(flow_px / (width, height), trust, (width, height))
@@ -108,4 +103,4 @@ def _near_homography(
         ]
     )
     matrix = np.linalg.inv(parts_from_px) @ near @ parts_from_px
-    return np.asarray(matrix / matrix[2, 2]), rest_px
+    return matrix / matrix[2, 2], rest_px

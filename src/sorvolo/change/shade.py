@@ -7,7 +7,7 @@ import numpy as np
 from cv2.typing import MatLike
 
 from sorvolo.change.light import fit_light, relit
-from sorvolo.geometry.arrays import ImageGray, ImageRGB, Mask
+from sorvolo.geometry.arrays import ImageGray, ImageRGB, Mask, shrunk
 from sorvolo.survey.findings import Shade
 
 _ONE = 128  # of parts in a byte
@@ -38,10 +38,7 @@ def shade_of_view(reference: ImageRGB, image: ImageRGB, valid: Mask) -> ImageGra
         if valid.all()
         else cv2.resize(valid.view(np.uint8), half, interpolation=cv2.INTER_NEAREST) > 0
     )
-    small_before, small_after = (
-        np.asarray(cv2.resize(each, half, interpolation=cv2.INTER_AREA), np.uint8)
-        for each in (before, after)
-    )
+    small_before, small_after = (shrunk(each, half) for each in (before, after))
     shade = shade_between(relit(before, fit_light(small_before, small_after, known)), after)
     return np.asarray(cv2.copyTo(shade, valid.view(np.uint8)), np.uint8)
 

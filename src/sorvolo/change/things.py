@@ -48,7 +48,7 @@ def without_shadow(change: Change) -> Change:
 def shadow_of(patch: Patch, kind: ChangeKind) -> Mask:
     """Where (h, w) it is dark as a shadow is: on the later date where something came, on the earlier where it went."""
     bits = {ChangeKind.DISAPPEARED: Shade.EARLIER, ChangeKind.REPLACED: Shade.LATER | Shade.EARLIER}
-    return np.asarray((patch.shade & np.uint8(bits.get(kind, Shade.LATER))) > 0)
+    return (patch.shade & np.uint8(bits.get(kind, Shade.LATER))) > 0
 
 
 def thing_of(changed: Mask, shadow: Mask) -> Mask:
@@ -61,9 +61,7 @@ def thing_of(changed: Mask, shadow: Mask) -> Mask:
     areas = stats[:, cv2.CC_STAT_AREA].copy()
     areas[0] = -1  # the ground: no piece, however small pieces may be
     kept = (areas >= _LEAST_PIECE * areas.max())[labels].view(np.uint8)
-    return np.asarray(
-        (cv2.dilate(_hull(kept).view(np.uint8), np.ones((3, 3), np.uint8)) > 0) & changed
-    )
+    return (cv2.dilate(_hull(kept).view(np.uint8), np.ones((3, 3), np.uint8)) > 0) & changed
 
 
 def things_of(patch: Patch, kind: ChangeKind, changed: Mask) -> list[tuple[Mask, ChangeKind]]:
@@ -76,7 +74,7 @@ def things_of(patch: Patch, kind: ChangeKind, changed: Mask) -> list[tuple[Mask,
     if _may_be_a_car(changed, patch.m_per_px):
         return [(changed, kind)]
     labels = _joined(changed, int((_GAP_M / patch.m_per_px - 1) / 2))
-    dark = np.asarray((patch.shade & np.uint8(Shade.LATER_DARK | Shade.EARLIER_DARK)) > 0)
+    dark = (patch.shade & np.uint8(Shade.LATER_DARK | Shade.EARLIER_DARK)) > 0
     # what is all shadow is no piece of its own
     bare_m2 = np.bincount(labels[changed & ~dark]) * patch.m_per_px**2
     pieces = [changed & (labels == each) for each in np.flatnonzero(bare_m2 >= _LEAST_M2)]
@@ -118,7 +116,7 @@ def _joined_by_shadow(
 def _lit_things(bare: Mask, m_per_px: float) -> list[Mask]:
     """The solid things, the largest first, in the part of a change that is no shadow."""
     lit = cv2.morphologyEx(bare.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    labels = _joined(np.asarray(lit > 0), round(_APART_M / 2 / m_per_px))
+    labels = _joined(lit > 0, round(_APART_M / 2 / m_per_px))
     areas_m2 = np.bincount(labels[lit > 0]) * m_per_px**2
     large = [
         (labels == each) & (lit > 0)

@@ -103,7 +103,7 @@ class FramePixels:
         x_map, y_map = self._maps
         changed = np.asarray(cv2.remap(view.changed, x_map, y_map, cv2.INTER_NEAREST), np.uint8)
         valid = cv2.remap(view.valid.view(np.uint8), x_map, y_map, cv2.INTER_NEAREST)
-        return changed, np.asarray(valid > 0)
+        return changed, valid > 0
 
     def boxes(self, view: ComparedView) -> Boxes:
         """The view's boxes in the frame's own pixels."""

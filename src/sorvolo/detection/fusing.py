@@ -30,7 +30,7 @@ def calibrated(seen: Seen, info: ModelInfo) -> Seen:
 
 def platt_scaled(scores: Floats | float, how: ScoreCalibration) -> Floats:
     """Scores of any shape, 0 to 1, whose log-odds become `shift` and `slope` times themselves (Platt 1999)."""
-    return np.asarray(1 / (1 + np.exp(-how.shift - how.slope * log_odds(scores, _LEAST))))
+    return 1 / (1 + np.exp(-how.shift - how.slope * log_odds(scores, _LEAST)))
 
 
 def platt_fit(scores: Floats, right: Mask) -> ScoreCalibration | None:
@@ -76,7 +76,7 @@ def scaled_thresholds(
 def log_odds(scores: Floats | float, least: float) -> Floats:
     """log(p / (1 - p)) of scores p of any shape, which count for `least` at least and for 1 - `least` at most."""
     inside = np.clip(scores, least, 1 - least)
-    return np.asarray(np.log(inside / (1 - inside)))
+    return np.log(inside / (1 - inside))
 
 
 SAME_IOU = 0.4
@@ -335,4 +335,4 @@ def trust(
     curve = np.exp(-0.5 * (off**2 - (off**2).min(axis=1, keepdims=True))) + _LEAST_TRUST
     is_closer = np.isin(times, times[0] * np.array(pyramid.closer))
     curve[~is_closer[curve.argmax(axis=1)][:, None] & is_closer] = _LEAST_TRUST
-    return np.asarray(curve / curve.sum(axis=1, keepdims=True))
+    return curve / curve.sum(axis=1, keepdims=True)

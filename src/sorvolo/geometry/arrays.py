@@ -1,9 +1,12 @@
 """The array aliases: what shape, order and unit an annotated array has."""
 
-from typing import Any, TypeAlias
+from collections.abc import Sequence
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+_Kind = TypeVar("_Kind", bound=np.generic)
 
 Floats: TypeAlias = NDArray[np.float64]
 """Any float64 array; the docstring gives its shape."""
@@ -84,3 +87,11 @@ def frozen(array: Any, dtype: Any = np.float64) -> Any:
     copy = np.array(array, dtype=dtype, order="C")
     copy.setflags(write=False)
     return copy
+
+
+def shrunk(image: NDArray[_Kind], size_px: Sequence[int]) -> NDArray[_Kind]:
+    """A picture of any kind, (height, width) or (height, width, C), brought to this width and height, less than its own:
+    a pixel is the mean of those that it covers."""
+    import cv2  # most who name arrays shrink none
+
+    return cv2.resize(image, size_px, interpolation=cv2.INTER_AREA)  # type: ignore[arg-type, return-value]

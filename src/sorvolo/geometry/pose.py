@@ -70,7 +70,7 @@ def rotation_from_vector(rotation_vector_rad: Floats) -> Floats:
 def rotation_between(first: Matrix3, last: Matrix3, share: float) -> Matrix3:
     """The rotation so far, from 0 to 1, on the shortest turn from one, (3, 3), to another."""
     turn, _ = cv2.Rodrigues(first.T @ last)
-    return np.asarray(first @ cv2.Rodrigues(share * turn)[0], np.float64)
+    return first @ cv2.Rodrigues(share * turn)[0]
 
 
 def site_from_gimbal_rotation(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Matrix3:

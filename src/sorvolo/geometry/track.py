@@ -42,7 +42,7 @@ def speeds_m_s(points_m: PointsM, times_s: Floats) -> Floats:
     begin = np.flatnonzero(later < len(times_s))
     end = later[begin]
     distance_m = np.linalg.norm(points_m[end] - points_m[begin], axis=1)
-    return np.asarray(distance_m / (times_s[end] - times_s[begin]))
+    return distance_m / (times_s[end] - times_s[begin])
 
 
 def thinned(points_m: PointsM) -> PointsM:

@@ -198,7 +198,7 @@ def height_deviations(scene: Scene, priors: Priors, settings: AdjustmentSettings
     moved -= moved.mean(axis=0)
     system = normal.cameras - _eliminated(normal, inverse)[0]
     half = np.linalg.solve(np.linalg.cholesky(system + 1e-9 * np.eye(len(system))), moved.T)
-    return np.asarray(np.sqrt((half**2).sum(axis=0)))
+    return np.sqrt((half**2).sum(axis=0))
 
 
 def matched_deviations(scene: Scene, priors: Priors, settings: AdjustmentSettings) -> Floats:
@@ -206,10 +206,8 @@ def matched_deviations(scene: Scene, priors: Priors, settings: AdjustmentSetting
 
     The cameras count as known: what they err, all heights near a point err alike.
     """
-    return np.asarray(
-        np.sqrt(
-            np.linalg.inv(_linearise(scene, priors, settings).points + 1e-9 * np.eye(3))[:, 2, 2]
-        )
+    return np.sqrt(
+        np.linalg.inv(_linearise(scene, priors, settings).points + 1e-9 * np.eye(3))[:, 2, 2]
     )
 
 
@@ -357,4 +355,4 @@ def _pulls(derivative: Floats, residual: Floats) -> Floats:
 def _summed(values: Floats, at: Rows, count: int) -> Floats:
     """(count, K) sums of the rows of `values`, (M, K), that belong to each place."""
     sums = csr_matrix((np.ones(len(at)), (at, np.arange(len(at)))), shape=(count, len(at)))
-    return np.asarray(sums @ values)
+    return sums @ values

@@ -10,7 +10,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Floats, ImageGray, Mask, PointsM, Rows
+from sorvolo.geometry.arrays import Floats, ImageGray, Mask, PointsM, Rows, shrunk
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.pose import Pose, rotation_from_vector
 from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
@@ -113,7 +113,7 @@ def _features(gray: ImageGray, view: View) -> _Found:
     scale = min(1.0, FEATURES_SIDE_PX / max(gray.shape))
     if scale < 1.0:
         size = (round(gray.shape[1] * scale), round(gray.shape[0] * scale))
-        gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
+        gray = shrunk(gray, size)
     found = sift_features(normalise_contrast(gray), FeatureSettings(sift_count=_FEATURES))
     rays = view.camera.resized(gray.shape[1], gray.shape[0]).rays_from_pixels(found.points_px)[
         :, :2
@@ -340,7 +340,7 @@ def _along(rotations: Floats, headings: Rows) -> Floats:
 
 
 def _yaws(rotations: Floats) -> Floats:
-    return np.asarray(np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0]))
+    return np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0])
 
 
 def _held(views: Sequence[View], tracks: Tracks) -> Mask:
@@ -380,7 +380,7 @@ def _first(views: Sequence[View], tracks: Tracks) -> Scene:
 
 def _fitting(scene: Scene, limit_px: float) -> Mask:
     with np.errstate(invalid="ignore"):
-        return np.asarray(np.linalg.norm(scene.residuals_px(), axis=1) < limit_px)
+        return np.linalg.norm(scene.residuals_px(), axis=1) < limit_px
 
 
 def _priors(views: Sequence[View]) -> Priors:
@@ -415,7 +415,7 @@ def _sigmas_m(scatter_m: Floats, count: int, freedom: float) -> Floats:
     """(count, 3) the sigma of each fix from how known ones scatter, (N, 3), by its median; `freedom` is N over what is
     left of it."""
     spread = SIGMA_PER_MEDIAN_DEVIATION * np.nanmedian(np.abs(scatter_m), axis=0) * np.sqrt(freedom)
-    return np.asarray(np.broadcast_to(np.maximum(spread, _LEAST_SIGMA_M), (count, 3)))
+    return np.broadcast_to(np.maximum(spread, _LEAST_SIGMA_M), (count, 3))
 
 
 def _solved(views: Sequence[View], scene: Scene, priors: Priors, held: Mask) -> Cameras3D:

@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, Floats32, ImageRGBA, Mask
+from sorvolo.geometry.arrays import Floats, Floats32, ImageRGBA, Mask, shrunk
 from sorvolo.heights.cameras import FEATURES_SIDE_PX, Cameras3D
 from sorvolo.heights.field import HeightField
 from sorvolo.heights.surface import Surface
@@ -207,8 +207,8 @@ def relief_picture(surface: Surface) -> ImageRGBA:
     scale = min(1.0, _LONGEST_PX / max(surface.up_m.shape))
     up_m: Floats32 = np.where(known, surface.up_m, np.nanmedian(surface.up_m)).astype(np.float32)
     size = (max(1, round(up_m.shape[1] * scale)), max(1, round(up_m.shape[0] * scale)))
-    up_m = np.asarray(cv2.resize(up_m, size, interpolation=cv2.INTER_AREA), np.float32)
-    seen = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5
+    up_m = np.asarray(shrunk(up_m, size), np.float32)
+    seen = shrunk(known.astype(np.float32), size) > 0.5
     down, across = (
         np.gradient(up_m, surface.lattice.cell_m / scale)
         if min(up_m.shape) > 1

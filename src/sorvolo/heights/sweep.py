@@ -229,7 +229,7 @@ def _spreads(lattice: Lattice, views: Sequence[View], up_m: float) -> Floats:
         up_m,
     ]
     rays = rays[:, :2] / np.maximum(rays[:, 2:], 0.1)
-    return np.asarray(np.linalg.norm(rays[:, None] - rays[None], axis=2))
+    return np.linalg.norm(rays[:, None] - rays[None], axis=2)
 
 
 class _Laid:
@@ -280,7 +280,7 @@ class _Laid:
         seen = np.column_stack([ends, np.ones(len(ends))]) @ self._at(bounds.usual_m).T
         places = seen[:, :2] / np.maximum(np.abs(seen[:, 2:]), 1e-9)
         moved = places[1:] - places[0]
-        angles = np.asarray(np.rint(np.arctan2(moved[:, 1], moved[:, 0]) / _ANGLE_RAD) % _ANGLES)
+        angles = np.rint(np.arctan2(moved[:, 1], moved[:, 0]) / _ANGLE_RAD) % _ANGLES
         others = (away_m != 0).any(axis=1)
         directions, which = np.unique(angles[others], return_inverse=True)
         self.contrast = np.stack([_contrast(piece, each * _ANGLE_RAD) for each in directions])
@@ -321,7 +321,7 @@ class _Laid:
         ]
 
     def _at(self, up_m: float) -> Matrix3:
-        return np.asarray(self.planes[0] + up_m * self.planes[1])
+        return self.planes[0] + up_m * self.planes[1]
 
 
 def _unit(vectors: Floats) -> Floats:

@@ -75,7 +75,7 @@ def tie(
     """
     shift_m = np.zeros(3)
     down, east = (
-        np.asarray(np.gradient(earlier.up_m.astype(np.float64), earlier.lattice.cell_m, axis=axis))
+        np.gradient(earlier.up_m.astype(np.float64), earlier.lattice.cell_m, axis=axis)
         for axis in (0, 1)
     )
     north = -down

@@ -166,7 +166,7 @@ def find_flight(
 
 def _nadir(rotation: Matrix3) -> Floats:
     down = rotation.T @ np.array([0.0, 0.0, -1.0])
-    return np.asarray(down[:2] / max(float(down[2]), 0.1))
+    return down[:2] / max(float(down[2]), 0.1)
 
 
 def base_grid(

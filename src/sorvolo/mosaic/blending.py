@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import Bytes, ImageGray, ImageRGB, Mask, Numbers
+from sorvolo.geometry.arrays import Bytes, ImageGray, ImageRGB, Mask, Numbers, shrunk
 
 BANDS = 5
 """Bands of the pyramid: four Laplacians and the residual."""
@@ -122,10 +122,7 @@ def coarse_fill(image: ImageRGB, valid: Mask) -> ImageRGB:
     known = valid.astype(np.uint8) * np.uint8(255)
     seen = cv2.copyMakeBorder(cv2.copyTo(image, known), 0, below, 0, beside, cv2.BORDER_CONSTANT)
     share = cv2.copyMakeBorder(known, 0, below, 0, beside, cv2.BORDER_CONSTANT)
-    colours, weights = (
-        cv2.resize(each, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-        for each in (seen, share)
-    )
+    colours, weights = (shrunk(each, size).astype(np.float32) for each in (seen, share))
     small = np.clip(colours * 255 / np.maximum(weights, 1)[..., None] + 0.5, 0, 255).astype(
         np.uint8
     )

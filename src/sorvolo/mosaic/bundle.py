@@ -303,7 +303,7 @@ def _moved_as_one(problem: _Problem, nodes: Nodes, shared: Floats) -> tuple[Node
         basis[: 6 * count, :4] = motions.reshape(-1, 4)
         basis[6 * count :, 4:] = np.eye(len(SHARED))
         among, pull = basis.T @ (equations.matrix() @ basis), basis.T @ equations.gradient()
-        step = np.asarray(np.linalg.lstsq(among, pull, rcond=None)[0], np.float64)
+        step = np.linalg.lstsq(among, pull, rcond=None)[0]
         trial_nodes, trial_shared = _move_as_one(nodes, middle_m, step[:4]), shared + step[4:]
         trial = _normal_equations(problem, trial_nodes, trial_shared)
         if not trial.cost < equations.cost * (1 - 1e-4):

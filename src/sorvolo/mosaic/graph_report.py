@@ -44,7 +44,7 @@ def leans_m(rotations: Floats, stated: Floats, heights_m: Floats) -> Floats:
     here, there = (
         each[:, :2, 2] / -np.minimum(each[:, 2:, 2], -0.1) for each in (rotations, stated)
     )
-    return np.asarray(heights_m * np.linalg.norm(here - there, axis=1) / np.sqrt(2))
+    return heights_m * np.linalg.norm(here - there, axis=1) / np.sqrt(2)
 
 
 def ground_sigmas_m(

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Bytes, ImageRGB, ImageRGBA, Mask
+from sorvolo.geometry.arrays import Bytes, ImageRGB, ImageRGBA, Mask, shrunk
 from sorvolo.geometry.grid import Grid, TileIndex
 
 SETTLING_PX = 64
@@ -106,7 +106,7 @@ def settled(picture: ImageRGB, stored: ImageRGB, lasting: Mask) -> ImageRGB:
     side = 2 * (_REACH_PX // _SHRINK) + 1
     steps, shares = (
         cv2.GaussianBlur(
-            cv2.resize(each, small, interpolation=cv2.INTER_AREA),
+            shrunk(each, small),
             (side, side),
             _REACH_PX / 3 / _SHRINK,
         )

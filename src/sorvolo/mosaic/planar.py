@@ -6,11 +6,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 
-import cv2
 import numpy as np
 
 from sorvolo.errors import GeometryError
-from sorvolo.geometry.arrays import Floats, ImageRGB, Matrix3, PointsM
+from sorvolo.geometry.arrays import Floats, ImageRGB, Matrix3, PointsM, shrunk
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import apply_homography, site_from_image_homography
 from sorvolo.geometry.pose import Pose
@@ -478,7 +477,7 @@ class PlanarMapper:
         gray = gray_from_rgb(image)
         if scale < 1.0:
             size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
-            gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
+            gray = shrunk(gray, size)
             camera = camera.resized(*size)
         gray = normalise_contrast(gray)
         return Keyframe(keyframe_id, camera, gray, orb_features(gray, _LINKS.features), prior)
@@ -702,7 +701,7 @@ class PlanarMapper:
 def _thumbnail(image: ImageRGB) -> ImageRGB:
     scale = min(1.0, 320 / max(image.shape[:2]))
     size = (max(8, round(image.shape[1] * scale)), max(8, round(image.shape[0] * scale)))
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)  # type: ignore[return-value]
+    return shrunk(image, size)
 
 
 def _scaled(points_px: Floats, camera: Camera, small: ImageRGB) -> Floats:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from sorvolo.errors import SettingsError
-from sorvolo.geometry.arrays import ImageGray, ImageRGB, PointsM
+from sorvolo.geometry.arrays import ImageGray, ImageRGB, PointsM, shrunk
 from sorvolo.geometry.camera import Camera
 from sorvolo.registration.features import gray_from_rgb, normalise_contrast, sharpness
 from sorvolo.survey.flight import Frame, LostFrame, PosedFrame
@@ -231,7 +231,7 @@ def small_gray(image: ImageRGB) -> ImageGray:
     """A gray copy whose longer side has 256 px."""
     scale = _SMALL_PX / max(image.shape[:2])
     size = (max(16, round(image.shape[1] * scale)), max(16, round(image.shape[0] * scale)))
-    return gray_from_rgb(cv2.resize(image, size, interpolation=cv2.INTER_AREA))  # type: ignore[arg-type]
+    return gray_from_rgb(shrunk(image, size))
 
 
 def has_texture(image: ImageRGB) -> bool:
@@ -239,7 +239,7 @@ def has_texture(image: ImageRGB) -> bool:
     gray = small_gray(image)
     scale = _COARSE_PX / max(gray.shape)
     size = (max(4, round(gray.shape[1] * scale)), max(4, round(gray.shape[0] * scale)))
-    coarse = cv2.resize(gray.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    coarse = shrunk(gray.astype(np.float32), size)
     return float((coarse - cv2.boxFilter(coarse, -1, (9, 9))).std()) >= _BARE_LEVELS
 
 

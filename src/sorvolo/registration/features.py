@@ -20,6 +20,7 @@ from sorvolo.geometry.arrays import (
     Mask,
     Matrix3,
     PointsPx,
+    shrunk,
 )
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.survey.mosaic import Features
@@ -97,7 +98,7 @@ def _detection_image(gray: ImageGray, settings: FeatureSettings) -> tuple[ImageG
     scale = min(1.0, settings.detection_side_px / max(gray.shape))
     if scale < 1.0:
         size = (max(1, round(gray.shape[1] * scale)), max(1, round(gray.shape[0] * scale)))
-        gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
+        gray = shrunk(gray, size)
     return gray, scale
 
 
@@ -172,7 +173,7 @@ def well_inside(points_px: PointsPx, known: Mask, rim_px: int) -> Mask:
     safe = cv2.erode(known.astype(np.uint8), np.ones((rim_px, rim_px), np.uint8))
     at = np.rint(points_px).astype(int)
     height, width = known.shape
-    return np.asarray(safe[at[:, 1].clip(0, height - 1), at[:, 0].clip(0, width - 1)] > 0)
+    return safe[at[:, 1].clip(0, height - 1), at[:, 0].clip(0, width - 1)] > 0
 
 
 def filled(gray: ImageGray, known: Mask) -> ImageGray:

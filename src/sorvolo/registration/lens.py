@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from cv2.typing import MatLike
 
-from sorvolo.geometry.arrays import ImageRGB, Mask
+from sorvolo.geometry.arrays import ImageRGB, Mask, shrunk
 from sorvolo.geometry.camera import Camera
 
 _VISIBLE_PX = 0.5  # at a corner: what moves no pixel by more is left as it is
@@ -57,7 +57,7 @@ class Undistorter:
         if self._averages:
             image = cv2.blur(image, (2, 2))  # type: ignore[assignment]
         elif image.shape[1::-1] != self._size:
-            image = cv2.resize(image, self._size, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
+            image = shrunk(image, self._size)
         if self._maps is None:
             return image
         return cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[return-value]
@@ -69,7 +69,7 @@ class Undistorter:
         white = np.full(self._mapped_size[::-1], 255, np.uint8)
         seen = cv2.remap(white, *self._maps, cv2.INTER_LINEAR)
         seen = cv2.erode(seen, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
-        mask = cv2.resize(seen, (width_px, height_px), interpolation=cv2.INTER_AREA) == 255
+        mask = shrunk(seen, (width_px, height_px)) == 255
         return None if mask.all() else mask
 
 
@@ -112,9 +112,7 @@ def at_size(image: ImageRGB, width_px: int, height_px: int) -> ImageRGB:
     """The picture, (H, W, 3), at this size; the very same where it has it."""
     if image.shape[1::-1] == (width_px, height_px):
         return image
-    return np.asarray(
-        cv2.resize(image, (width_px, height_px), interpolation=cv2.INTER_AREA), np.uint8
-    )
+    return shrunk(image, (width_px, height_px))
 
 
 def at_most(image: ImageRGB, longest_px: int) -> ImageRGB:

@@ -8,7 +8,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import Floats, Floats16, ImageRGB, Mask, PointsM, Vector3, frozen
+from sorvolo.geometry.arrays import (
+    Floats,
+    Floats16,
+    ImageRGB,
+    Mask,
+    PointsM,
+    Vector3,
+    frozen,
+    shrunk,
+)
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.ground import footprint, is_on_ground
 from sorvolo.geometry.pose import Pose
@@ -84,15 +93,11 @@ def _leaf_roughness(
     """The roughness of leaves, laid on a small picture of (H, W)."""
     scale = max(1.0, _LEAF_M / m_per_px)
     size = max(8, round(image.shape[1] / scale)), max(8, round(image.shape[0] / scale))
-    fine = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32).mean(
-        axis=2
-    )
+    fine = np.asarray(shrunk(image, size), np.float32).mean(axis=2)
     around = _odd_px(_LEAVES_M, max(m_per_px, _LEAF_M))
     # over the frame's lightness where it is darker there: shadows are rough over their own mean by their rims alone
     rough = _rough(fine, around, usual)
-    return np.asarray(
-        cv2.resize(rough, (shape[1], shape[0]), interpolation=cv2.INTER_AREA), np.float32
-    )
+    return np.asarray(shrunk(rough, (shape[1], shape[0])), np.float32)
 
 
 def _towards_sun(dark: Mask, sunward: Floats, m_per_px: float) -> Mask:
@@ -248,7 +253,7 @@ def look_at(
     scale = max(1.0, _LOOK_M / m_per_px)
     small_m = max(m_per_px, _LOOK_M)
     size = max(8, round(camera.width_px / scale)), max(8, round(camera.height_px / scale))
-    small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
+    small = np.asarray(shrunk(image, size), np.float32)
     lightness = small.mean(axis=2)
     texture = _rough(lightness, _odd_px(_WINDOW * _LOOK_M, small_m), _LEAST_GREY)
     crowns = crowns_in(image, small, m_per_px, small_m, _sunward(site_from_camera, sun))

@@ -123,7 +123,7 @@ def held_out_chances(columns: Floats, found: Mask) -> Floats:
 
 
 def _logistic(odds: Floats) -> Floats:
-    return np.asarray(1.0 / (1.0 + np.exp(-np.clip(odds, -35, 35))), np.float64)
+    return 1.0 / (1.0 + np.exp(-np.clip(odds, -35, 35)))
 
 
 @dataclass(frozen=True)

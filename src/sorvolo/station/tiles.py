@@ -25,7 +25,7 @@ from rasterio.windows import Window
 
 from sorvolo.canopy.integral import against_surroundings, averaged, levelled, seeing
 from sorvolo.errors import SorvoloError
-from sorvolo.geometry.arrays import Floats, Floats32, ImageRGBA, Numbers
+from sorvolo.geometry.arrays import Floats, Floats32, ImageRGBA, Numbers, shrunk
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import Grid, SiteGrid, TileIndex
 from sorvolo.heights.lattice import Lattice
@@ -498,7 +498,7 @@ class FloorTiles:
 def _levels(pictures: FlightPictures, number: int, camera: Camera) -> NDArray[np.int16]:
     """(H, W) a picture in gray without its usual level, of a camera's size."""
     size = camera.width_px, camera.height_px
-    gray = cv2.resize(pictures.gray(number), size, interpolation=cv2.INTER_AREA)
+    gray = shrunk(pictures.gray(number), size)
     return levelled(np.asarray(gray, np.uint8)).astype(np.int16)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from cv2.typing import MatLike
 
 from sorvolo.errors import StoreError
-from sorvolo.geometry.arrays import Floats32, ImageRGB, ImageRGBA, Mask, frozen
+from sorvolo.geometry.arrays import Floats32, ImageRGB, ImageRGBA, Mask, frozen, shrunk
 
 Key = TypeVar("Key", bound=Hashable)
 Kept = TypeVar("Kept")
@@ -60,7 +60,7 @@ def jpeg_from_image(image: ImageRGB, most_px: int | None = None) -> bytes:
     if most_px is not None and max(image.shape[:2]) > most_px:
         scale = most_px / max(image.shape[:2])
         size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
-        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+        image = shrunk(image, size)
     _, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), _JPEG)
     return data.tobytes()
 
@@ -147,10 +147,10 @@ def shrink(rgba: ImageRGBA, width: int, height: int) -> ImageRGBA:
         return rgba
     size = (width, height)
     if rgba[..., 3].min() == 255:
-        return np.asarray(cv2.resize(rgba, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        return shrunk(rgba, size)
     times = rgba.shape[0] // height
     if rgba.shape[:2] != (height * times, width * times):
-        return unweighted(cv2.resize(weighted(rgba), size, interpolation=cv2.INTER_AREA))
+        return unweighted(shrunk(weighted(rgba), size))
     if not _is_partly_seen(rgba).any():
         return _shrunk_rim(rgba, times)
     rows = max(
@@ -158,14 +158,7 @@ def shrink(rgba: ImageRGBA, width: int, height: int) -> ImageRGBA:
     )  # at a time: as floats the whole may be hundreds of megabytes
     parts = [rgba[first * times : (first + rows) * times] for first in range(0, height, rows)]
     return np.concatenate(
-        [
-            unweighted(
-                cv2.resize(
-                    weighted(each), (width, len(each) // times), interpolation=cv2.INTER_AREA
-                )
-            )
-            for each in parts
-        ]
+        [unweighted(shrunk(weighted(each), (width, len(each) // times))) for each in parts]
     )
 
 

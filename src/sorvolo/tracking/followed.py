@@ -246,7 +246,7 @@ def inward_m(outline_m: PointsM, points_m: PointsM) -> Floats:
     side = (edges[None, :, 0] * away[..., 1] - edges[None, :, 1] * away[..., 0]) / lengths
     middle = outline_m.mean(axis=0) - outline_m
     turn = np.sign(np.sum(edges[:, 0] * middle[:, 1] - edges[:, 1] * middle[:, 0]))
-    return np.asarray((side * turn).min(axis=1))
+    return (side * turn).min(axis=1)
 
 
 def neighbours(

@@ -5,7 +5,16 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, Mask, Matrix3, PointsPx, frozen
+from sorvolo.geometry.arrays import (
+    Floats,
+    ImageGray,
+    ImageRGB,
+    Mask,
+    Matrix3,
+    PointsPx,
+    frozen,
+    shrunk,
+)
 from sorvolo.survey.flight import Frame
 from sorvolo.survey.objects import Detections, Sighting
 
@@ -104,9 +113,9 @@ class ImageMotion:
         """Find where a picture lies."""
         shrink = min(1.0, _WIDTH_PX / image.shape[1])
         size = (round(image.shape[1] * shrink), round(image.shape[0] * shrink))
-        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if shrink < 1 else image
+        small = shrunk(image, size) if shrink < 1 else image
         gray = np.asarray(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), np.uint8)
-        thumbnail = cv2.resize(gray, _THUMBNAIL_PX, interpolation=cv2.INTER_AREA).astype(np.float64)
+        thumbnail = shrunk(gray, _THUMBNAIL_PX).astype(np.float64)
         if self._last is None or self._last.gray.shape != gray.shape:
             if self._last is not None:
                 self._begin_segment()
@@ -265,7 +274,7 @@ def _similarity(here: PointsPx, places: PointsPx) -> tuple[Floats | None, Floats
 
 
 def _moved(transform: Floats, points: PointsPx) -> PointsPx:
-    return np.asarray(points @ transform[:, :2].T + transform[:, 2])
+    return points @ transform[:, :2].T + transform[:, 2]
 
 
 def _composed(outer: Floats, inner: Floats) -> Floats:

@@ -141,7 +141,7 @@ def log_density(gaps: Floats, spread: Floats) -> Floats:
     """(...,) log of the Gaussian density of (..., d) with covariances (..., d, d)."""
     squared = np.sum(gaps * np.linalg.solve(spread, gaps[..., None])[..., 0], axis=-1)
     size = gaps.shape[-1]
-    return np.asarray(-0.5 * (squared + np.log(np.linalg.det(spread)) + size * np.log(2 * np.pi)))
+    return -0.5 * (squared + np.log(np.linalg.det(spread)) + size * np.log(2 * np.pi))
 
 
 def _moved_on(

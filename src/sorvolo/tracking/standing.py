@@ -424,7 +424,7 @@ def _standing(
     elif has_metres:
         size_m = fitted_size_m(chosen, label, 2 * max(usual_up_m + float(answer[2]), 0.0))
     else:
-        size_m = np.asarray(np.median([each.sighting.size_m for each in chosen], axis=0))
+        size_m = np.median([each.sighting.size_m for each in chosen], axis=0)
     return Standing(
         tuple(members),
         _best(members, laid, label),

@@ -8,9 +8,6 @@ from collections.abc import Callable, Iterator
 from math import nan
 from pathlib import Path
 
-import cv2
-import numpy as np
-
 from sorvolo.capture.decoding import PHOTO_SUFFIXES, is_same_shape, other_size
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.segments import FlightSoFar
@@ -25,7 +22,7 @@ from sorvolo.capture.photos import read_picture
 from sorvolo.capture.sync import FIX_DELAY_S, PHOTO_TIE
 from sorvolo.capture.telemetry.cleaning import notice
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Floats, TimesNs
+from sorvolo.geometry.arrays import Floats, TimesNs, shrunk
 from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry
 
 _POLL_S = 0.25  # photos are seconds apart; by choice
@@ -226,9 +223,7 @@ class GrowingFolder:
         if own_px != self.size_px:
             if not is_same_shape(own_px, self.size_px):
                 return LostFrame(index, path.name, time_ns, other_size(own_px, self.size_px))
-            image = np.asarray(
-                cv2.resize(image, self.size_px, interpolation=cv2.INTER_AREA), dtype=np.uint8
-            )
+            image = shrunk(image, self.size_px)
         return Frame(index, path.name, time_ns, image)
 
     def _note_place(self, time_ns: int, metadata: PhotoMetadata) -> None:

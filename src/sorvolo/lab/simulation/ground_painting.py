@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.random import Generator
 
-from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB
+from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, shrunk
 from sorvolo.search.drawing.noise import FieldF32, fractal, layer
 
 _COARSE = 4  # materials are mixed on a raster this many times coarser than the picture
@@ -69,10 +69,8 @@ class GroundRaster:
         size = (new_width, new_height)
         return replace(
             self,
-            rgb=np.asarray(cv2.resize(self.rgb, size, interpolation=cv2.INTER_AREA), np.uint8),
-            vegetation=np.asarray(
-                cv2.resize(self.vegetation, size, interpolation=cv2.INTER_AREA), np.uint8
-            ),
+            rgb=shrunk(self.rgb, size),
+            vegetation=shrunk(self.vegetation, size),
             m_per_px=(self.m_per_px[0] * width / new_width, self.m_per_px[1] * height / new_height),
         )
 

@@ -355,7 +355,7 @@ def _gains(weather: WeatherSettings, rng: Generator) -> Floats:
     is_other = weather.has_other_light
     warmth = rng.uniform(-0.06, 0.06) if is_other else 0.0
     gains = np.array([1 + warmth, 1.0, 1 - warmth]) * (rng.uniform(0.82, 1.12) if is_other else 1.0)
-    return np.asarray(gains * weather.brightness)
+    return gains * weather.brightness
 
 
 def scenery(ground: str, layout: GroundLayout, rng: Generator) -> tuple[Thing, ...]:

@@ -24,6 +24,7 @@ from sorvolo.geometry.arrays import (
     PointsM,
     PointsPx,
     frozen,
+    shrunk,
 )
 from sorvolo.geometry.homography import apply_homography, fit_similarity, resized
 from sorvolo.geometry.polygons import polygon_area
@@ -116,9 +117,7 @@ class RoiStitcher:
         outline = apply_homography(placed.mosaic_from_image, _corners(width, height))
         if reason := _misplaced(outline, width * height):
             return reason
-        small = cv2.resize(
-            gray, (width // _SHRINK, height // _SHRINK), interpolation=cv2.INTER_AREA
-        ).astype(np.float64)
+        small = shrunk(gray, (width // _SHRINK, height // _SHRINK)).astype(np.float64)
         new = _Pasted(placed, gray, small)
         reach = float(np.hypot(width, height))
         away = {

@@ -316,4 +316,4 @@ def _on_plane(view: View, matrix: Matrix3, model: GroundModel) -> Matrix3:
     project = matrix @ np.column_stack([turn, -turn @ view.site_from_camera.translation_m])
     raised = np.array([[1.0, 0, 0], [0, 1, 0], plane, [0, 0, 1]])
     site_from_image = np.linalg.inv(project @ raised)
-    return np.asarray(site_from_image / site_from_image[2, 2])
+    return site_from_image / site_from_image[2, 2]

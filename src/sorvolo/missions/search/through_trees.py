@@ -13,7 +13,7 @@ from sorvolo.canopy.finds import Find, Finds, average, look_under_trees
 from sorvolo.canopy.integral import LEAST_VIEWS, Floor, Picture, UnderTrees, lay, levelled
 from sorvolo.canopy.planting import PlantedFloor, free_share, plant_on_floor
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Floats32, ImageGray, ImageRGB, ImageRGBA, Numbers
+from sorvolo.geometry.arrays import Floats32, ImageGray, ImageRGB, ImageRGBA, Numbers, shrunk
 from sorvolo.heights.cameras import Cameras3D, Matches, find_tracks, solve_steady, solve_tracks
 from sorvolo.heights.field import HeightField
 from sorvolo.heights.figures import camera_figures
@@ -145,14 +145,14 @@ def look_through_trees(
     def load(number: int) -> Any:
         size = views[number].camera.width_px, views[number].camera.height_px
         stored = gray_from_rgb(colour(number)) if is_thermal else colour(number)
-        image = np.asarray(cv2.resize(stored, size, interpolation=cv2.INTER_AREA), np.uint8)
+        image = shrunk(stored, size)
         # half levels take half the memory of floats: a median is at one
         return (2 * levelled(image)).astype(np.int16)
 
     kept = BytesCache[int, Any](_PICTURES_BYTES, lambda image: image.nbytes)
 
     def picture(number: int) -> Floats32:
-        return np.asarray(kept.get(number, lambda: load(number)) * np.float32(0.5))
+        return kept.get(number, lambda: load(number)) * np.float32(0.5)
 
     lattice = Lattice.over(ground_outlines_m(views, floor_m[0]), height_grid(site, cell_m))
     under, floor, finds = look_under_trees(views, picture, lattice, *floor_m)

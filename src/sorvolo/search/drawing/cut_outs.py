@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Self
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, ImageRGBA, Mask
+from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, ImageRGBA, Mask, shrunk
 from sorvolo.registration.features import FeatureSettings, gray_from_rgb, sift_features
 from sorvolo.registration.matching import fit_homography, match
 from sorvolo.search.drawing.objects import GROUND_LEVEL, Body, Thing, ThingLabel
@@ -95,9 +95,7 @@ class CutThing(Thing):
         texture, (width_m, height_m) = self.cut_out.texture, self.cut_out.size_m
         size = max(1, round(width_m / m_per_px)), max(1, round(height_m / m_per_px))
         if size[0] < texture.shape[1]:
-            texture = np.asarray(
-                cv2.resize(texture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8
-            )
+            texture = shrunk(texture, size)
         corners_m = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]]) * [width_m / 2, height_m / 2]
         level_m = np.column_stack([corners_m, np.full(4, _HEIGHT_M)])
         return Body((DrawnPatch.spanned(level_m, texture, np.zeros(3)),))
@@ -106,11 +104,7 @@ class CutThing(Thing):
 def sheet_of(cut_outs: Sequence[CutOut]) -> ImageRGBA:
     """(H, W, 4) all of them in a row, 1 cm a pixel, clear where nobody is."""
     shown = [
-        cv2.resize(
-            each.texture,
-            (max(1, round(100 * width)), max(1, round(100 * height))),
-            interpolation=cv2.INTER_AREA,
-        )
+        shrunk(each.texture, (max(1, round(100 * width)), max(1, round(100 * height))))
         for each in cut_outs
         for width, height in [each.size_m]
     ]

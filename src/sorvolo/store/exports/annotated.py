@@ -9,7 +9,7 @@ import av
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import BoxesPx, ImageRGB, Mask
+from sorvolo.geometry.arrays import BoxesPx, ImageRGB, Mask, shrunk
 from sorvolo.store.atomic import (
     TEMPORARY_PREFIX,
     atomic_write_bytes,
@@ -112,9 +112,7 @@ class AnnotatedVideo:
             assert self._container is not None and self._stream is not None
             size = (self._stream.width, self._stream.height)
             if picture.shape[1::-1] != size:
-                picture = np.asarray(
-                    cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8
-                )
+                picture = shrunk(picture, size)
             frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
             tick = max(
                 (time_ns - self._first_ns) * _TICKS_PER_S // 1_000_000_000, self._last_tick + 1

@@ -119,7 +119,7 @@ def _drawing(tracks: Sequence[_Track], drone_m: Floats, *, is_local: bool) -> Ma
     middle_px = np.array([_WIDE_PX, height_px]) / 2
 
     def on_drawing(points: Floats) -> Floats:
-        return np.asarray(middle_px + signs * (points - (low + high) / 2) * scale)
+        return middle_px + signs * (points - (low + high) / 2) * scale
 
     bar = round_length(0.25 * (_WIDE_PX - 2 * _RIM_PX) / scale)
     places_px = on_drawing(places)
