@@ -589,6 +589,17 @@ def test_a_flight_is_sorted_by_time_then_by_name(tmp_path: Path) -> None:
     assert source.kind == "photos" and source.frame_count == 4 and math.isnan(source.frame_rate_hz)
 
 
+def test_photos_of_different_days_are_no_silent_flight(tmp_path: Path) -> None:
+    """Two flights in one folder, or a clock that was reset: changes between them would be painted over each other."""
+    for folder, second_day in (("one", "2026:06:01 17:00:0"), ("two", "2026:06:02 12:00:0")):
+        (tmp_path / folder).mkdir()
+        for index, day in enumerate(["2026:06:01 12:00:0"] * 2 + [second_day] * 2):
+            path = tmp_path / folder / f"{index}.jpg"
+            write_photo(path, local=f"{day}{index}", utc=f"{day}{index}", seed=index)
+    assert codes(open_photos(tmp_path / "one")) == {"gap": 1}
+    assert codes(open_photos(tmp_path / "two")) == {"gap": 1, "days_apart": 1}
+
+
 def test_an_unknown_zone_is_reported_and_no_time_too(tmp_path: Path) -> None:
     (tmp_path / "local").mkdir()
     for index in range(3):

@@ -40,6 +40,7 @@ from sorvolo.survey.flight import (
 _LOOK_AHEAD = 1  # photos decoded while one is worked on; each takes tens of megabytes
 # that a camera's clock is off its receiver's by more or less; by choice
 _SAME_CLOCK_NS = 600 * SECOND_NS
+_SAME_DAY_NS = DAY_NS // 2
 _STEP_NS = 1_000_000  # between photos of the same second
 # between photos that state no time: their order is kept, a second each by choice
 _UNTIMED_STEP_NS = 1_000_000_000
@@ -235,6 +236,12 @@ def read_album(
             *place_notices,
             *time_notices,
             *gps_notices,
+            *notice(
+                "days_apart",
+                sum(now.time_ns - then.time_ns > _SAME_DAY_NS for then, now in pairwise(timed)),
+                "breaks of more than 12 hours between photos: {}; if these are two flights, or a clock was reset, map each "
+                "part from a folder of its own",
+            ),
             *notice(
                 "duplicate_photo",
                 sum(photo.fault is PhotoFault.DUPLICATE for photo in photos),
