@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sorvolo.change.ground import GroundSums
 from sorvolo.change.light import OCTAVES
-from sorvolo.change.outlines import measures, outline_of, place_sigma_m
+from sorvolo.change.outlines import dilated, measures, opened, outline_of, place_sigma_m
 from sorvolo.geometry.arrays import Bytes, Floats32, ImageRGB, Mask, Matrix3, shrunk
 from sorvolo.geometry.homography import resized
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView
@@ -242,10 +242,9 @@ def segments(signs: GroundSigns) -> Iterator[tuple[Mask, float]]:
     free = signs.known & (
         _otherness(_smooth(signs.likeness[..., None], known, finest)[..., 0], near) > 0
     )
-    cores = cv2.morphologyEx(
-        (core > _SEED).view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)
-    )
-    for cells in _joined(list(_grown(cores > 0, near, free, signs.surface)), signs.surface):
+    for cells in _joined(
+        list(_grown(opened(core > _SEED), near, free, signs.surface)), signs.surface
+    ):
         yield cells, float(np.mean(core[cells]))
 
 
@@ -305,14 +304,14 @@ def _share(rim: Mask, cells: Mask) -> float:
 
 def _rim(cells: Mask, reach: int) -> Mask:
     """The cells around, up to this many away."""
-    return (cv2.dilate(cells.view(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) > 0) & ~cells
+    return dilated(cells, 2 * reach + 1) & ~cells
 
 
 def _connected(cells: Mask, own: Mask) -> Mask:
     """The pieces of cells that hold some of an area's own, thin bridges cut."""
-    opened = cv2.morphologyEx(cells.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    _, labels = cv2.connectedComponents(opened, connectivity=4)
-    held = np.unique(labels[own & (opened > 0)])
+    without = opened(cells)
+    _, labels = cv2.connectedComponents(without.view(np.uint8), connectivity=4)
+    held = np.unique(labels[own & without])
     return np.isin(labels, held[held > 0])
 
 

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
+from sorvolo.change.outlines import dilated
 from sorvolo.geometry.arrays import Boxes, Floats, ImageGray, Mask
 
 _MAP = 0  # the first of the opinions
@@ -44,9 +44,8 @@ def believed(
     it as well. What the map does not show needs two of them, or a single one that is very sure. Nothing is kept where
     the map knows no ground.
     """
-    window = np.ones((_NEAR_PX, _NEAR_PX), np.uint8)
     opinions = [
-        _Opinion(each, sees, cv2.dilate(each.mask, window) > 0) for each, sees in (by_map, *earlier)
+        _Opinion(each, sees, dilated(each.mask, _NEAR_PX)) for each, sees in (by_map, *earlier)
     ]
     known = by_map[1]
     mask = np.zeros_like(by_map[0].mask)

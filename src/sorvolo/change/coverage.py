@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from sorvolo.change.ground import CHUNK, CellWindow, chunk_parts, window_around
+from sorvolo.change.outlines import opened
 from sorvolo.change.planting import (
     CONTRASTS,
     Planted,
@@ -219,10 +220,7 @@ class GroundCoverage:
         is_compared = (clean >= _LEAST_VIEWS) & (clean >= hidden.sum(axis=0))
         classes = np.where(is_compared, _CLEAN, classes)
         differs = is_compared & ~explained & (chunk.differs >= _DIFFERS * clean)
-        whole = (
-            cv2.morphologyEx(differs.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
-        )
-        return np.where(whole, names.index(Gap.UNEXPLAINED), classes)
+        return np.where(opened(differs), names.index(Gap.UNEXPLAINED), classes)
 
     def _marks(self, view: ComparedView, *, is_dark: bool, doubted: Mask | None) -> Bytes:
         """A view's pixels, (h, w): 255 compared, else 1 + the place of what kept it from that; 0 where it sees nothing."""

@@ -9,7 +9,7 @@ import numpy as np
 from sorvolo.change.ground import GroundSums
 from sorvolo.change.kinds import kind_of
 from sorvolo.change.learned import learned_difference
-from sorvolo.change.outlines import mask_of, measures, outline_of, overlap, place_sigma_m
+from sorvolo.change.outlines import mask_of, measures, opened, outline_of, overlap, place_sigma_m
 from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, Mask, PointsM
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Shade
@@ -196,8 +196,8 @@ class GatheredThings:
         seen = np.maximum(sums["seen"], 1)
         mean = {name: sums[name] / seen for name in _SUMS[1:]}
         differs = (sums["seen"] >= _LEAST_VIEWS) & (mean["apart"] > _SPREADS)
-        opened = cv2.morphologyEx(differs.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-        count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
+        whole = opened(differs).view(np.uint8)
+        count, labels, stats, _ = cv2.connectedComponentsWithStats(whole, connectivity=4)
         for label in range(1, count):
             x, y, wide, high, cells = (int(each) for each in stats[label])
             if cells < _LEAST_CELLS:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from sorvolo.change.outlines import dilated
 from sorvolo.geometry.arrays import Bytes, Floats, Floats32, ImageRGB, ImageRGBA, Labels, Mask
 from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 from sorvolo.survey.findings import ChangeKind, Patch
@@ -68,9 +69,9 @@ class _Region(NamedTuple):
         part = _near(changed, reach + 8)
         changed = changed[part]
         marked = changed.astype(np.uint8)
-        near = cv2.dilate(marked, np.ones((7, 7), np.uint8)) > 0
-        around = (cv2.dilate(marked, np.ones((2 * reach + 7, 2 * reach + 7), np.uint8)) > 0) & ~near
-        rim = near & (cv2.erode(marked, np.ones((5, 5), np.uint8)) == 0)
+        near = dilated(changed, 7)
+        around = dilated(changed, 2 * reach + 7) & ~near
+        rim = near & dilated(~changed, 5)
         return cls(part, changed, around, rim, _outwards(marked))
 
 

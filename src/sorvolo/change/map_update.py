@@ -5,6 +5,7 @@ from collections.abc import Iterable, Mapping, MutableMapping
 import cv2
 import numpy as np
 
+from sorvolo.change.outlines import dilated
 from sorvolo.geometry.arrays import Floats32, ImageRGBA, Matrix3, PointsM
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.geometry.homography import apply_homography
@@ -119,9 +120,11 @@ def _weight(patch: Patch, grow: int, feather: int) -> Floats32:
 
 def _gains(patch: Patch, grow: int) -> Floats32:
     """(3,) what the later picture's channels are multiplied with to look like the map's ground around the change."""
-    size = 2 * grow + 1
-    near = cv2.dilate(patch.changed.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
-    ring = ~near & (patch.before[..., 3] > 0) & (patch.after[..., 3] > 0)
+    ring = (
+        ~dilated(patch.changed, 2 * grow + 1)
+        & (patch.before[..., 3] > 0)
+        & (patch.after[..., 3] > 0)
+    )
     if np.count_nonzero(ring) < _LEAST_RING_PX:
         return np.ones(3, np.float32)
     before = np.median(patch.before[ring][:, :3], axis=0) + 1.0

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from sorvolo.change.light import BLACK_LEVEL
+from sorvolo.change.outlines import dilated
 from sorvolo.geometry.arrays import Bytes, Floats, Floats32, ImageRGB, Mask, shrunk
 from sorvolo.survey.findings import ComparedView
 
@@ -122,7 +123,7 @@ def planted_in(
     """Draw things of all sizes and contrasts where the view shows no change, and see which are found."""
     rough = texture(view)
     picture = view.image.copy()
-    free = view.valid & (cv2.dilate(view.changed, np.ones((9, 9), np.uint8)) == 0)
+    free = view.valid & ~dilated(view.changed, 9)
     drawn: list[tuple[float, float, float, tuple[slice, slice], Mask]] = []
     for number, place in enumerate(_places(free, rng)):
         size = SIZES_PX[number % len(SIZES_PX)]

@@ -3,13 +3,13 @@
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 
-import cv2
 import numpy as np
 
 from sorvolo.change.gathered import GatheredThings
 from sorvolo.change.outlines import (
     KnownPlace,
     area_sigma_m,
+    dilated,
     is_known,
     mask_of,
     measures,
@@ -86,7 +86,7 @@ def _inside(change: Change, outline_m: PointsM) -> float:
 def _is_thing(patch: Patch, stands_out: float) -> bool:
     """Whether what changed differs from the ground around it by more than that ground varies, before or after."""
     reach = max(3, round(0.15 * max(patch.changed.shape)))
-    near = cv2.dilate(patch.changed.astype(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) > 0
+    near = dilated(patch.changed, 2 * reach + 1)
     for picture in (patch.before, patch.after):
         known = picture[..., 3] > 0
         ring, own = near & ~patch.changed & known, patch.changed & known

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from sorvolo.change.light import PairLight, fit_light, relit
+from sorvolo.change.outlines import dilated
 from sorvolo.change.regions import (
     Image,
     Regions,
@@ -125,7 +126,7 @@ def grown(regions: Regions, region: int, came: bool, views: Views) -> ThingPixel
     window = _window(regions, region, _REACH_PX)
     strength, labels = regions.strength[window], regions.labels[window]
     core = labels == region + 1
-    quiet = cv2.dilate((labels > 0).view(np.uint8), np.ones((7, 7), np.uint8)) == 0
+    quiet = ~dilated(labels > 0, 7)
     if not quiet.any():
         return None
     top = int(strength[core].max())

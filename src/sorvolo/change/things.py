@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from sorvolo.change.kinds import kind_of
-from sorvolo.change.outlines import hull_of, measures, outline_of
+from sorvolo.change.outlines import dilated, hull_of, measures, opened, outline_of
 from sorvolo.geometry.arrays import Bytes, Floats32, Ints32, Mask
 from sorvolo.survey.findings import Change, ChangeKind, Patch, Shade
 
@@ -54,14 +54,14 @@ def shadow_of(patch: Patch, kind: ChangeKind) -> Mask:
 def thing_of(changed: Mask, shadow: Mask) -> Mask:
     """The part of the change that is the thing, not its shadow; `changed` itself where hardly anything would stay."""
     lit = changed & ~shadow
-    opened = cv2.morphologyEx(lit.view(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
-    if np.count_nonzero(opened) < max(_LEAST_PX, _LEAST_SHARE * np.count_nonzero(changed)):
+    solid = opened(lit, 2)
+    if np.count_nonzero(solid) < max(_LEAST_PX, _LEAST_SHARE * np.count_nonzero(changed)):
         return changed
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(solid.view(np.uint8), connectivity=8)
     areas = stats[:, cv2.CC_STAT_AREA].copy()
     areas[0] = -1  # the ground: no piece, however small pieces may be
     kept = (areas >= _LEAST_PIECE * areas.max())[labels].view(np.uint8)
-    return (cv2.dilate(_hull(kept).view(np.uint8), np.ones((3, 3), np.uint8)) > 0) & changed
+    return dilated(_hull(kept), 3) & changed
 
 
 def things_of(patch: Patch, kind: ChangeKind, changed: Mask) -> list[tuple[Mask, ChangeKind]]:
@@ -115,13 +115,11 @@ def _joined_by_shadow(
 
 def _lit_things(bare: Mask, m_per_px: float) -> list[Mask]:
     """The solid things, the largest first, in the part of a change that is no shadow."""
-    lit = cv2.morphologyEx(bare.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    labels = _joined(lit > 0, round(_APART_M / 2 / m_per_px))
-    areas_m2 = np.bincount(labels[lit > 0]) * m_per_px**2
+    lit = opened(bare)
+    labels = _joined(lit, round(_APART_M / 2 / m_per_px))
+    areas_m2 = np.bincount(labels[lit]) * m_per_px**2
     large = [
-        (labels == each) & (lit > 0)
-        for each in np.argsort(-areas_m2)
-        if areas_m2[each] >= _LEAST_M2
+        (labels == each) & lit for each in np.argsort(-areas_m2) if areas_m2[each] >= _LEAST_M2
     ]
     return [
         each for each in large if np.count_nonzero(each) >= _SOLID * np.count_nonzero(_hull(each))
