@@ -163,10 +163,10 @@ def aside_of(outline_m: PointsM, cameras_m: PointsM) -> float:
 
 def dilated(mask: Mask | Bytes, side_px: int) -> Mask:
     """Where (h, w) a window of this side, around the pixel, holds some of a mask."""
-    return np.asarray(cv2.dilate(mask.view(np.uint8), np.ones((side_px,) * 2, np.uint8)) > 0)
+    return cv2.dilate(mask.view(np.uint8), np.ones((side_px,) * 2, np.uint8)) > 0
 
 
 def opened(mask: Mask, side_px: int = 3) -> Mask:
     """A mask without what is narrower than a window of this side."""
     window = np.ones((side_px,) * 2, np.uint8)
-    return np.asarray(cv2.morphologyEx(mask.view(np.uint8), cv2.MORPH_OPEN, window) > 0)
+    return cv2.morphologyEx(mask.view(np.uint8), cv2.MORPH_OPEN, window) > 0
