@@ -31,6 +31,7 @@ from sorvolo.geometry.homography import (
     apply_homography,
     pose_from_homography,
     resized,
+    shifted,
     site_from_image_homography,
 )
 from sorvolo.geometry.pose import Pose
@@ -497,9 +498,7 @@ class Aligner:
         (dx, dy), response = cv2.phaseCorrelate(old, fresh, window)
         if response < 0.05 or abs(dx) > 0.4 * size[0] or abs(dy) > 0.4 * size[1]:
             return site_from_image
-        return site_from_image @ np.array(
-            [[1.0, 0.0, -step_x * dx], [0.0, 1.0, -step_y * dy], [0.0, 0.0, 1.0]]
-        )
+        return site_from_image @ shifted(-step_x * dx, -step_y * dy)
 
     def _by_features(
         self,

@@ -318,9 +318,7 @@ def _connected(cells: Mask, own: Mask) -> Mask:
 def _whole(cells: Mask, gap: int = 2) -> Mask:
     """The cells without gaps up to twice `gap` wide, and without small holes."""
     window = np.ones((2 * gap + 1,) * 2, np.uint8)
-    padded = cv2.copyMakeBorder(
-        cells.view(np.uint8), gap, gap, gap, gap, cv2.BORDER_CONSTANT, value=0
-    )
+    padded = np.pad(cells.view(np.uint8), gap)
     closed = np.ascontiguousarray(
         cv2.morphologyEx(padded, cv2.MORPH_CLOSE, window)[gap:-gap, gap:-gap]
     )

@@ -21,6 +21,7 @@ from sorvolo.change.patches import Cut, PatchWindow, cut, moved, patch_of, quali
 from sorvolo.change.things import things_of
 from sorvolo.errors import GeometryError
 from sorvolo.geometry.arrays import Bytes, Floats, Mask, PointsM
+from sorvolo.geometry.homography import shifted
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Patch
 
 _MOST_VOTES = 250  # a byte counts them
@@ -168,11 +169,9 @@ class Pictures:
         window = self._window
         if window is None or not self._votes:
             return None
-        padded = cv2.copyMakeBorder(
-            cells.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0
-        )
+        padded = np.pad(cells.astype(np.uint8), 1)
         grown = cv2.dilate(padded, np.ones((3, 3), np.uint8))
-        cells_from_padded = np.array([[1, 0, -1], [0, 1, -1], [0, 0, 1.0]])
+        cells_from_padded = shifted(-1, -1)
         site_from_padded = cell_window.site_from_cell(cell_m) @ cells_from_padded
         patch_from_cells = np.linalg.inv(window.site_from_patch) @ site_from_padded
         near = (

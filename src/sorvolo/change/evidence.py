@@ -578,9 +578,7 @@ def restlessness(grid: EvidenceGrid, window: CellWindow, own: Mask, cell_m: floa
     """
     reach = int(np.ceil((_APART_M + _AROUND_M) / cell_m))
     evidence = grid.read(window.grown(reach))
-    free = cv2.copyMakeBorder(
-        (~own).view(np.uint8), reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=1
-    )
+    free = np.pad((~own).view(np.uint8), reach, constant_values=1)
     away_m = cv2.distanceTransform(free, cv2.DIST_L2, 5) * cell_m
     around = (away_m > _APART_M) & (away_m <= _APART_M + _AROUND_M) & (evidence.seen >= 2)
     seen, changed = evidence.seen[around].astype(float), evidence.changed[around]

@@ -11,7 +11,7 @@ from sorvolo.change.kinds import kind_of
 from sorvolo.change.learned import learned_difference
 from sorvolo.change.outlines import mask_of, measures, opened, outline_of, overlap, place_sigma_m
 from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, Mask, PointsM
-from sorvolo.geometry.homography import apply_homography
+from sorvolo.geometry.homography import apply_homography, resized, shifted
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Shade
 
 _SUMS = ("seen", "apart", "agree", "came", "left")
@@ -143,7 +143,7 @@ class GatheredThings:
             return part, seen
         own = mask_of(
             outline_m,
-            site_from_cell @ np.array([[1, 0, left], [0, 1, top], [0, 0, 1.0]]),
+            site_from_cell @ shifted(left, top),
             seen.shape,
         )
         return part, own & seen
@@ -215,7 +215,7 @@ class GatheredThings:
 
     def _record(self, cells: Mask, corner: tuple[int, int], score: float) -> Change | None:
         cell_m = self._ground.cell_m
-        cell_from_own = np.array([[1, 0, corner[0]], [0, 1, corner[1]], [0, 0, 1.0]])
+        cell_from_own = shifted(*corner)
         outline_m = outline_of(
             cells, self._ground.window.site_from_cell(cell_m) @ cell_from_own, 0.5, 1.0
         )
@@ -246,9 +246,6 @@ def _enlarged(
     height, width = view.valid.shape
     size = round(width * times), round(height * times)
     x, y = size[0] / width, size[1] / height
-    view_from_large = np.array(
-        [[1 / x, 0, (1 - x) / (2 * x)], [0, 1 / y, (1 - y) / (2 * y)], [0, 0, 1.0]]
-    )
 
     def picture(image: ImageRGB) -> ImageRGB:
         return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), np.uint8)
@@ -261,7 +258,7 @@ def _enlarged(
 
     large = replace(
         view,
-        site_from_image=view.site_from_image @ view_from_large,
+        site_from_image=view.site_from_image @ resized(1 / x, 1 / y),
         image=picture(view.image),
         reference=picture(view.reference),
         valid=mask(view.valid),

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sorvolo.change.outlines import dilated
 from sorvolo.change.patches import Cut, PatchWindow, cut, patch_of, quality
 from sorvolo.geometry.arrays import (
     Bytes,
@@ -147,10 +148,7 @@ class LaidView:
     @cached_property
     def at_rim(self) -> Mask:
         """The flagged pieces that end at unknown ground or at the view's rim."""
-        unseen = cv2.copyMakeBorder(
-            (~self.seen).view(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1
-        )
-        beside = cv2.dilate(unseen, np.ones((3, 3), np.uint8))[1:-1, 1:-1] > 0
+        beside = dilated(np.pad(~self.seen, 1, constant_values=True), 3)[1:-1, 1:-1]
         _, labels = cv2.connectedComponents(self.flagged.view(np.uint8), connectivity=8)
         return np.isin(labels, np.unique(labels[beside & self.flagged]))
 

@@ -14,6 +14,7 @@ from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.homography import (
     apply_homography,
     pose_from_homography,
+    shifted,
     site_from_image_homography,
 )
 from sorvolo.geometry.pose import Pose, rotation_from_vector
@@ -344,7 +345,7 @@ class MapSearch:
             return None
         width, height = camera.width_px, camera.height_px
         spare = np.round(np.array([width, height]) * margin)
-        image_from_large = np.array([[1.0, 0.0, -spare[0]], [0.0, 1.0, -spare[1]], [0.0, 0.0, 1.0]])
+        image_from_large = shifted(-spare[0], -spare[1])
         centre = site_from_image @ np.array([camera.cx_px, camera.cy_px, 1.0])
         if centre[2] <= 0:
             return None

@@ -8,7 +8,7 @@ import numpy as np
 from sorvolo.change.outlines import dilated
 from sorvolo.geometry.arrays import Floats32, ImageRGBA, Matrix3, PointsM
 from sorvolo.geometry.grid import SiteGrid, TileIndex
-from sorvolo.geometry.homography import apply_homography
+from sorvolo.geometry.homography import apply_homography, shifted
 from sorvolo.survey.findings import Change, ChangeKind, Patch
 
 # How a change is mixed into the map. Lengths in px of the tile.
@@ -72,7 +72,7 @@ def patched(
     stay as they are.
     """
     x0, y0, x1, y1 = tile_window
-    tile_from_grid = np.array([[1, 0, -x0], [0, 1, -y0], [0, 0, 1.0]])
+    tile_from_grid = shifted(-x0, -y0)
     tile_from_patch = (tile_from_grid @ grid_from_site @ patch.site_from_patch)[:2]
     scale = float(np.sqrt(abs(np.linalg.det(tile_from_patch[:, :2]))))
     grow = max(1, round(_GROWN_PX / scale))

@@ -55,10 +55,8 @@ def outline_of(
         return None
     (y0, x0), (y1, x1) = found.min(axis=0), found.max(axis=0) + 1
     pad = int(np.ceil(join_px)) + 1
-    part = cv2.copyMakeBorder(
-        mask[y0:y1, x0:x1].astype(np.uint8), pad, pad, pad, pad, cv2.BORDER_CONSTANT, value=0
-    )
-    part = cv2.resize(part, None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
+    framed = np.pad(mask[y0:y1, x0:x1].astype(np.uint8), pad)
+    part = cv2.resize(framed, None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
     if join_px >= 1:
         size = 2 * round(join_px) + 1
         part = cv2.morphologyEx(

@@ -9,7 +9,7 @@ import numpy as np
 
 from sorvolo.geometry.arrays import ImageGray, ImageRGB, ImageRGBA, Mask, Matrix3, PointsPx, shrunk
 from sorvolo.geometry.grid import Grid, TileIndex, gather_tiles
-from sorvolo.geometry.homography import apply_homography, resized
+from sorvolo.geometry.homography import apply_homography, resized, shifted
 from sorvolo.registration.features import (
     FeatureSettings,
     gray_from_rgb,
@@ -64,9 +64,7 @@ class ReferenceMap:
             return nothing
         x, y = (int(each) for each in low)
         window = self._assembled(level, x, y, *(int(each) for each in high - low))
-        window_from_image = (
-            np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [0.0, 0.0, 1.0]]) @ level_from_image
-        )
+        window_from_image = shifted(-x, -y) @ level_from_image
         if shrink > 1:
             small = window.shape[1] // shrink, window.shape[0] // shrink
             window = shrunk(window, small)

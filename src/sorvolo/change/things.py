@@ -140,9 +140,7 @@ def _hull(mask: Mask | Bytes) -> Mask:
 def _joined(mask: Mask, near_px: int) -> Ints32:
     """The number from 1 on of the thing that each pixel of a mask (h, w) belongs to, and those near it; else 0."""
     reach = 2 * near_px + 1
-    padded = cv2.copyMakeBorder(
-        mask.view(np.uint8), reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=0
-    )
+    padded = np.pad(mask.view(np.uint8), reach)
     joined = cv2.dilate(padded, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
     return np.asarray(
         cv2.connectedComponents(joined[reach:-reach, reach:-reach], connectivity=8)[1], np.int32

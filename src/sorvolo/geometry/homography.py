@@ -93,6 +93,11 @@ def pose_from_homography(site_from_image: Matrix3, camera: Camera) -> Pose | Non
     return Pose(camera_from_site.T, centre_m)
 
 
+def shifted(x: float, y: float) -> Matrix3:
+    """(3, 3) by which points go so far to the right and down."""
+    return np.array([[1.0, 0, x], [0, 1, y], [0, 0, 1]])
+
+
 def resized(x: float, y: float) -> Matrix3:
     """(3, 3) from pixels to those of the picture made x and y times as large: to = (from + 1/2) x - 1/2."""
     return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]])

@@ -9,7 +9,7 @@ import numpy as np
 from sorvolo.errors import GeometryError
 from sorvolo.geometry.arrays import Floats, Matrix3, PointsM, frozen
 from sorvolo.geometry.grid import SiteGrid
-from sorvolo.geometry.homography import apply_homography
+from sorvolo.geometry.homography import apply_homography, shifted
 
 MOST_SIDE = 32_766
 """The most rows or columns of a height model: OpenCV resamples no larger picture."""
@@ -74,8 +74,9 @@ class Lattice:
         )[0]
         reach_m = max(width, height) / 2 * grid.m_per_px
         grid_from_site = site_grid.grid_from_site_affine(middle_m, max(reach_m, 1.0))
-        shift = np.array([[1.0, 0, first[0]], [0, 1, first[1]], [0, 0, 1]])
-        return cls(np.linalg.inv(grid_from_site) @ shift, width, height, grid.m_per_px, first)
+        return cls(
+            np.linalg.inv(grid_from_site) @ shifted(*first), width, height, grid.m_per_px, first
+        )
 
     @staticmethod
     def cell_for(points_m: PointsM, pixel_m: float) -> float:
@@ -94,7 +95,7 @@ class Lattice:
 
     def window(self, x0: int, y0: int, x1: int, y1: int) -> "Lattice":
         """The cells of a window, ends exclusive; it may reach beyond."""
-        shift = np.array([[1.0, 0, x0], [0, 1, y0], [0, 0, 1]])
+        shift = shifted(x0, y0)
         return replace(
             self,
             site_from_cells=self.site_from_cells @ shift,

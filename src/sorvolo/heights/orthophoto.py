@@ -8,6 +8,7 @@ import numpy as np
 from sorvolo.geometry.arrays import Floats32, ImageRGB, ImageRGBA, Mask, Matrix3
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.geometry.ground import hidden, laid_pixels
+from sorvolo.geometry.homography import shifted
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.views import View, ground_outlines_m
 from sorvolo.mosaic.blending import (
@@ -156,7 +157,9 @@ class _Painter:
         """(count tile_px, count tile_px, 4) the picture of `count` x `count` tiles; None where no photo sees them."""
         apron = -(-LAYER_APRON_PX // ALIGN_PX) * ALIGN_PX
         side = count * self._grid.tile_px + 2 * apron
-        shift = _shift(first[0] * self._grid.tile_px - apron, first[1] * self._grid.tile_px - apron)
+        shift = shifted(
+            first[0] * self._grid.tile_px - apron, first[1] * self._grid.tile_px - apron
+        )
         # (side, side) the view of each pixel of a tile, the borders between views drawn
         # straight between cells
         cells_from_here = self._cells_from_grid @ shift
@@ -165,7 +168,7 @@ class _Painter:
         low = np.clip(np.floor(ends[:2].min(axis=1)).astype(int) - 2, 0, limit)
         high = np.clip(np.ceil(ends[:2].max(axis=1)).astype(int) + 3, 0, limit)
         coarse = self._labels[low[1] : high[1], low[0] : high[0]]
-        there = (_shift(-low[0], -low[1]) @ cells_from_here)[:2]
+        there = (shifted(-low[0], -low[1]) @ cells_from_here)[:2]
         labels = winners_from_shares(
             (
                 (
@@ -218,14 +221,10 @@ class _Painter:
             u, v = laid_pixels(
                 view.camera,
                 view.site_from_camera,
-                self._site_from_grid @ shift @ _shift(x0, y0),
+                self._site_from_grid @ shift @ shifted(x0, y0),
                 up_m[y0:y1, x0:x1],
             )
             seen = cv2.remap(
                 self._pictures(number), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101
             )
             yield Layer(number, x0, y0, np.asarray(seen, np.uint8))
-
-
-def _shift(x: float, y: float) -> Matrix3:
-    return np.array([[1.0, 0, x], [0, 1, y], [0, 0, 1]])

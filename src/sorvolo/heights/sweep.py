@@ -13,6 +13,7 @@ import numpy as np
 
 from sorvolo import kernels
 from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, Mask, Matrix3, PointsM
+from sorvolo.geometry.homography import shifted
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.obstacles import Obstacles
 from sorvolo.heights.views import View, inside
@@ -268,7 +269,7 @@ class _Laid:
             high = np.clip(np.ceil(places.max(axis=0)) + _CONTRAST_PX + 1, low + 2, high).astype(
                 int
             )
-        self.planes = np.array([[1.0, 0, -low[0]], [0, 1, -low[1]], [0, 0, 1]]) @ self.planes
+        self.planes = shifted(-low[0], -low[1]) @ self.planes
         self.frame -= np.tile(low, 2)
         piece = picture[low[1] : high[1], low[0] : high[0]].astype(np.float32)
         away_m = others_m - eye_m

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from sorvolo.errors import GeometryError
 from sorvolo.geometry.arrays import Bytes, Floats, ImageRGB, Mask, Matrix3, PointsPx, frozen
-from sorvolo.geometry.homography import apply_homography
+from sorvolo.geometry.homography import apply_homography, shifted
 from sorvolo.mosaic.blending import FILL_PX, WINDOW_APRON_PX, coarse_fill
 from sorvolo.mosaic.exposure import corrected
 
@@ -104,15 +104,15 @@ def warp(
     left, top = pad * (x0 == 0), pad * (y0 == 0)
     right, bottom = pad * (x1 == frame.width_px), pad * (y1 == frame.height_px)
     window_from_source = (
-        _shift(-window[0], -window[1])
+        shifted(-window[0], -window[1])
         @ frame.grid_from_image
-        @ _shift(x0, y0)
+        @ shifted(x0, y0)
         @ np.diag([2.0**halvings] * 2 + [1.0])
     )
     framed = cv2.copyMakeBorder(rgba, top, bottom, left, right, cv2.BORDER_REFLECT)
     size = window[2] - window[0], window[3] - window[1]
     warped = cv2.warpPerspective(
-        framed, window_from_source @ _shift(-left, -top), size, flags=cv2.INTER_LINEAR
+        framed, window_from_source @ shifted(-left, -top), size, flags=cv2.INTER_LINEAR
     )
     return cv2.cvtColor(warped, cv2.COLOR_RGBA2RGB)  # type: ignore[return-value]
 
@@ -174,7 +174,7 @@ def _centre_px(frame: CanvasFrame) -> Floats:
 def coverage(frame: CanvasFrame, window: tuple[int, int, int, int]) -> Bytes:
     """255 where a frame has pixels in a window of grid pixels (x0, y0, x1, y1, ends exclusive), else 0."""
     size = window[2] - window[0], window[3] - window[1]
-    window_from_image = _shift(-window[0], -window[1]) @ frame.grid_from_image
+    window_from_image = shifted(-window[0], -window[1]) @ frame.grid_from_image
     if frame.valid is not None:
         valid = cv2.erode(frame.valid.astype(np.uint8) * 255, np.ones((3, 3), np.uint8))
         return cv2.warpPerspective(valid, window_from_image, size, flags=cv2.INTER_NEAREST)  # type: ignore[return-value]
@@ -253,7 +253,3 @@ def _stretch(frame: CanvasFrame) -> tuple[float, float]:
     )
     large, small = np.linalg.svd(linear, compute_uv=False)
     return float(small), float(large)
-
-
-def _shift(x: float, y: float) -> Matrix3:
-    return np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
