@@ -183,6 +183,20 @@ def test_telemetry_that_the_pictures_contradict_makes_no_clean_headline(
     assert "no person" not in found["text"]
 
 
+def test_a_straight_flight_says_that_nothing_checks_its_clock(tmp_path: Path) -> None:
+    """It fits the log of any moment; this table counts from the video's own first frame."""
+    truth = OutputSettings(telemetry="all", truth_step=1)
+    made = simulate_into(tmp_path / "made", small_flight(5, length_m=50, people=1, output=truth))
+    detector = TruthDetector(made)
+    for log, is_unsure in (("other/flight1.gpx", True), ("flight1.csv", False)):
+        written = WatchOutputs(folder=tmp_path / str(is_unsure))
+        settings = WatchSettings(ground_elevation_m=35.0 if is_unsure else None)
+        given = {"telemetry": made / "flight1" / log, "camera": made / "camera.xml"}
+        list(watch(_video(made), settings, outputs=written, detector=detector, **given))
+        notices = _read(tmp_path / str(is_unsure) / "report.json")["notices"]
+        assert ("clock_unchecked" in {each["code"] for each in notices}) is is_unsure
+
+
 def test_each_object_once_at_its_place(
     flown: Path, detector: TruthDetector, tmp_path: Path
 ) -> None:

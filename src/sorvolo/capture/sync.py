@@ -28,6 +28,8 @@ FIX_DELAY_S = 0.25
 
 Measured on a senseFly survey of 2013: 0.35 s, which is 3 to 5 m at its speed.
 """
+UNSURE_CLOCK_S = 1.0
+"""1 sigma of a tie that the motion has to confirm; by choice."""
 DEFAULT_HORIZONTAL_SIGMA_M = 1.5  # the thesis's DJI Phantom 3, section 2.2
 _LONGEST_DELAY_S = 4 * FIX_DELAY_S  # that a photo's own fix is moved along the flight's path
 STARTS_TIED = "first sample tied to first frame"

@@ -15,6 +15,7 @@ from sorvolo.survey.wording import counted
 from sorvolo.tracking.headings import (
     HeadingCheck,
     contradiction,
+    is_straight,
 )
 from sorvolo.tracking.image_motion import ImageMotion
 from sorvolo.tracking.laying import IMPOSSIBLE_SIZE, GroundHeight, LocateSettings, locate
@@ -141,6 +142,12 @@ class GroundFollower:
             seen = counted(self._check.unturned, "detection")
             return f"its headings are far off, which showed only after {seen}: objects may be counted twice"
         return words
+
+    @property
+    def is_straight(self) -> bool:
+        """Whether the pictures' motion has no turn that would hold the telemetry's clock; not so of photos."""
+        fx_px = self._camera.camera.fx_px
+        return self._check is not None and is_straight(self._check.pictures.places, fx_px)
 
     def look_ahead(self, coming: Iterable[tuple[Frame, CameraPrior]]) -> None:
         """Learn from a recorded video's first frames, before any is taken, whether headings are far off."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from sorvolo.capture.clock_offset import OffsetEstimate
+from sorvolo.capture.sync import UNSURE_CLOCK_S
 from sorvolo.missions.flight.log import FlightLog
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.mosaic.consistency import NOTHING_KNOWN, Consistency
@@ -24,7 +25,6 @@ _BAD_FIT_PX = 3.0  # median residual of a map's matches from which on it is warn
 _TURNED_DEG = 6.0  # by which all stated angles may be off without a word
 _MOST_RIVALS = 4  # clock offsets in a sentence
 _FAR_BETTER = 0.7  # of the misfit at the clock's own tie
-_UNSURE_CLOCK_S = 1.0  # 1 sigma of a tie that the motion has to confirm; by choice
 _MANY_JUMPS = 0.2  # share of the fixes: a receiver that starts loses fewer
 _MOVED = 0.3  # pictures that spread so many diagonals of a frame are not those of a hovering drone
 _GUESSED = 0.1  # relative: a focal length that is hardly known
@@ -112,7 +112,7 @@ def clock_doubts(
 def clock_remarks(setup: FlightSetup, found: OffsetEstimate | None) -> list[str]:
     """That nothing holds a clock of uncertain tie against the pictures, where the motion shows less than the tie."""
     clock = setup.clock
-    if found is None or clock is None or found.rivals_s or clock.sigma_s < _UNSURE_CLOCK_S:
+    if found is None or clock is None or found.rivals_s or clock.sigma_s < UNSURE_CLOCK_S:
         return []
     if found.sigma_s < clock.sigma_s or found.rms_m < _FAR_BETTER * found.rms_at_zero_m:
         return []

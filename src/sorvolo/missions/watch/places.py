@@ -10,7 +10,7 @@ from pathlib import Path
 from statistics import median
 
 from sorvolo.capture.source import LiveSource
-from sorvolo.capture.sync import HeightKind
+from sorvolo.capture.sync import UNSURE_CLOCK_S, HeightKind
 from sorvolo.detection.fusing import is_from_above
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, PointsM
@@ -235,6 +235,13 @@ class GroundPlaces(Places):
                 "pictures show: corrected"
             )
             found.append(Notice("tilt_wrong", 1, text))
+        clock = self._setup.clock
+        if follower.is_straight and clock is not None and clock.sigma_s >= UNSURE_CLOCK_S:
+            text = (
+                f"the clock could not be checked ({clock.tie}): the flight has no turn; places may be off along it by "
+                f"{clock.sigma_s:g} s of flight beside their stated accuracy"
+            )
+            found.append(Notice("clock_unchecked", 1, text))
         if why_not := follower.contradiction:
             text = f"the pictures' motion contradicts the telemetry: {why_not}"
             found.append(Notice(CONTRADICTED, 1, text))
