@@ -197,6 +197,17 @@ def test_each_thing_once_in_its_place(seed: int) -> None:
         assert distance_m < 0.15
 
 
+@pytest.mark.parametrize(
+    ("label", "apart_m", "count"), [("person", 0.2, 1), ("person", 0.7, 2), ("car", 0.8, 1)]
+)
+def test_no_two_bodies_stand_in_one_place(label: str, apart_m: float, count: int) -> None:
+    """A detector that boxes a body twice in every frame has seen one: two of a class are half its width apart or more."""
+    frames = survey()
+    places_m = (18.0, 18.0 + apart_m)
+    things: list[Thing] = [(label, east_m, 2.0, 0.0, (0.0, 0.0)) for east_m in places_m]
+    assert len(fuse(sightings(frames, things, misses=0.0), frames).objects) == count
+
+
 @pytest.mark.parametrize("yaw_deg", [0.0, 40.0, 90.0])
 def test_what_one_strip_only_cuts_is_no_second_object(yaw_deg: float) -> None:
     """The first strip's edge cuts two cars in all its frames, by a half and a third; the second shows them whole."""

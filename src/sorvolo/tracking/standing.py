@@ -306,7 +306,8 @@ def _distance(one: _Gathering, other: _Gathering) -> float:
 
 
 def _merged(objects: list[_Gathering], laid: Sequence[LaidSighting]) -> list[list[int]]:
-    """What is near enough to be one object and was never, or hardly, seen beside itself: the nearest pairs first."""
+    """What is near enough to be one object and was never, or hardly, seen beside itself, or lies within half its class's
+    width: the nearest pairs first."""
     alive = dict(enumerate(objects))
     frames = {k: _frames_of(each.members, laid) for k, each in alive.items()}
     while True:
@@ -315,12 +316,14 @@ def _merged(objects: list[_Gathering], laid: Sequence[LaidSighting]) -> list[lis
         pairs = []
         for row, one in enumerate(keys):
             apart_m = np.hypot(*(places_m[row + 1 :] - places_m[row]).T)
+            half_m = TYPICAL_SIZE_M.get(alive[one].label, (0.0, 0.0))[1] / 2
             for k in np.flatnonzero(apart_m < _reach_m(alive[one], laid)).tolist():
                 other = keys[row + 1 + k]
                 distance = _distance(alive[one], alive[other])
                 fewer = min(len(frames[one]), len(frames[other]))
                 is_apart = len(frames[one] & frames[other]) <= _SHARED_FRAMES * fewer
-                if is_apart and distance < _GATE:
+                is_body = apart_m[k] < half_m and alive[one].label == alive[other].label
+                if is_body or (is_apart and distance < _GATE):
                     pairs.append((distance, one, other))
         if not pairs:
             return [
