@@ -24,6 +24,7 @@ from sorvolo.geometry.arrays import (
     PointsPx,
     Vector3,
     shrunk,
+    size_within,
 )
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
@@ -281,8 +282,7 @@ class Aligner:
 
     def _small(self, image: ImageRGB) -> tuple[tuple[int, int], ImageGray]:
         """The size (width, height) at which a frame is aligned, and its gray there."""
-        scale = min(1.0, _ALIGNMENT_SIDE_PX / max(image.shape[:2]))
-        size = max(16, round(image.shape[1] * scale)), max(16, round(image.shape[0] * scale))
+        size = size_within(image, _ALIGNMENT_SIDE_PX, 16)
         return size, shrunk(gray_from_rgb(image), size)
 
     def _by_homographies(self, frame: _Frame, *, is_cheap: bool = False) -> MapPlace | NotAligned:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sorvolo.change.ground import GroundSums
 from sorvolo.change.light import OCTAVES
 from sorvolo.change.outlines import dilated, measures, opened, outline_of, place_sigma_m
-from sorvolo.geometry.arrays import Bytes, Floats32, ImageRGB, Mask, Matrix3, shrunk
+from sorvolo.geometry.arrays import Bytes, Floats32, ImageRGB, Mask, Matrix3, shrunk, size_within
 from sorvolo.geometry.homography import resized
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView
 
@@ -64,7 +64,7 @@ class AreaSigns:
 def area_signs(view: ComparedView, leans: Mask | None = None) -> AreaSigns:
     """Compare the ground of a view with the map's. What `leans` (h, w) is not known."""
     height, width = view.valid.shape
-    size = _small(view.image)
+    size = size_within(view.image, _SIDE_PX)
     valid = view.valid if leans is None else view.valid & ~leans
     known = shrunk(valid.view(np.uint8) * np.uint8(255), size) == 255
     before, after = (_octaves(image, size) for image in (view.reference, view.image))
@@ -85,7 +85,7 @@ def area_signs(view: ComparedView, leans: Mask | None = None) -> AreaSigns:
 
 def level_of(picture: ImageRGB) -> Signs:
     """How bright a picture, (h, w, 3), is, in octaves, at the size at which views are examined."""
-    return _level(_octaves(picture, _small(picture)))
+    return _level(_octaves(picture, size_within(picture, _SIDE_PX)))
 
 
 def leaning(reference: Signs, picture: ImageRGB, seen: Mask) -> Mask:
@@ -98,13 +98,6 @@ def leaning(reference: Signs, picture: ImageRGB, seen: Mask) -> Mask:
     window = np.ones((_WINDOW_PX, _WINDOW_PX), np.uint8)
     whole = cv2.morphologyEx(found.view(np.uint8), cv2.MORPH_CLOSE, window)
     return (cv2.resize(whole, (width, height), interpolation=cv2.INTER_NEAREST) > 0) & seen
-
-
-def _small(picture: ImageRGB) -> tuple[int, int]:
-    """Width and height at which a picture is examined."""
-    height, width = picture.shape[:2]
-    scale = min(1.0, _SIDE_PX / max(height, width))
-    return max(1, round(width * scale)), max(1, round(height * scale))
 
 
 def _structure(before: Signs, after: Signs) -> tuple[Signs, Signs, Signs]:

@@ -16,6 +16,7 @@ from sorvolo.geometry.arrays import (
     PointsM,
     Rows,
     shrunk,
+    size_within,
 )
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import apply_homography, fit_similarity
@@ -143,8 +144,7 @@ class FlightOnMap:
 
     def features(self, image: ImageRGB, camera: Camera) -> PhotoFeatures:
         """What `find` needs of an undistorted photo, (H, W, 3)."""
-        scale = min(1.0, _SIDE_PX / max(image.shape[:2]))
-        size = round(image.shape[1] * scale), round(image.shape[0] * scale)
+        size = size_within(image, _SIDE_PX)
         gray: ImageGray = shrunk(gray_from_rgb(image), size)
         return PhotoFeatures(camera.resized(*size), learned_features(gray, _POINTS))
 

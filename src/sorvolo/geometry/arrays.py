@@ -89,6 +89,13 @@ def frozen(array: Any, dtype: Any = np.float64) -> Any:
     return copy
 
 
+def size_within(image: NDArray[Any], longest_px: int, least_px: int = 1) -> tuple[int, int]:
+    """A picture's width and height, made smaller alike until the longer is at most this many pixels."""
+    scale = min(1.0, longest_px / max(image.shape[:2]))
+    height, width = (max(least_px, round(side * scale)) for side in image.shape[:2])
+    return width, height
+
+
 def shrunk(image: NDArray[_Kind], size_px: Sequence[int]) -> NDArray[_Kind]:
     """A picture of any kind, (height, width) or (height, width, C), brought to this width and height, less than its own:
     a pixel is the mean of those that it covers."""

@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, Floats32, ImageRGBA, Mask, shrunk
+from sorvolo.geometry.arrays import Floats, Floats32, ImageRGBA, Mask, shrunk, size_within
 from sorvolo.heights.cameras import FEATURES_SIDE_PX, Cameras3D
 from sorvolo.heights.field import HeightField
 from sorvolo.heights.surface import Surface
@@ -206,7 +206,7 @@ def relief_picture(surface: Surface) -> ImageRGBA:
         return np.zeros((1, 1, 4), np.uint8)
     scale = min(1.0, _LONGEST_PX / max(surface.up_m.shape))
     up_m: Floats32 = np.where(known, surface.up_m, np.nanmedian(surface.up_m)).astype(np.float32)
-    size = (max(1, round(up_m.shape[1] * scale)), max(1, round(up_m.shape[0] * scale)))
+    size = size_within(up_m, _LONGEST_PX)
     up_m = np.asarray(shrunk(up_m, size), np.float32)
     seen = shrunk(known.astype(np.float32), size) > 0.5
     down, across = (

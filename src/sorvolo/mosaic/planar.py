@@ -9,7 +9,7 @@ from itertools import islice
 import numpy as np
 
 from sorvolo.errors import GeometryError
-from sorvolo.geometry.arrays import Floats, ImageRGB, Matrix3, PointsM, shrunk
+from sorvolo.geometry.arrays import Floats, ImageRGB, Matrix3, PointsM, shrunk, size_within
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import apply_homography, site_from_image_homography
 from sorvolo.geometry.pose import Pose
@@ -473,13 +473,10 @@ class PlanarMapper:
     def _keyframe(
         self, keyframe_id: int, camera: Camera, image: ImageRGB, prior: CameraPrior
     ) -> Keyframe:
-        scale = min(1.0, _REGISTRATION_SIDE_PX / max(image.shape[:2]))
-        gray = gray_from_rgb(image)
-        if scale < 1.0:
-            size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
-            gray = shrunk(gray, size)
+        size = size_within(image, _REGISTRATION_SIDE_PX)
+        gray = normalise_contrast(shrunk(gray_from_rgb(image), size))
+        if gray.shape != image.shape[:2]:
             camera = camera.resized(*size)
-        gray = normalise_contrast(gray)
         return Keyframe(keyframe_id, camera, gray, orb_features(gray, _LINKS.features), prior)
 
     def _tie(self, new: Keyframe) -> tuple[_Tie, str]:
@@ -699,9 +696,7 @@ class PlanarMapper:
 
 
 def _thumbnail(image: ImageRGB) -> ImageRGB:
-    scale = min(1.0, 320 / max(image.shape[:2]))
-    size = (max(8, round(image.shape[1] * scale)), max(8, round(image.shape[0] * scale)))
-    return shrunk(image, size)
+    return shrunk(image, size_within(image, 320, 8))
 
 
 def _scaled(points_px: Floats, camera: Camera, small: ImageRGB) -> Floats:

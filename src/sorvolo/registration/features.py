@@ -21,6 +21,7 @@ from sorvolo.geometry.arrays import (
     Matrix3,
     PointsPx,
     shrunk,
+    size_within,
 )
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.survey.mosaic import Features
@@ -97,8 +98,7 @@ def sift_features(gray: ImageGray, settings: FeatureSettings) -> Features:
 def _detection_image(gray: ImageGray, settings: FeatureSettings) -> tuple[ImageGray, float]:
     scale = min(1.0, settings.detection_side_px / max(gray.shape))
     if scale < 1.0:
-        size = (max(1, round(gray.shape[1] * scale)), max(1, round(gray.shape[0] * scale)))
-        gray = shrunk(gray, size)
+        gray = shrunk(gray, size_within(gray, settings.detection_side_px))
     return gray, scale
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from cv2.typing import MatLike
 
 from sorvolo.errors import StoreError
-from sorvolo.geometry.arrays import Floats32, ImageRGB, ImageRGBA, Mask, frozen, shrunk
+from sorvolo.geometry.arrays import Floats32, ImageRGB, ImageRGBA, Mask, frozen, shrunk, size_within
 
 Key = TypeVar("Key", bound=Hashable)
 Kept = TypeVar("Kept")
@@ -57,10 +57,8 @@ _PNG_REPEATED = [
 
 def jpeg_from_image(image: ImageRGB, most_px: int | None = None) -> bytes:
     """Encode an image as JPEG, quality 92, colour at full resolution; its longer side made `most_px` where longer."""
-    if most_px is not None and max(image.shape[:2]) > most_px:
-        scale = most_px / max(image.shape[:2])
-        size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
-        image = shrunk(image, size)
+    if most_px is not None:
+        image = shrunk(image, size_within(image, most_px))
     _, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), _JPEG)
     return data.tobytes()
 

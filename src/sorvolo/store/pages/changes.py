@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, ImageRGBA, PointsPx
+from sorvolo.geometry.arrays import Floats, ImageRGBA, PointsPx, size_within
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.store.exports.map_pictures import Picture
 from sorvolo.store.exports.places import SYSTEMS, place_words
@@ -235,10 +235,7 @@ def _crop(rgba: ImageRGBA | None, change: StoredChange, when: str, most_bytes: i
     if rgba is None:
         return _Crop(when, "", 0, 0, "")
     height_px, width_px = rgba.shape[:2]
-    small = rgba
-    if max(height_px, width_px) > _CROP_PX:
-        scale = _CROP_PX / max(height_px, width_px)
-        small = shrink(rgba, max(1, round(width_px * scale)), max(1, round(height_px * scale)))
+    small = shrink(rgba, *size_within(rgba, _CROP_PX))
     crop = change.crop
     outline_px = (change.outline_m - [crop.west_m, crop.north_m]) * [1, -1] / crop.m_per_px
     return _Crop(when, picture_uri(small, most_bytes), width_px, height_px, _points(outline_px))
