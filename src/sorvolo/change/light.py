@@ -1,7 +1,6 @@
 """One picture in the light of another: a power law per channel for the camera, a smooth gain for clouds' shadows."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -63,8 +62,8 @@ def fit_light(reference: Bgr, query: Bgr, known: Mask | None = None) -> PairLigh
     height, width = reference.shape[:2]
     size = max(4, width // _CELL_PX), max(4, height // _CELL_PX)
     fine = _FINE * size[0], _FINE * size[1]
-    reference, query = _smaller(reference, fine), _smaller(query, fine)
-    before, after = (_logarithm(_smaller(each, size)) for each in (reference, query))
+    reference, query = shrunk(reference, fine), shrunk(query, fine)
+    before, after = (_logarithm(shrunk(each, size)) for each in (reference, query))
     sure = _surely(known, size)
     if sure is not None and sure.sum() < 16:
         return PairLight(np.ones(3), np.zeros(3), np.ones((*size[::-1], 3), np.float32), 0.0)
@@ -138,10 +137,6 @@ def _logarithm(image: Bytes) -> Floats32:
     return np.asarray(cv2.LUT(image, OCTAVES), np.float32)
 
 
-def _smaller(image: NDArray[Any], size: tuple[int, int]) -> Bytes:
-    return shrunk(image, size)
-
-
 def _surely(known: Mask | None, size: tuple[int, int]) -> Mask | None:
     """Which pixels of a picture of `size` (w, h) lie on known ground alone; None where everything does."""
-    return None if known is None else _smaller(known.astype(np.uint8) * 255, size) > 250
+    return None if known is None else shrunk(known.astype(np.uint8) * 255, size) > 250

@@ -10,7 +10,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Floats, ImageGray, Mask, PointsM, Rows, shrunk
+from sorvolo.geometry.arrays import Floats, ImageGray, Mask, PointsM, Rows, shrunk, size_within
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.pose import Pose, rotation_from_vector
 from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
@@ -110,10 +110,7 @@ class _Found:
 
 
 def _features(gray: ImageGray, view: View) -> _Found:
-    scale = min(1.0, FEATURES_SIDE_PX / max(gray.shape))
-    if scale < 1.0:
-        size = (round(gray.shape[1] * scale), round(gray.shape[0] * scale))
-        gray = shrunk(gray, size)
+    gray = shrunk(gray, size_within(gray, FEATURES_SIDE_PX))
     found = sift_features(normalise_contrast(gray), FeatureSettings(sift_count=_FEATURES))
     rays = view.camera.resized(gray.shape[1], gray.shape[0]).rays_from_pixels(found.points_px)[
         :, :2
