@@ -184,10 +184,11 @@ def test_telemetry_that_the_pictures_contradict_makes_no_clean_headline(
 
 
 def test_a_straight_flight_says_that_nothing_checks_its_clock(tmp_path: Path) -> None:
-    """It fits the log of any moment; this table counts from the video's own first frame."""
+    """It fits the log of any moment; this table counts from the video's own first frame. The accuracy of places left out
+    how far the drone flies while a clock is off."""
     truth = OutputSettings(telemetry="all", truth_step=1)
     made = simulate_into(tmp_path / "made", small_flight(5, length_m=50, people=1, output=truth))
-    detector = TruthDetector(made)
+    detector, sigmas_m = TruthDetector(made), dict[bool, float]()
     for log, is_unsure in (("other/flight1.gpx", True), ("flight1.csv", False)):
         written = WatchOutputs(folder=tmp_path / str(is_unsure))
         settings = WatchSettings(ground_elevation_m=35.0 if is_unsure else None)
@@ -195,6 +196,11 @@ def test_a_straight_flight_says_that_nothing_checks_its_clock(tmp_path: Path) ->
         list(watch(_video(made), settings, outputs=written, detector=detector, **given))
         notices = _read(tmp_path / str(is_unsure) / "report.json")["notices"]
         assert ("clock_unchecked" in {each["code"] for each in notices}) is is_unsure
+        tracks = _read(tmp_path / str(is_unsure) / "tracks.geojson")["features"]
+        sigmas_m[is_unsure] = min(each["properties"]["sigma_m"] for each in tracks)
+    # three seconds, where a log's first sample is tied to the first frame, at 5 m/s, along the flight
+    more_m = np.sqrt(sigmas_m[True] ** 2 - sigmas_m[False] ** 2)
+    assert more_m == pytest.approx(3 * 5 / np.sqrt(2), rel=0.1)
 
 
 def test_each_object_once_at_its_place(

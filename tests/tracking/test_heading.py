@@ -1,5 +1,7 @@
 """The heading of a camera whose telemetry does not have it, on ways that are known."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -14,6 +16,7 @@ from sorvolo.tracking.headings import (
     Way,
     contradiction,
     heading_deg,
+    is_uniform,
     righted,
 )
 
@@ -214,3 +217,23 @@ def test_a_clock_that_is_off_is_named_with_every_offset_that_fits(
     ]
     found = contradiction(places, 400.0, knows_tilt=True)
     assert words in found and bool(found) is bool(words)
+
+
+@pytest.mark.parametrize(
+    ("passed_m", "fits_any_moment"),
+    [
+        (lambda times_s: 5 * times_s, True),
+        (lambda times_s: 5 * np.minimum(times_s, 60 - times_s), False),
+        (lambda times_s: 5 * np.maximum(times_s - 20, 0), False),
+        (lambda times_s: 0 * times_s, False),
+    ],
+    ids=["one way", "and back", "hovers first", "hovers"],
+)
+def test_a_way_at_one_velocity_fits_the_log_of_any_moment(
+    passed_m: Callable[[np.ndarray], np.ndarray], *, fits_any_moment: bool
+) -> None:
+    """To and fro on one line was taken for such a way, though its turn shows when it was."""
+    times_s = np.arange(0.0, 60.0, 0.5)
+    seen_px = passed_m(times_s) * np.exp(0.4j) * 400 / 30
+    places = [(1, round(at * 1e9), seen, 0j, 30.0) for at, seen in zip(times_s, seen_px)]
+    assert is_uniform(places, 400.0) is fits_any_moment

@@ -15,7 +15,7 @@ from sorvolo.survey.wording import counted
 from sorvolo.tracking.headings import (
     HeadingCheck,
     contradiction,
-    is_straight,
+    is_uniform,
 )
 from sorvolo.tracking.image_motion import ImageMotion
 from sorvolo.tracking.laying import IMPOSSIBLE_SIZE, GroundHeight, LocateSettings, locate
@@ -90,8 +90,11 @@ class GroundFollower:
         *,
         knows_heading: bool,
         is_video: bool,
+        clock_sigma_s: float = 0.0,
     ) -> None:
-        self._camera, self._ground = camera, ground
+        self._camera, self._ground, self._clock_sigma_s = camera, ground, clock_sigma_s
+        self._uniform = 0, False  # how many pictures were asked for it, and what they answered
+        self._ends: list[tuple[int, Floats]] = []  # the camera's first place and its last
         self._tracker, fx_px = Tracker(settings), camera.camera.fx_px
         self._knows_heading = knows_heading
         self._check = (
@@ -144,10 +147,14 @@ class GroundFollower:
         return words
 
     @property
-    def is_straight(self) -> bool:
-        """Whether the pictures' motion has no turn that would hold the telemetry's clock; not so of photos."""
-        fx_px = self._camera.camera.fx_px
-        return self._check is not None and is_straight(self._check.pictures.places, fx_px)
+    def is_uniform(self) -> bool:
+        """Whether the pictures' motion has no turn that would hold the telemetry's clock; not so of photos.
+
+        It is asked anew when there are a tenth more pictures."""
+        places = [] if self._check is None else self._check.pictures.places
+        if len(places) > 1.1 * self._uniform[0]:
+            self._uniform = len(places), is_uniform(places, self._camera.camera.fx_px)
+        return self._uniform[1]
 
     def look_ahead(self, coming: Iterable[tuple[Frame, CameraPrior]]) -> None:
         """Learn from a recorded video's first frames, before any is taken, whether headings are far off."""
@@ -191,6 +198,7 @@ class GroundFollower:
             footprint_m=located.outline_m,
         )
         if located.camera_m is not None:
+            self._ends = [*self._ends[:1], (located.time_ns, located.camera_m)]
             if len(self._path) < _MOST_DRONE_PLACES:
                 self._path.append(located.camera_m)
             for each in filter(None, located.sightings):
@@ -207,15 +215,26 @@ class GroundFollower:
         return self._doubted(self._tracker.finish())
 
     def _doubted(self, tracks: Sequence[Track]) -> Sequence[Track]:
-        """What was placed before a heading showed that is far off may stand by that turn elsewhere around its camera."""
-        if self._check is None or not self._check.unturned:
+        """What was placed before a heading showed that is far off may stand by that turn elsewhere around its camera,
+        and all that a flight without a turn shows as far along it as it flew while its clock was off."""
+        more_m2, turned_m2 = np.zeros((2, 2)), np.zeros((2, 2))
+        if self._clock_sigma_s and len(self._ends) == 2 and self.is_uniform:
+            (first_ns, start_m), (last_ns, end_m) = self._ends
+            gone_m = self._clock_sigma_s * (end_m - start_m) / max((last_ns - first_ns) / 1e9, 1e-3)
+            more_m2 = np.outer(gone_m, gone_m)
+        if self._check is not None and self._check.unturned:
+            beside_m = 2 * self._reach_m * np.sin(self._check.shown_rad / 2)
+            turned_m2 = beside_m**2 * np.eye(2)
+        elif not more_m2.any():
             return tracks
-        beside_m = 2 * self._reach_m * np.sin(self._check.shown_rad / 2)
-        more_m2 = beside_m**2 * np.eye(2)
+        shown_ns = 0 if self._check is None else self._check.shown_ns
         return [
-            replace(each, covariance_m2=each.covariance_m2 + more_m2)
-            if each.first_seen_ns < self._check.shown_ns
-            else each
+            replace(
+                each,
+                covariance_m2=each.covariance_m2
+                + more_m2
+                + (turned_m2 if each.first_seen_ns < shown_ns else 0.0),
+            )
             for each in tracks
         ]
 

@@ -123,7 +123,7 @@ _JUDGED_M = 10.0  # of way, rms, by either of the two: less is within the fixes'
 _LONGER = 1.4  # than the other a way may be, as where the ground falls; by choice
 _ASTRAY = 0.35  # of a way, rms, that does not fit the other; by choice
 _MISS_M = 1.5  # rms, by which ways must miss each other before a mirror image or another moment explains it
-_TURN_M = 3.0  # rms, beside a straight line; by choice
+_TURN_M = 3.0  # rms, beside a way at one velocity; by choice
 _MIRRORED = "its positions are a mirror image: latitude and longitude swapped, or a sign lost"
 _APART = (
     "its positions do not follow the pictures: a receiver that stopped, a wrong clock, or a camera "
@@ -194,15 +194,17 @@ def contradiction(places: Sequence[SeenPlace], fx_px: float, *, knows_tilt: bool
     return late if worst == _LATE else f"{_MIRRORED}, or {late}"
 
 
-def is_straight(places: Sequence[SeenPlace], fx_px: float) -> bool:
-    """Whether the pictures' way is long and has no turn, so that it fits the telemetry of any moment."""
-    sides_m2 = [np.zeros(2)]
+def is_uniform(places: Sequence[SeenPlace], fx_px: float) -> bool:
+    """Whether the pictures' way is long and at one velocity, so that it fits the telemetry of any moment."""
+    uneven_m, along_m = [0.0], [0.0]
     for _, stretch in groupby(places, lambda each: each[0]):
-        _, _, seen_px, _, height_m = np.array([*stretch]).T
-        way_m = seen_px * np.median(height_m.real) / fx_px
-        sides_m2.append(np.linalg.eigvalsh(np.cov(way_m.real, way_m.imag, ddof=0)))
-    across_m2, along_m2 = np.max(sides_m2, axis=0)
-    return bool(across_m2 < _TURN_M**2 and along_m2 > _JUDGED_M**2)
+        _, time_ns, seen_px, _, height_m = np.array([*stretch]).T
+        way_m = (seen_px - seen_px.mean()) * np.median(height_m.real) / fx_px
+        since_ns = time_ns.real - time_ns.real.mean()
+        velocity_m_ns = since_ns @ way_m / max(since_ns @ since_ns, 1.0)
+        uneven_m.append(float(np.std(way_m - since_ns * velocity_m_ns)))
+        along_m.append(float(np.std(way_m)))
+    return max(uneven_m) < _TURN_M and max(along_m) > _JUDGED_M
 
 
 def _miss_m(seen_m: NDArray[np.complex128], told_m: NDArray[np.complex128]) -> float:

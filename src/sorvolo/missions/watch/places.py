@@ -158,8 +158,14 @@ class GroundPlaces(Places):
         self._headings = None if is_video else PhotoHeadings(setup.source.camera.camera)
         self._taken: tuple[int, CameraPrior] | None = None  # the last frame taken, and its prior
         knows_heading = setup.track is None or setup.track.attitude != "none"
+        clock_s = 0.0 if setup.clock is None else setup.clock.sigma_s
         self.follower: GroundFollower = GroundFollower(
-            setup.source.camera, settings, ground, knows_heading=knows_heading, is_video=is_video
+            setup.source.camera,
+            settings,
+            ground,
+            knows_heading=knows_heading,
+            is_video=is_video,
+            clock_sigma_s=clock_s if clock_s >= UNSURE_CLOCK_S else 0.0,
         )
         self.site = new_site(setup, setup.source.name, 1.0, 0.0)
         if self._over_model:  # one height would stand for all objects
@@ -236,10 +242,10 @@ class GroundPlaces(Places):
             )
             found.append(Notice("tilt_wrong", 1, text))
         clock = self._setup.clock
-        if follower.is_straight and clock is not None and clock.sigma_s >= UNSURE_CLOCK_S:
+        if follower.is_uniform and clock is not None and clock.sigma_s >= UNSURE_CLOCK_S:
             text = (
-                f"the clock could not be checked ({clock.tie}): the flight has no turn; places may be off along it by "
-                f"{clock.sigma_s:g} s of flight beside their stated accuracy"
+                f"the clock could not be checked ({clock.tie}): the flight has no turn; the stated accuracy of places "
+                f"includes {clock.sigma_s:g} s of flight along it"
             )
             found.append(Notice("clock_unchecked", 1, text))
         if why_not := follower.contradiction:

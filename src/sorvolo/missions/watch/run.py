@@ -642,6 +642,6 @@ class WatchRun:
         if far:
             warnings.append(
                 f"{len(far)} of {len(tracks)} objects are placed to more than 10 m only; telemetry with the camera's "
-                "angles would place them better"
+                "angles, or a turn that shows its clock, would place them better"
             )
         return warnings
