@@ -20,7 +20,7 @@ from sorvolo.canopy.integral import (
     seeing,
 )
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Floats32, Numbers, PointsM
+from sorvolo.geometry.arrays import Floats32, Numbers, PointsM, square
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.views import View
 
@@ -67,7 +67,7 @@ def find_people(under: UnderTrees, views: Sequence[View], picture: Picture) -> F
     """The spots of the integral that a person on the floor would leave."""
     lattice, anomaly = under.lattice, np.nan_to_num(under.anomaly)
     side = 2 * round(_APART_M / lattice.cell_m) + 1
-    highest = cv2.dilate(anomaly, np.ones((side, side), np.uint8))
+    highest = cv2.dilate(anomaly, square(side))
     rows, columns = np.nonzero((anomaly == highest) & (anomaly >= LEAST_ANOMALY))
     people, refused = [], Counter[str]()
     for at in np.argsort(-anomaly[rows, columns]):

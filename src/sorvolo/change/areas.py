@@ -15,7 +15,16 @@ from numpy.typing import NDArray
 from sorvolo.change.ground import GroundSums
 from sorvolo.change.light import OCTAVES
 from sorvolo.change.outlines import dilated, measures, opened, outline_of, place_sigma_m
-from sorvolo.geometry.arrays import Bytes, Floats32, ImageRGB, Mask, Matrix3, shrunk, size_within
+from sorvolo.geometry.arrays import (
+    Bytes,
+    Floats32,
+    ImageRGB,
+    Mask,
+    Matrix3,
+    shrunk,
+    size_within,
+    square,
+)
 from sorvolo.geometry.homography import resized
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView
 
@@ -95,7 +104,7 @@ def leaning(reference: Signs, picture: ImageRGB, seen: Mask) -> Mask:
     height, width = seen.shape
     likeness, _, rough = _structure(reference, level_of(picture))
     found = (likeness < _LEANS) & (rough > _ROUGH)
-    window = np.ones((_WINDOW_PX, _WINDOW_PX), np.uint8)
+    window = square(_WINDOW_PX)
     whole = cv2.morphologyEx(found.view(np.uint8), cv2.MORPH_CLOSE, window)
     return (cv2.resize(whole, (width, height), interpolation=cv2.INTER_NEAREST) > 0) & seen
 
@@ -310,7 +319,7 @@ def _connected(cells: Mask, own: Mask) -> Mask:
 
 def _whole(cells: Mask, gap: int = 2) -> Mask:
     """The cells without gaps up to twice `gap` wide, and without small holes."""
-    window = np.ones((2 * gap + 1,) * 2, np.uint8)
+    window = square(2 * gap + 1)
     padded = np.pad(cells.view(np.uint8), gap)
     closed = np.ascontiguousarray(
         cv2.morphologyEx(padded, cv2.MORPH_CLOSE, window)[gap:-gap, gap:-gap]

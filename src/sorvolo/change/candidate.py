@@ -20,7 +20,7 @@ from sorvolo.change.outlines import aside_of, measures, outline_of, overlap, pla
 from sorvolo.change.patches import Cut, PatchWindow, cut, moved, patch_of, quality
 from sorvolo.change.things import things_of
 from sorvolo.errors import GeometryError
-from sorvolo.geometry.arrays import Bytes, Floats, Mask, PointsM
+from sorvolo.geometry.arrays import Bytes, Floats, Mask, PointsM, square
 from sorvolo.geometry.homography import shifted
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Patch
 
@@ -170,7 +170,7 @@ class Pictures:
         if window is None or not self._votes:
             return None
         padded = np.pad(cells.astype(np.uint8), 1)
-        grown = cv2.dilate(padded, np.ones((3, 3), np.uint8))
+        grown = cv2.dilate(padded, square(3))
         cells_from_padded = shifted(-1, -1)
         site_from_padded = cell_window.site_from_cell(cell_m) @ cells_from_padded
         patch_from_cells = np.linalg.inv(window.site_from_patch) @ site_from_padded

@@ -23,6 +23,7 @@ from sorvolo.geometry.arrays import (
     Matrix3,
     PointsM,
     shrunk,
+    square,
 )
 from sorvolo.geometry.homography import apply_homography, resized
 from sorvolo.survey.findings import ComparedView, Patch
@@ -231,9 +232,7 @@ def lay(view: ComparedView, cell_m: float, ignored: Mask, held: Mask, legs: Labe
 def pieces(cells: Mask, gap: int) -> Iterator[tuple[Mask, tuple[slice, slice]]]:
     """The connected pieces of cells, gaps of up to `gap` cells closed: each with the raster's part that holds it."""
     side = 2 * ((gap + 1) // 2) + 1  # odd: an even one would shift the cells
-    closed = cv2.morphologyEx(
-        cells.view(np.uint8), cv2.MORPH_CLOSE, np.ones((side, side), np.uint8)
-    )
+    closed = cv2.morphologyEx(cells.view(np.uint8), cv2.MORPH_CLOSE, square(side))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
     for label in range(1, count):
         x, y, w, h = (int(each) for each in stats[label, :4])

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import Bytes, Floats, Floats32, Ints32, Mask, shrunk
+from sorvolo.geometry.arrays import Bytes, Floats, Floats32, Ints32, Mask, shrunk, square
 from sorvolo.kernels import detail_products, relight, slopes
 
 Bgr = NDArray[np.uint8]
@@ -121,7 +121,7 @@ def _sameness(reference: Bgr, query: Bgr) -> Floats32:
     least, most = _LIGHT_ALIKE
     sure = np.clip((alike - least) / (most - least), 0, 1)
     flat = np.exp(-(sums[1] + sums[2]) / (2 * _FLAT)) * np.float32(_FLAT_TRUST)
-    return np.asarray(np.maximum(cv2.erode(sure, np.ones((3, 3), np.uint8)), flat), np.float32)
+    return np.asarray(np.maximum(cv2.erode(sure, square(3)), flat), np.float32)
 
 
 def _spread(values: Floats32, weights: Floats32) -> Floats32:

@@ -16,6 +16,7 @@ from sorvolo.geometry.arrays import (
     PointsPx,
     Rows,
     shrunk,
+    square,
 )
 
 # How a displacement is searched; cells and pixels are those of the small copies of the pictures.
@@ -100,9 +101,7 @@ def fit_locally(
     if min(cells) < 4 or min(size) < 4 * reach:
         return None
     share = shrunk(known.astype(np.float32), size)
-    seen = cv2.erode(
-        (share > 0.99).astype(np.float32), np.ones((5, 5), np.uint8)
-    )  # no gradients of the map's rim
+    seen = cv2.erode((share > 0.99).astype(np.float32), square(5))  # no gradients of the map's rim
     on_map = np.asarray(shrunk(seen, cells), np.float32)
     still, moving = (_even_gradients(image, size) for image in (reference, query))
     agreement = _agreement((still[0] * seen, still[1] * seen), moving, reach, cells)

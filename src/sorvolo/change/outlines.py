@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Bytes, Ints32, Mask, Matrix3, PointsM
+from sorvolo.geometry.arrays import Bytes, Ints32, Mask, Matrix3, PointsM, square
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.geometry.polygons import signed_area
 from sorvolo.survey.findings import ChangeKind
@@ -161,10 +161,10 @@ def aside_of(outline_m: PointsM, cameras_m: PointsM) -> float:
 
 def dilated(mask: Mask | Bytes, side_px: int) -> Mask:
     """Where (h, w) a window of this side, around the pixel, holds some of a mask."""
-    return cv2.dilate(mask.view(np.uint8), np.ones((side_px,) * 2, np.uint8)) > 0
+    return cv2.dilate(mask.view(np.uint8), square(side_px)) > 0
 
 
 def opened(mask: Mask, side_px: int = 3) -> Mask:
     """A mask without what is narrower than a window of this side."""
-    window = np.ones((side_px,) * 2, np.uint8)
+    window = square(side_px)
     return cv2.morphologyEx(mask.view(np.uint8), cv2.MORPH_OPEN, window) > 0

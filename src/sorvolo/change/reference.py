@@ -7,7 +7,16 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import ImageGray, ImageRGB, ImageRGBA, Mask, Matrix3, PointsPx, shrunk
+from sorvolo.geometry.arrays import (
+    ImageGray,
+    ImageRGB,
+    ImageRGBA,
+    Mask,
+    Matrix3,
+    PointsPx,
+    shrunk,
+    square,
+)
 from sorvolo.geometry.grid import Grid, TileIndex, gather_tiles
 from sorvolo.geometry.homography import apply_homography, resized, shifted
 from sorvolo.registration.features import (
@@ -179,9 +188,7 @@ class ReferenceMap:
         inner = (
             (found.points_px >= _APRON_PX - 0.5) & (found.points_px < side - _APRON_PX - 0.5)
         ).all(axis=1)
-        safe = cv2.erode(
-            known.view(np.uint8), np.ones((31, 31), np.uint8)
-        )  # no corners of the map's rim
+        safe = cv2.erode(known.view(np.uint8), square(31))  # no corners of the map's rim
         keep = inner & (safe[near[:, 1], near[:, 0]] > 0)
         grid_px = apply_homography(
             np.linalg.inv(_level_from_grid(level)), found.points_px[keep] + [x, y]

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import Bytes, Floats, Ints32, Labels, Mask
+from sorvolo.geometry.arrays import Bytes, Floats, Ints32, Labels, Mask, square
 from sorvolo.kernels import (
     core_regions,
     differences,
@@ -214,7 +214,7 @@ def find_regions(
     difference, chroma, came, went, light_before, light_after = planes
     spare, specks, smooth, threshold = scratch.stack("thresholds", size, 4)
     # a large thing's inside is no clutter: only what is small among the differences raises the thresholds around it
-    window = np.ones((_SPECK_PX, _SPECK_PX), np.uint8)
+    window = square(_SPECK_PX)
     cv2.subtract(
         difference, cv2.morphologyEx(difference, cv2.MORPH_OPEN, window, dst=spare), dst=specks
     )
@@ -288,7 +288,7 @@ def _measured(
     cv2.LUT(level, LOGARITHMS, dst=log_after)
     _details(log_before, detail_before)
     _details(log_after, detail_after)
-    window = np.ones((3, 3), np.uint8)
+    window = square(3)
     cv2.addWeighted(log_after, 0.5, log_before, -0.5, 128, dst=ratio)
     cv2.morphologyEx(log_after, cv2.MORPH_GRADIENT, window, dst=edges_after)
     cv2.morphologyEx(log_before, cv2.MORPH_GRADIENT, window, dst=edges_before)
@@ -415,7 +415,7 @@ def _looked_at(boxes: Ints32, shape: tuple[int, ...]) -> tuple[tuple[slice, slic
 
 def _rims(labels: Bytes) -> Bytes:
     """The labels (h, w) of pixels next to pixels of no region, 0 elsewhere."""
-    return labels * (cv2.erode(labels, np.ones((3, 3), np.uint8)) == 0)
+    return labels * (cv2.erode(labels, square(3)) == 0)
 
 
 def _green(image: Image, boxes: Ints32) -> Floats:

@@ -6,7 +6,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Bytes, Floats32, Mask, Matrix3, PointsM, Vector3, frozen
+from sorvolo.geometry.arrays import Bytes, Floats32, Mask, Matrix3, PointsM, Vector3, frozen, square
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.ground import hidden, laid_pixels
 from sorvolo.geometry.homography import apply_homography
@@ -38,7 +38,7 @@ class OrthoSurface:
     def _steep(self) -> Bytes:
         """(H, W) 1 by walls, eaves and the rims of crowns: heights are off there, and a wall has no place on a map."""
         side = max(1, round(_WALL_M / self._cell_m)) | 1
-        window = np.ones((side, side), np.uint8)
+        window = square(side)
         rise_m = cv2.subtract(cv2.dilate(self.up_m, window), cv2.erode(self.up_m, window))
         return (np.asarray(rise_m) >= _STEEP_M).view(np.uint8)
 

@@ -32,6 +32,7 @@ from sorvolo.geometry.arrays import (
     Ints32,
     Mask,
     shrunk,
+    square,
 )
 from sorvolo.kernels import held_parts, tree_margins
 from sorvolo.survey.findings import Shade
@@ -141,12 +142,10 @@ def grown(regions: Regions, region: int, came: bool, views: Views) -> ThingPixel
     )
     while limit < _HIGHEST * top:
         over = cv2.threshold(bare, floor(limit), 255, cv2.THRESH_BINARY)[1]
-        above = np.asarray(
-            cv2.morphologyEx(over, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)), np.uint8
-        )
+        above = np.asarray(cv2.morphologyEx(over, cv2.MORPH_OPEN, square(3)), np.uint8)
         thing = held_parts(above | surely, surely)
         if _is_thing(thing, bare, limit):
-            largest_near = cv2.dilate(strength, np.ones((5, 5), np.uint8))
+            largest_near = cv2.dilate(strength, square(5))
             is_sharp = strength > np.floor(_BLURRED * np.asarray(largest_near, np.float32))
             return ThingPixels(window, (thing > 0) & (is_sharp | (surely > 0)))
         limit *= _STEP
@@ -162,7 +161,7 @@ def with_weak_ground(regions: Regions, region: int, reach_px: int) -> ThingPixel
     window = _window(regions, region, reach_px)
     weak, core = regions.weak[window], np.uint8(255) * (regions.labels[window] == region + 1)
     # two blurs of 3 px reach two pixels out
-    weak = np.asarray(cv2.erode(held_parts(weak | core, core), np.ones((5, 5), np.uint8)), np.uint8)
+    weak = np.asarray(cv2.erode(held_parts(weak | core, core), square(5)), np.uint8)
     return ThingPixels(window, ((weak > 0) & (regions.nearest[window] == region + 1)) | (core > 0))
 
 
@@ -173,7 +172,7 @@ def _is_thing(mask: Image, strength: Image, limit: float) -> bool:
         cv2.convexHull(np.concatenate(outlines))
     ):
         return False
-    inner, outer = (cv2.dilate(mask, np.ones((px, px), np.uint8)) for px in (5, 9))
+    inner, outer = (cv2.dilate(mask, square(px)) for px in (5, 9))
     beside = outer > inner
     return not beside.any() or _quantile(strength, beside, 0.75) <= _BESIDE * limit
 
@@ -318,7 +317,7 @@ def _half_known(valid: Mask | None, half: tuple[int, int]) -> Mask | None:
 
 
 def _without_rim(known: Mask, rim_px: int) -> Mask:
-    window = np.ones((2 * rim_px + 1,) * 2, np.uint8)
+    window = square(2 * rim_px + 1)
     return cv2.erode(known.astype(np.uint8), window, borderValue=1) > 0
 
 
@@ -436,10 +435,10 @@ def _filled(chosen: Mask, regions: Regions, pieces: Mapping[int, ThingPixels]) -
 
 def _outlined(thing: ImageGray, strength: ImageGray) -> ImageGray:
     """Things (h, w) 0 or 255 whose rim is drawn anew where the difference falls below a part of its height nearby."""
-    near = np.ones((_RIM_PX, _RIM_PX), np.uint8)
+    near = square(_RIM_PX)
     height = np.maximum(cv2.dilate(cv2.min(thing, strength), near), 1).astype(np.float32)
     least = np.float32(_LEAST_SHARE) * height
     limit = np.maximum(np.float32(0.5) * height - np.float32(_SLACK_LEVELS), least)
     rim = np.clip(127.5 + 255 * (strength - limit) / height, 0, 255).astype(np.uint8)
-    rim[cv2.dilate(thing, np.ones((3, 3), np.uint8)) == 0] = 0
+    rim[cv2.dilate(thing, square(3)) == 0] = 0
     return np.asarray(cv2.max(rim, cv2.erode(thing, near)), np.uint8)

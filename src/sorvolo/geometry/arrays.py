@@ -89,6 +89,11 @@ def frozen(array: Any, dtype: Any = np.float64) -> Any:
     return copy
 
 
+def square(side_px: int) -> NDArray[np.uint8]:
+    """The window (side, side) within which OpenCV erodes or dilates."""
+    return np.ones((side_px, side_px), np.uint8)
+
+
 def size_within(image: NDArray[Any], longest_px: int, least_px: int = 1) -> tuple[int, int]:
     """A picture's width and height, made smaller alike until the longer is at most this many pixels."""
     scale = min(1.0, longest_px / max(image.shape[:2]))

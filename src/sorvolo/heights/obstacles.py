@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats32, Mask, PointsM, Vector3
+from sorvolo.geometry.arrays import Floats32, Mask, PointsM, Vector3, square
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.views import View, inside
 
@@ -36,7 +36,7 @@ class Obstacles:
         known = np.isfinite(up_m)
         if not known.any():
             return cls(lattice, np.zeros(up_m.shape, np.float32))
-        around = np.ones((patch_cells, patch_cells), np.uint8)
+        around = square(patch_cells)
         low = cv2.erode(
             np.where(known, up_m, np.inf).astype(np.float32), around, borderValue=np.inf
         )

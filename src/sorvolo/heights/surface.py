@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats32, ImageGray, Mask, PointsM
+from sorvolo.geometry.arrays import Floats32, ImageGray, Mask, PointsM, square
 from sorvolo.heights.borders import beyond_borders
 from sorvolo.heights.free_space import ONE_PAIR, islands, seen_through
 from sorvolo.heights.lattice import Lattice
@@ -204,7 +204,7 @@ def _sigma_m(
     match = _MATCH_CELLS * lattice.cell_m / np.maximum(swept.spread, 0.02) / likeness
     # (H, W) highest minus lowest within two cells
     known = np.isfinite(up_m)
-    around = np.ones((5, 5), np.uint8)
+    around = square(5)
     high = cv2.dilate(np.where(known, up_m, -1e6).astype(np.float32), around)
     low = cv2.erode(np.where(known, up_m, 1e6).astype(np.float32), around)
     relief = _RELIEF_SHARE * np.where(known, high - low, 0.0)

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import Bytes, ImageRGB, ImageRGBA, Mask, PointsPx
+from sorvolo.geometry.arrays import Bytes, ImageRGB, ImageRGBA, Mask, PointsPx, square
 from sorvolo.geometry.grid import Grid, SiteGrid, TileIndex
 from sorvolo.mosaic.blending import (
     ALIGN_PX,
@@ -185,7 +185,7 @@ class Canvas:
             self._winners(column - 1, row - 1, _CHUNK_CELLS + 2, _CHUNK_CELLS + 2), list(ids)
         )
         if theirs.any():
-            cells = cv2.dilate(theirs.astype(np.uint8), np.ones((3, 3), np.uint8))[1:-1, 1:-1] > 0
+            cells = cv2.dilate(theirs.astype(np.uint8), square(3))[1:-1, 1:-1] > 0
             ground = np.repeat(np.repeat(cells, CELL_PX, axis=0), CELL_PX, axis=1)
             known.release(column * CELL_PX, row * CELL_PX, ground)
 
@@ -221,7 +221,7 @@ class Canvas:
         for (column, row), mask in dirty.items():
             x, y = column * _CHUNK_CELLS - low[0], row * _CHUNK_CELLS - low[1]
             cells[y : y + _CHUNK_CELLS, x : x + _CHUNK_CELLS] = mask
-        cells = cv2.dilate(cells, np.ones((2 * _REACH_CELLS + 1,) * 2, np.uint8))
+        cells = cv2.dilate(cells, square(2 * _REACH_CELLS + 1))
         left, top, width, height = cv2.boundingRect(cells)
         xs = self._cuts(int(low[0]) + left, width) - low[0]
         ys = self._cuts(int(low[1]) + top, height) - low[1]

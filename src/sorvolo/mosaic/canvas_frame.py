@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sorvolo.errors import GeometryError
-from sorvolo.geometry.arrays import Bytes, Floats, ImageRGB, Mask, Matrix3, PointsPx, frozen
+from sorvolo.geometry.arrays import Bytes, Floats, ImageRGB, Mask, Matrix3, PointsPx, frozen, square
 from sorvolo.geometry.homography import apply_homography, shifted
 from sorvolo.mosaic.blending import FILL_PX, WINDOW_APRON_PX, coarse_fill
 from sorvolo.mosaic.exposure import corrected
@@ -176,7 +176,7 @@ def coverage(frame: CanvasFrame, window: tuple[int, int, int, int]) -> Bytes:
     size = window[2] - window[0], window[3] - window[1]
     window_from_image = shifted(-window[0], -window[1]) @ frame.grid_from_image
     if frame.valid is not None:
-        valid = cv2.erode(frame.valid.astype(np.uint8) * 255, np.ones((3, 3), np.uint8))
+        valid = cv2.erode(frame.valid.astype(np.uint8) * 255, square(3))
         return cv2.warpPerspective(valid, window_from_image, size, flags=cv2.INTER_NEAREST)  # type: ignore[return-value]
     left, right = _spans(frame.outline_px, np.arange(window[1], window[3]))
     first = np.clip(np.ceil(left) - window[0], 0, size[0]).astype(np.int32)[:, None]

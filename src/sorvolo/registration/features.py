@@ -22,6 +22,7 @@ from sorvolo.geometry.arrays import (
     PointsPx,
     shrunk,
     size_within,
+    square,
 )
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.survey.mosaic import Features
@@ -107,7 +108,7 @@ def corners(gray: ImageGray) -> PointsPx:
     scale = min(1.0, 0.5 * max(1.0, 640 / max(gray.shape)))
     small = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     response = cv2.cornerMinEigenVal(small, 5)
-    response[response < cv2.dilate(response, np.ones((5, 5), np.uint8))] = -1.0
+    response[response < cv2.dilate(response, square(5))] = -1.0
     columns = _CORNER_COLUMNS
     rows = max(1, round(columns * small.shape[0] / small.shape[1]))
     per_cell = max(1, round(_CORNER_COUNT / (columns * rows)))
@@ -170,7 +171,7 @@ def known_only(features: Features, known: Mask, rim_px: int = 9) -> Features:
 
 def well_inside(points_px: PointsPx, known: Mask, rim_px: int) -> Mask:
     """(N,) whether points lie on known ground, (H, W), with only such around them in a window `rim_px` wide."""
-    safe = cv2.erode(known.astype(np.uint8), np.ones((rim_px, rim_px), np.uint8))
+    safe = cv2.erode(known.astype(np.uint8), square(rim_px))
     at = np.rint(points_px).astype(int)
     height, width = known.shape
     return safe[at[:, 1].clip(0, height - 1), at[:, 0].clip(0, width - 1)] > 0
@@ -208,10 +209,7 @@ def learned_features(gray: ImageGray, most: int = 2048) -> Features:
         None, {"gray": padded[None, None] / np.float32(255)}
     )
     likely = likely[0, 0, :height, :width]
-    ys, xs = np.nonzero(
-        (likely > _LEAST_POINT)
-        & (likely == cv2.dilate(likely, np.ones((_APART_PX, _APART_PX), np.uint8)))
-    )
+    ys, xs = np.nonzero((likely > _LEAST_POINT) & (likely == cv2.dilate(likely, square(_APART_PX))))
     points = np.column_stack([xs, ys]).astype(np.float64)
     sure = likely[ys, xs] * _sampled(reliability[0], points)[:, 0]
     points = points[np.argsort(-sure, kind="stable")[:most]]

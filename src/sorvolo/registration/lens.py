@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from cv2.typing import MatLike
 
-from sorvolo.geometry.arrays import ImageRGB, Mask, shrunk
+from sorvolo.geometry.arrays import ImageRGB, Mask, shrunk, square
 from sorvolo.geometry.camera import Camera
 
 _VISIBLE_PX = 0.5  # at a corner: what moves no pixel by more is left as it is
@@ -68,7 +68,7 @@ class Undistorter:
             return None
         white = np.full(self._mapped_size[::-1], 255, np.uint8)
         seen = cv2.remap(white, *self._maps, cv2.INTER_LINEAR)
-        seen = cv2.erode(seen, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
+        seen = cv2.erode(seen, square(3), borderType=cv2.BORDER_REPLICATE)
         mask = shrunk(seen, (width_px, height_px)) == 255
         return None if mask.all() else mask
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Self
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, ImageRGBA, Mask, shrunk
+from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, ImageRGBA, Mask, shrunk, square
 from sorvolo.registration.features import FeatureSettings, gray_from_rgb, sift_features
 from sorvolo.registration.matching import fit_homography, match
 from sorvolo.search.drawing.objects import GROUND_LEVEL, Body, Thing, ThingLabel
@@ -175,8 +175,8 @@ def _differing(image: ImageRGB, ground: ImageRGB, is_known: Mask, m_per_px: floa
     if np.ptp(image, axis=2).mean() > 2:  # in grey pictures nothing tells a shadow from a body
         differs &= ~is_shade
     side = max(3, round(0.06 / m_per_px) | 1)
-    whole = cv2.morphologyEx(differs.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    whole = cv2.morphologyEx(whole, cv2.MORPH_CLOSE, np.ones((side, side), np.uint8))
+    whole = cv2.morphologyEx(differs.astype(np.uint8), cv2.MORPH_OPEN, square(3))
+    whole = cv2.morphologyEx(whole, cv2.MORPH_CLOSE, square(side))
     count, parts, stats, _ = cv2.connectedComponentsWithStats(whole)
     sizes_m = stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1) * m_per_px
     fits = [number for number in range(1, count) if SHORTEST_M <= sizes_m[number] <= LONGEST_M]

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import BoxesPx, Floats, ImageRGB, ImageRGBA, Vector3, frozen
+from sorvolo.geometry.arrays import BoxesPx, Floats, ImageRGB, ImageRGBA, Vector3, frozen, square
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.pose import Pose
 from sorvolo.search.drawing.bodies import build_body
@@ -131,7 +131,7 @@ def _blur_px2(grey: _Grey) -> Floats:
     again = np.hypot(*_gradients(soft))
     strength = np.hypot(x, y)
     is_ridge = (
-        strength >= cv2.dilate(strength, np.ones((3, 3), np.uint8)) - 1e-3
+        strength >= cv2.dilate(strength, square(3)) - 1e-3
     )  # an edge's own line, not its slopes
     angle = np.arctan2(y, x) % np.pi
     ratio = np.maximum(strength / np.maximum(again, 1e-6), 1.0001)
