@@ -1,9 +1,13 @@
 """What holds for all tests."""
 
 import gc
+import importlib
 import os
 import signal
+import sys
 from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
@@ -30,6 +34,21 @@ settings.load_profile("every time the same" if "CI" in os.environ else "anywhere
 
 
 os.environ.pop("SORVOLO_CATALOGUE", None)  # where the tester's own catalogues lie
+
+
+def pytest_collectstart(collector: pytest.Collector) -> None:
+    """Each worker of the whole suite begins with tests of its own: in a fresh clone all of them would rewrite the
+    assertions of every file, where one writes what the others read."""
+    is_whole = collector.config.args_source is pytest.Config.ArgsSource.TESTPATHS
+    workers, tests = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "0")), Path(__file__).parent
+    if not (workers and is_whole and collector.path == tests):
+        return
+    own = int(os.environ["PYTEST_XDIST_WORKER"].removeprefix("gw"))
+    for path in sorted(tests.rglob("test_*.py"))[own::workers]:
+        if str(path.parent) not in sys.path:
+            sys.path.insert(0, str(path.parent))  # as pytest does itself
+        with suppress(Exception, pytest.skip.Exception):  # which the collection reports
+            importlib.import_module(path.stem)
 
 
 def pytest_collection_finish() -> None:
