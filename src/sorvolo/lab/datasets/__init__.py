@@ -8,7 +8,7 @@ from sorvolo.errors import InputError, SettingsError
 from sorvolo.lab.datasets.checking import labelled_set, naming, plain
 from sorvolo.lab.datasets.coco import coco_files, read_coco
 from sorvolo.lab.datasets.okutama import looks_like_okutama, read_okutama
-from sorvolo.lab.datasets.parsed import ParsedSet, Reader, files_below, is_label_file, read_text
+from sorvolo.lab.datasets.parsed import ParsedSet, Reader, files_below, first_line, is_label_file
 from sorvolo.lab.datasets.splits import compiled
 from sorvolo.lab.datasets.umcd import looks_like_umcd, read_umcd
 from sorvolo.lab.datasets.visdrone import looks_like_visdrone, read_visdrone
@@ -158,7 +158,7 @@ def _label_texts(folder: Path) -> list[Path]:
 
 
 def _form_of_text(path: Path) -> str | None:
-    line = next((line for line in read_text(path).splitlines() if line.strip()), "")
+    line = first_line(path)
     for form, looks_like in (
         ("visdrone", looks_like_visdrone),
         ("okutama", looks_like_okutama),

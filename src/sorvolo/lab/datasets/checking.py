@@ -156,7 +156,25 @@ def labelled_set(
             f"{place}: none of its {len(parsed.pictures)} pictures can be used: "
             + "; ".join(each.text for each in found)
         )
-    notices = (*found, *_left_out(counts, names), *_look_alikes(counts, names))
+    is_unknown = {name: not (names.is_target(name) or names.is_ignored(name)) for name in counts}
+    notices = (
+        *found,
+        *_counted(
+            "unmapped_classes",
+            {name: count for name, count in counts.items() if is_unknown[name]},
+            "classes that stand for none of ours left out",
+        ),
+        *_counted(
+            "look_alikes_ignored",
+            {
+                name: count
+                for name, count in counts.items()
+                if names.is_ignored(name) and plain(name) in LOOK_ALIKES
+            },
+            "look-alikes are neither right nor wrong, as regions to ignore",
+            "; --classes THEIRS=OURS,... states which of a set's classes count",
+        ),
+    )
     return LabelledSet(
         place.stem if place.is_file() else place.name,
         classes,
@@ -297,34 +315,12 @@ def _clipped(
     )
 
 
-def _left_out(counts: Counter[str], names: Naming) -> tuple[Notice, ...]:
-    rest = {
-        name: count
-        for name, count in counts.items()
-        if not names.is_target(name) and not names.is_ignored(name)
-    }
-    if not rest:
+def _counted(
+    code: str, counts: Mapping[str, int], words: str, more: str = ""
+) -> tuple[Notice, ...]:
+    """A notice of so many boxes of these names; none where there are no names."""
+    if not counts:
         return ()
-    total = sum(rest.values())
-    text = f"{total} boxes of classes that stand for none of ours left out: {_counted(rest)}"
-    return (Notice("unmapped_classes", total, text),)
-
-
-def _look_alikes(counts: Counter[str], names: Naming) -> tuple[Notice, ...]:
-    alike = {
-        name: count
-        for name, count in counts.items()
-        if names.is_ignored(name) and plain(name) in LOOK_ALIKES
-    }
-    if not alike:
-        return ()
-    total = sum(alike.values())
-    text = (
-        f"{total} boxes of look-alikes are neither right nor wrong, as regions to ignore: {_counted(alike)}; "
-        "--classes THEIRS=OURS,... states which of a set's classes count"
-    )
-    return (Notice("look_alikes_ignored", total, text),)
-
-
-def _counted(counts: Mapping[str, int]) -> str:
-    return ", ".join(f"{name} ({count})" for name, count in counts.items())
+    total = sum(counts.values())
+    named = ", ".join(f"{name} ({count})" for name, count in counts.items())
+    return (Notice(code, total, f"{total} boxes of {words}: {named}{more}"),)

@@ -7,14 +7,12 @@ from sorvolo.errors import InputError
 from sorvolo.lab.datasets.parsed import (
     LabelFinding,
     ParsedBox,
-    ParsedPicture,
     ParsedSet,
-    files_below,
     findings_in,
-    frames_by_video,
-    no_frames,
-    pictures_around,
-    read_text,
+    first_line,
+    label_files,
+    labelled_frames,
+    read_lines,
 )
 
 FORM = "Okutama-Action"
@@ -35,42 +33,17 @@ def read_okutama(place: Path) -> ParsedSet:
     and with multiple actions, the boxes are the same: the first file counts. Raises InputError when no line is of this
     form, or no frame is there.
     """
-    files = (
-        [place]
-        if place.is_file()
-        else [
-            path
-            for path in files_below(place, ".txt")
-            if looks_like_okutama(
-                next((line for line in read_text(path).splitlines() if line.strip()), "")
-            )
-        ]
-    )
+    files = label_files(place, lambda path: looks_like_okutama(first_line(path)))
     files_of = {path.stem: path for path in reversed(files)}
     read = {video: _boxes(path) for video, path in sorted(files_of.items())}
     labelled = {video: by_frame for video, (by_frame, _) in read.items()}
-    findings = findings_in(read.values())
     if not any(labelled.values()):
         raise InputError(
             f'{place}: no line is an {FORM} label (track, four edges, frame, three flags, "Person")'
         )
-    frames = frames_by_video(pictures_around(place, FORM), labelled)
-    if not any(frames.values()):
-        raise no_frames(place, FORM, labelled)
-    result: list[ParsedPicture] = []
-    for video, by_frame in labelled.items():
-        lonely = set(by_frame) - set(frames[video])
-        findings.append(
-            LabelFinding(
-                "labels_without_picture", f"{video}, frame {min(lonely, default=0)}", len(lonely)
-            )
-        )
-        size = _labelled_size(files_of[video])
-        result += [
-            ParsedPicture(path, tuple(by_frame.get(number, ())), size, video)
-            for number, path in sorted(frames[video].items())
-        ]
-    return ParsedSet(FORM, tuple(result), ("Person",), tuple(findings))
+    sizes = {video: _labelled_size(path) for video, path in files_of.items()}
+    pictures, lonely = labelled_frames(place, FORM, labelled, sizes)
+    return ParsedSet(FORM, pictures, ("Person",), (*findings_in(read.values()), *lonely))
 
 
 def looks_like_okutama(line: str) -> bool:
@@ -81,18 +54,13 @@ def looks_like_okutama(line: str) -> bool:
 def _boxes(path: Path) -> tuple[dict[int, list[ParsedBox]], list[LabelFinding]]:
     """The file's boxes by frame; frames where all are lost have none. And its lines that are no labels."""
     found: dict[int, list[ParsedBox]] = {}
-    findings = []
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
-        match = _LINE.fullmatch(line) if len(line) < 1000 else None
-        if match is None:
-            if line.strip():
-                findings.append(LabelFinding("malformed_labels", f"{path.name}, line {number}"))
-            continue
+    matches, findings = read_lines(
+        path, lambda line: _LINE.fullmatch(line) if len(line) < 1000 else None
+    )
+    for match in matches:
         of_frame = found.setdefault(int(match["frame"]), [])
         if match["lost"] == "0":
-            left, top, right, bottom = (
-                float(match[edge]) for edge in ("left", "top", "right", "bottom")
-            )
+            left, top, right, bottom = map(float, match.group("left", "top", "right", "bottom"))
             of_frame.append(ParsedBox(match["name"], left, top, right, bottom))
     return found, findings
 

@@ -6,7 +6,8 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from types import MappingProxyType
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 from PIL import ExifTags, Image
 
@@ -108,6 +109,8 @@ class ParsedSet:
         )
 
 
+_Label = TypeVar("_Label")
+
 Reader: TypeAlias = Callable[[Path], ParsedSet]
 """Reads one form from a file or folder; raises InputError when it is not of that form."""
 
@@ -162,6 +165,33 @@ def read_text(path: Path) -> str:
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         return data.decode("utf-16", "replace")
     return data.decode("utf-8-sig", "replace")
+
+
+def first_line(path: Path) -> str:
+    """The first line that is not blank; empty where there is none."""
+    return next((line for line in read_text(path).splitlines() if line.strip()), "")
+
+
+def read_lines(
+    path: Path, parse: Callable[[str], _Label | None]
+) -> tuple[list[_Label], list[LabelFinding]]:
+    """What `parse` makes of a file's lines; those of which it makes None are no labels, unless they are blank."""
+    found, findings = [], []
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        if (label := parse(line)) is not None:
+            found.append(label)
+        elif line.strip():
+            findings.append(LabelFinding("malformed_labels", f"{path.name}, line {number}"))
+    return found, findings
+
+
+def label_files(
+    place: Path, is_one: Callable[[Path], bool] = lambda _: True, ending: str = ".txt"
+) -> list[Path]:
+    """The file itself, or all files below a folder that end so and that `is_one` takes."""
+    if place.is_file():
+        return [place]
+    return [path for path in files_below(place, ending) if is_one(path)]
 
 
 def is_label_file(path: Path) -> bool:
@@ -303,11 +333,14 @@ def paired(
 
 
 def frames_by_video(
-    pictures: Iterable[Path], videos: Iterable[str]
+    place: Path, form: str, videos: Iterable[str]
 ) -> Mapping[str, Mapping[int, Path]]:
-    """The pictures of each video by frame number: in a folder of its name, or with its name before the number."""
+    """The pictures of each video by frame number: in a folder of its name, or with its name before the number.
+
+    Raises InputError where no frame of any video lies there as a picture.
+    """
     frames: dict[str, dict[int, Path]] = {video: {} for video in videos}
-    for path in pictures:
+    for path in pictures_around(place, form):
         number = frame_number(path.name)
         if number is None:
             continue
@@ -315,13 +348,33 @@ def frames_by_video(
         video = named or group_of(path, path.parent)
         if video in frames:
             frames[video].setdefault(number, path)
+    if not any(frames.values()):
+        raise InputError(
+            f"{place}: {form} labels of videos, but none of their frames is there; extract them as pictures into a folder "
+            f"of the video's name, numbered as in the labels (such as {next(iter(frames))}/000123.jpg)"
+        )
     return frames
 
 
-def no_frames(place: Path, form: str, videos: Iterable[str]) -> InputError:
-    """The error for labels of videos none of whose frames lies there as a picture."""
-    first = next(iter(videos))
-    return InputError(
-        f"{place}: {form} labels of videos, but none of their frames is there; extract them as pictures into a folder "
-        f"of the video's name, numbered as in the labels (such as {first}/000123.jpg)"
-    )
+def labelled_frames(
+    place: Path,
+    form: str,
+    labelled: Mapping[str, Mapping[int, Sequence[ParsedBox]]],
+    sizes: Mapping[str, tuple[float, float]] = MappingProxyType({}),
+) -> tuple[tuple[ParsedPicture, ...], list[LabelFinding]]:
+    """All frames of videos with their boxes, and the labels whose frame is not there.
+
+    `labelled` has the boxes by video and frame, `sizes` the labelled sizes by video. Raises InputError as
+    `frames_by_video`.
+    """
+    frames = frames_by_video(place, form, labelled)
+    result, findings = [], []
+    for video, by_frame in labelled.items():
+        lonely = set(by_frame) - set(frames[video])
+        where = f"{video}, frame {min(lonely, default=0)}"
+        findings.append(LabelFinding("labels_without_picture", where, len(lonely)))
+        result += [
+            ParsedPicture(path, tuple(by_frame.get(number, ())), sizes.get(video), video)
+            for number, path in sorted(frames[video].items())
+        ]
+    return tuple(result), findings

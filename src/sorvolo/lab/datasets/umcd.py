@@ -12,10 +12,8 @@ from sorvolo.lab.datasets.parsed import (
     ParsedBox,
     ParsedPicture,
     ParsedSet,
-    files_below,
     frames_by_video,
-    no_frames,
-    pictures_around,
+    label_files,
     read_text,
 )
 
@@ -66,20 +64,13 @@ def read_umcd(place: Path) -> ParsedSet:
     when nothing is of this form, times are given without `Fps:`, or no frame is there or of use.
     """
     # The videos of all metadata files that describe objects. Raises InputError when none does.
-    files = (
-        [place]
-        if place.is_file()
-        else [path for path in files_below(place, ".txt") if looks_like_umcd(path)]
-    )
-    videos = {path: _parsed(path) for path in files}
-    videos = {path: video for path, video in videos.items() if video.objects}
+    read = {path: _parsed(path) for path in label_files(place, looks_like_umcd)}
+    videos = {path: video for path, video in read.items() if video.objects}
     if not videos:
         raise InputError(
             f"{place}: no text file describes objects as {FORM}'s do (Type:, Shape:, Dimension:, ...)"
         )
-    frames = frames_by_video(pictures_around(place, FORM), [path.stem for path in videos])
-    if not any(frames.values()):
-        raise no_frames(place, FORM, frames)
+    frames = frames_by_video(place, FORM, [path.stem for path in videos])
     result: list[ParsedPicture] = []
     for path, video in videos.items():
         if not video.fps > 0 and any(each.from_s > -inf for each in video.objects):

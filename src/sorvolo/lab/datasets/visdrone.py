@@ -10,13 +10,13 @@ from sorvolo.lab.datasets.parsed import (
     ParsedBox,
     ParsedPicture,
     ParsedSet,
-    files_below,
     findings_in,
-    frames_by_video,
     is_label_file,
-    no_frames,
+    label_files,
+    labelled_frames,
     paired,
     pictures_around,
+    read_lines,
     read_text,
 )
 
@@ -51,12 +51,7 @@ def read_visdrone(place: Path) -> ParsedSet:
     target come first. Score 0 and the categories "ignored regions" and "others" are ignored; truncated and occluded
     objects count. Raises InputError when no line is of either form.
     """
-    files = (
-        [place]
-        if place.is_file()
-        else [path for path in files_below(place, ".txt") if is_label_file(path)]
-    )
-    parsed = {path: _rows(path) for path in files}
+    parsed = {path: read_lines(path, _row) for path in label_files(place, is_label_file)}
     malformed = findings_in(parsed.values())
     rows = {
         path: found for path, (found, _) in parsed.items() if found or not read_text(path).strip()
@@ -71,10 +66,8 @@ def read_visdrone(place: Path) -> ParsedSet:
         raise InputError(
             f"{place}: lines of 8 and of 10 numbers; read pictures (DET) and videos (VID) one by one"
         )
-    length = lengths.pop()
-    pictures = pictures_around(place, FORM)
-    read = _video_frames if length == _VID else _separate_pictures
-    labelled, lonely = read(place, rows, pictures)
+    read = _video_frames if lengths == {_VID} else _separate_pictures
+    labelled, lonely = read(place, rows)
     return ParsedSet(FORM, labelled, NAMES, (*malformed, *lonely))
 
 
@@ -83,15 +76,11 @@ def looks_like_visdrone(line: str) -> bool:
     return _LINE.fullmatch(line) is not None
 
 
-def _rows(path: Path) -> tuple[list[list[int]], list[LabelFinding]]:
-    """The numbers of the file's lines, and the lines that are no labels."""
-    rows, findings = [], []
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
-        if looks_like_visdrone(line) and len(line) < 300:
-            rows.append([int(word) for word in line.strip().strip(",").split(",")])
-        elif line.strip():
-            findings.append(LabelFinding("malformed_labels", f"{path.name}, line {number}"))
-    return rows, findings
+def _row(line: str) -> list[int] | None:
+    """The numbers of a line; None where it is no label."""
+    if len(line) >= 300 or not looks_like_visdrone(line):
+        return None
+    return [int(word) for word in line.strip().strip(",").split(",")]
 
 
 def _box(row: list[int]) -> ParsedBox:
@@ -103,8 +92,9 @@ def _box(row: list[int]) -> ParsedBox:
 
 
 def _separate_pictures(
-    place: Path, rows: _RowsByFile, pictures: list[Path]
+    place: Path, rows: _RowsByFile
 ) -> tuple[tuple[ParsedPicture, ...], list[LabelFinding]]:
+    pictures = pictures_around(place, FORM)
     label_of, lonely = paired(pictures, rows, place, FORM)
     result = []
     for path in pictures:
@@ -118,30 +108,10 @@ def _separate_pictures(
 
 
 def _video_frames(
-    place: Path, rows: _RowsByFile, pictures: list[Path]
+    place: Path, rows: _RowsByFile
 ) -> tuple[tuple[ParsedPicture, ...], list[LabelFinding]]:
-    frames = frames_by_video(pictures, [path.stem for path in rows])
-    if not any(frames.values()):
-        raise no_frames(place, FORM, frames)
-    result: list[ParsedPicture] = []
-    findings = []
+    labelled: dict[str, dict[int, list[ParsedBox]]] = {path.stem: {} for path in rows}
     for path, found in rows.items():
-        boxes: dict[int, list[ParsedBox]] = {number: [] for number in frames[path.stem]}
-        lonely = set()
         for row in found:
-            if row[0] in boxes:
-                boxes[row[0]].append(_box(row))
-            else:
-                lonely.add(row[0])
-        findings.append(
-            LabelFinding(
-                "labels_without_picture",
-                f"{path.stem}, frame {min(lonely, default=0)}",
-                len(lonely),
-            )
-        )
-        result += [
-            ParsedPicture(frames[path.stem][number], tuple(each), None, path.stem)
-            for number, each in boxes.items()
-        ]
-    return tuple(result), findings
+            labelled[path.stem].setdefault(row[0], []).append(_box(row))
+    return labelled_frames(place, FORM, labelled)

@@ -14,7 +14,7 @@ from sorvolo.lab.datasets.parsed import (
     ParsedBox,
     ParsedPicture,
     ParsedSet,
-    files_below,
+    label_files,
     paired,
     pictures_around,
     read_text,
@@ -59,7 +59,7 @@ def looks_like_voc(path: Path) -> bool:
 
 def _annotations(place: Path) -> tuple[dict[Path, ParsedPicture], list[LabelFinding]]:
     """Every XML file of this form, and what of them is none. Raises InputError when there is none."""
-    files = [place] if place.is_file() else files_below(place, ".xml")
+    files = label_files(place, ending=".xml")
     labelled: dict[Path, ParsedPicture] = {}
     findings = []
     for path in files:

@@ -15,8 +15,10 @@ from sorvolo.lab.datasets.parsed import (
     ParsedSet,
     files_below,
     findings_in,
+    first_line,
     is_label_file,
     pictures_below,
+    read_lines,
     read_text,
 )
 
@@ -52,7 +54,12 @@ def read_yolo(place: Path) -> ParsedSet:
             f"{folder}: none of its {len(pictures)} pictures has a label file of the same name, beside it or in a "
             f"folder labels/ beside images/ (such as labels/{pictures[0].stem}.txt)"
         )
-    read = {path: _boxes(labels[path], names) if path in labels else ([], []) for path in pictures}
+    read: dict[Path, tuple[list[ParsedBox], list[LabelFinding]]] = {
+        path: read_lines(labels[path], lambda line: _box(line, names))
+        if path in labels
+        else ([], [])
+        for path in pictures
+    }
     malformed = findings_in(read.values())
     boxes = [box for boxes, _ in read.values() for box in boxes]
     far = sum(max(abs(edge) for edge in box[1:5]) > _FARTHEST_SHARE for box in boxes)
@@ -165,33 +172,21 @@ def _lonely(folder: Path, pictures: list[Path], labels: dict[Path, Path]) -> Ite
 
 def _is_label_place(path: Path, folder: Path) -> bool:
     inside = [part.lower() for part in path.relative_to(folder).parts[:-1]]
-    if "labels" in inside:
-        return True
-    first = next((line for line in read_text(path).splitlines() if line.strip()), "")
-    return looks_like_yolo(first)
+    return "labels" in inside or looks_like_yolo(first_line(path))
 
 
-def _boxes(path: Path, names: list[str]) -> tuple[list[ParsedBox], list[LabelFinding]]:
-    """The file's boxes, and its lines that are no labels."""
-    boxes, findings = [], []
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
-        if not line.strip():
-            continue
-        numbers = _numbers(line)
-        if len(numbers) < 5 or numbers[0] != int(numbers[0]) or numbers[0] < 0:
-            findings.append(LabelFinding("malformed_labels", f"{path.name}, line {number}"))
-            continue
-        label = int(numbers[0])
-        name = names[label] if label < len(names) else str(label)
-        if len(numbers) >= 7 and len(numbers) % 2:
-            xs, ys = numbers[1::2], numbers[2::2]
-            boxes.append(ParsedBox(name, min(xs), min(ys), max(xs), max(ys)))
-        else:  # a sixth number is a score or a track
-            x, y, width, height = numbers[1:5]
-            boxes.append(
-                ParsedBox(name, x - width / 2, y - height / 2, x + width / 2, y + height / 2)
-            )
-    return boxes, findings
+def _box(line: str, names: list[str]) -> ParsedBox | None:
+    """The box of a line; None where it is no label."""
+    numbers = _numbers(line)
+    if len(numbers) < 5 or numbers[0] != int(numbers[0]) or numbers[0] < 0:
+        return None
+    label = int(numbers[0])
+    name = names[label] if label < len(names) else str(label)
+    if len(numbers) >= 7 and len(numbers) % 2:
+        xs, ys = numbers[1::2], numbers[2::2]
+        return ParsedBox(name, min(xs), min(ys), max(xs), max(ys))
+    x, y, width, height = numbers[1:5]  # a sixth number is a score or a track
+    return ParsedBox(name, x - width / 2, y - height / 2, x + width / 2, y + height / 2)
 
 
 def _numbers(line: str) -> list[float]:
