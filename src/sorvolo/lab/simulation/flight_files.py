@@ -1,12 +1,11 @@
 """Flights as files that drones leave behind: video, photos, telemetry, camera and truth; the same bytes each time."""
 
-import csv
 import io
 import json
 import os
 import platform
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Set
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from fractions import Fraction
@@ -321,9 +320,7 @@ def _moment(time_ns: int) -> datetime:
 
 def _umcd(telemetry: Telemetry) -> str:
     """Table 2.2's columns, those that no simulated instrument measures at their idle values."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(UMCD_COLUMNS)
+    rows: list[Sequence[object]] = [UMCD_COLUMNS]
     times_s = (telemetry.time_ns - telemetry.time_ns[:1]) / 1e9
     speed = telemetry["speed_m_s"]
     travelled_m = (
@@ -358,7 +355,7 @@ def _umcd(telemetry: Telemetry) -> str:
             *(f"{angle:.3f}" for angle in (roll, pitch, yaw)),
         ]
         # Columns `IMUTemp(C)` to `batteryLifePercentage`: the charge falls with the flight's time
-        writer.writerow(
+        rows.append(
             [
                 *umcd_place,
                 *_UMCD_IDLE_INSTRUMENTS,
@@ -367,19 +364,17 @@ def _umcd(telemetry: Telemetry) -> str:
                 *_UMCD_IDLE_ERRORS,
                 *[f"{travelled_m[i]:.2f}"] * 2,
                 f"{row['course_deg']:.2f}",
-                *[
-                    "42.0",
-                    "31.0",
-                    "4480",
-                    f"{4480 - time_s:.0f}",
-                    "12",
-                    f"{max(5.0, 98 - time_s / 12):.0f}",
-                ],
+                "42.0",
+                "31.0",
+                "4480",
+                f"{4480 - time_s:.0f}",
+                "12",
+                f"{max(5.0, 98 - time_s / 12):.0f}",
                 *[f"{row[f'camera_{axis}_deg']:.4f}" for axis in ("roll", "pitch", "yaw")] * 2,
                 *_UMCD_MOTORS,
             ]
         )
-    return text.getvalue()
+    return "".join(",".join(map(str, row)) + "\n" for row in rows)
 
 
 def _quaternion(

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
@@ -17,6 +17,7 @@ from sorvolo.lab.simulation.ground_painting import (
     GroundRaster,
     away_from,
     distance_to_curve,
+    rectangle,
     rectangle_cover,
     scatter,
     soft,
@@ -24,7 +25,7 @@ from sorvolo.lab.simulation.ground_painting import (
 from sorvolo.search.drawing.noise import FieldF32
 
 _Block: TypeAlias = tuple[float, float, float, float]  # west, south, east, north, m
-_NOWHERE: Floats = np.zeros((0, 3))  # of what a ground has none
+_NOWHERE: Floats = np.zeros((0, 3))
 
 
 class GroundKind(StrEnum):
@@ -36,14 +37,13 @@ class GroundKind(StrEnum):
     SAND = "sand"
 
 
-@dataclass(frozen=True, eq=False)
-class GroundLayout:
+class GroundLayout(NamedTuple):
     """Where on the ground things may stand, in site metres: rows of (east, north, yaw_deg), each (N, 3)."""
 
-    houses: Floats
-    trees: Floats
-    bushes: Floats
-    parkings: Floats
+    houses: Floats = _NOWHERE
+    trees: Floats = _NOWHERE
+    bushes: Floats = _NOWHERE
+    parkings: Floats = _NOWHERE
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,14 +66,14 @@ def orthophoto_ground(rgb: ImageRGB, m_per_px: float) -> PaintedGround:
         height * m_per_px / 2,
         (m_per_px, m_per_px),
     )
-    return PaintedGround(raster, GroundLayout(_NOWHERE, _NOWHERE, _NOWHERE, _NOWHERE))
+    return PaintedGround(raster, GroundLayout())
 
 
 def paint_ground(
     kind: GroundKind, area: GroundArea, m_per_px: float, rng: Generator
 ) -> PaintedGround:
     """Paint `area` at `m_per_px`; the same `rng` state gives the same ground."""
-    canvas = GroundCanvas.over(area, m_per_px, rng)
+    canvas = GroundCanvas(area, m_per_px, rng)
     painter = {
         GroundKind.DIRT: _dirt,
         GroundKind.COUNTRYSIDE: _countryside,
@@ -109,7 +109,7 @@ def _dirt(canvas: GroundCanvas) -> GroundLayout:
             )
     canvas.develop()
     canvas.stones(1.4, (0.05, 0.4), (164, 152, 136), np.clip(0.25 + gravel, 0, 1))
-    return GroundLayout(_NOWHERE, _NOWHERE, scatter(canvas, 0.004, 3.0, 2.0), _NOWHERE)
+    return GroundLayout(bushes=scatter(canvas, 0.004, 3.0, 2.0))
 
 
 def _countryside(canvas: GroundCanvas) -> GroundLayout:
@@ -169,7 +169,7 @@ def _countryside(canvas: GroundCanvas) -> GroundLayout:
     trees = scatter(canvas, 1 / 150, 5.0, 3.0, far_from_houses)
     hedge = soft(-np.abs(border), -0.7, 0.2) + far_from_houses * soft(field(9.0, 3.0), 1.0, 0.2)
     bushes = scatter(canvas, 1 / 90, 1.6, 1.0, hedge)
-    return GroundLayout(houses, trees, bushes, _NOWHERE)
+    return GroundLayout(houses, trees, bushes)
 
 
 def _plant_rows(
@@ -204,32 +204,18 @@ def _urban(canvas: GroundCanvas) -> GroundLayout:
     canvas.develop()
     for west, south, east, north in blocks:
         for inset, tone in ((0.0, 196.0), (1.8, 140.0)):
-            ring = np.array(
-                [
-                    [west + inset, south + inset],
-                    [east - inset, south + inset],
-                    [east - inset, north - inset],
-                    [west + inset, north - inset],
-                    [west + inset, south + inset],
-                ]
-            )
-            canvas.stroke(ring, 0.14, np.array([tone, tone - 2, tone - 6]))
+            ring = rectangle(west + inset, south + inset, east - inset, north - inset)
+            canvas.stroke(np.vstack([ring, ring[:1]]), 0.14, (tone, tone - 2, tone - 6))
         for at in np.arange(west + 0.6, east - 0.4, 0.9):
             for low, high in ((south, south + 1.8), (north - 1.8, north)):
-                canvas.stroke(np.array([[at, low], [at, high]]), 0.02, np.array([146, 143, 138]))
+                canvas.stroke([[at, low], [at, high]], 0.02, (146, 143, 138))
         for at in np.arange(south + 0.6, north - 0.4, 0.9):
             for low, high in ((west, west + 1.8), (east - 1.8, east)):
-                canvas.stroke(np.array([[low, at], [high, at]]), 0.02, np.array([146, 143, 138]))
-    width_m, height_m = canvas.area.size_m
-    for _ in range(int(0.03 * width_m * height_m)):
-        start = np.array(
-            [
-                canvas.rng.uniform(canvas.area.west_m, canvas.area.east_m),
-                canvas.rng.uniform(canvas.area.south_m, canvas.area.north_m),
-            ]
-        )
-        steps = np.cumsum(canvas.rng.normal(0, 0.35, (8, 2)) + canvas.rng.normal(0, 0.3, 2), axis=0)
-        canvas.stroke(start + steps, 0.02, np.array([66.0, 65, 64]))
+                canvas.stroke([[low, at], [high, at]], 0.02, (146, 143, 138))
+    for _ in range(int(0.03 * area.size_m[0] * area.size_m[1])):
+        start = rng.uniform((area.west_m, area.south_m), (area.east_m, area.north_m))
+        steps = np.cumsum(rng.normal(0, 0.35, (8, 2)) + rng.normal(0, 0.3, 2), axis=0)
+        canvas.stroke(start + steps, 0.02, (66, 65, 64))
     # the places (east, north, yaw) of houses in the yards, and of the parked cars, whose
     # places are painted
     houses: list[tuple[float, float, float]] = []
@@ -241,27 +227,16 @@ def _urban(canvas: GroundCanvas) -> GroundLayout:
     white = np.array([222.0, 222, 216])
     for west, south, east, north in blocks:
         for at in np.arange(west, east - 2, 5.0):  # the dashed middle of the road to the south
-            canvas.stroke(np.array([[at, south - 3.6], [at + 2.5, south - 3.6]]), 0.12, white)
+            canvas.stroke([[at, south - 3.6], [at + 2.5, south - 3.6]], 0.12, white)
         for at in np.arange(south, north - 2, 5.0):
-            canvas.stroke(np.array([[west - 3.6, at], [west - 3.6, at + 2.5]]), 0.12, white)
+            canvas.stroke([[west - 3.6, at], [west - 3.6, at + 2.5]], 0.12, white)
         # a zebra crossing at each block's corner
         for at in np.arange(south - 6.3, south - 0.6, 0.9):
-            canvas.polygon(
-                np.array(
-                    [
-                        [east - 3.2, at],
-                        [east - 0.6, at],
-                        [east - 0.6, at + 0.45],
-                        [east - 3.2, at + 0.45],
-                    ]
-                ),
-                white * canvas.rng.uniform(0.88, 1.0),
-            )
-        hole = np.array([canvas.rng.uniform(west, east), south - 2.0])
+            stripe = rectangle(east - 3.2, at, east - 0.6, at + 0.45)
+            canvas.polygon(stripe, white * rng.uniform(0.88, 1.0))
+        hole = rng.uniform(west, east), south - 2.0
         angle = np.linspace(0, 2 * np.pi, 20)
-        canvas.polygon(
-            hole + 0.35 * np.column_stack([np.cos(angle), np.sin(angle)]), np.array([70.0, 68, 66])
-        )
+        canvas.polygon(hole + 0.35 * np.column_stack([np.cos(angle), np.sin(angle)]), (70, 68, 66))
     garden = sum(
         (rectangle_cover(canvas, w + 3, s + 3, e - 3, n - 3) for w, s, e, n in lawns), 0 * ones
     )
@@ -269,12 +244,10 @@ def _urban(canvas: GroundCanvas) -> GroundLayout:
     kerb_parkings = [
         (w - 1.3, 0.5 * (s + n) + d, 90.0) for w, s, _, n in blocks for d in (-6.0, 1.0)
     ]
-    return GroundLayout(
-        np.array(houses).reshape(-1, 3),
-        trees,
-        _NOWHERE,
-        np.array(parkings + kerb_parkings).reshape(-1, 3),
+    houses_m, parkings_m = (
+        np.array(each).reshape(-1, 3) for each in (houses, parkings + kerb_parkings)
     )
+    return GroundLayout(houses_m, trees, parkings=parkings_m)
 
 
 def _paint_blocks(
@@ -313,15 +286,10 @@ def _paint_parking(
     canvas: GroundCanvas, west: float, south: float, east: float
 ) -> list[tuple[float, float, float]]:
     """Lines of a row of parking lots, 2.5 m by 5 m; returns their places."""
-    lots = []
     edges = np.arange(west + 0.5, east - 0.4, 2.5)
     for edge in edges:
-        canvas.stroke(
-            np.array([[edge, south + 0.4], [edge, south + 5.2]]), 0.1, np.array([214.0, 214, 208])
-        )
-    for left in edges[:-1]:
-        lots.append((float(left) + 1.25, south + 2.8, 90.0))
-    return lots
+        canvas.stroke([[edge, south + 0.4], [edge, south + 5.2]], 0.1, (214, 214, 208))
+    return [(float(left) + 1.25, south + 2.8, 90.0) for left in edges[:-1]]
 
 
 def _sand(canvas: GroundCanvas) -> GroundLayout:
@@ -335,4 +303,4 @@ def _sand(canvas: GroundCanvas) -> GroundLayout:
         0.012 * field(20, 8) + 0.006 * field(2.5, 0.9) + 0.004 * field(0.4),
     )
     canvas.develop((0.05, 0.12, 0.3), (1.0, 1.0, 1.0))
-    return GroundLayout(_NOWHERE, _NOWHERE, _NOWHERE, _NOWHERE)
+    return GroundLayout()

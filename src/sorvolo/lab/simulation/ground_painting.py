@@ -1,10 +1,12 @@
 """The painter's tools: a raster of ground in site metres, mixed coarsely and then detailed."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.random import Generator
+from numpy.typing import NDArray
 
 from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, shrunk
 from sorvolo.search.drawing.noise import FieldF32, fractal, layer
@@ -21,10 +23,21 @@ class GroundArea:
     east_m: float
     north_m: float
 
+    @classmethod
+    def around(cls, points_m: Floats, margin_m: float) -> "GroundArea":
+        """The area of points (N, 2), larger by a margin on each side."""
+        low, high = points_m.min(axis=0) - margin_m, points_m.max(axis=0) + margin_m
+        return cls(*low.tolist(), *high.tolist())
+
     @property
     def size_m(self) -> tuple[float, float]:
         """Width and height."""
         return self.east_m - self.west_m, self.north_m - self.south_m
+
+    @property
+    def corners_m(self) -> Floats:
+        """(4, 2) from the south-west on, counter-clockwise."""
+        return rectangle(self.west_m, self.south_m, self.east_m, self.north_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,11 +91,11 @@ class GroundRaster:
 class GroundCanvas:
     """The ground while it is painted: a coarse mix of materials first, then fine strokes on the full raster."""
 
-    def __init__(
-        self, area: GroundArea, m_per_px: float, size_px: tuple[int, int], rng: Generator
-    ) -> None:
-        self.area, self.m_per_px, self.size_px, self.rng = area, m_per_px, size_px, rng
-        self.coarse_shape = (-(-size_px[1] // _COARSE), -(-size_px[0] // _COARSE))
+    def __init__(self, area: GroundArea, m_per_px: float, rng: Generator) -> None:
+        self.area, self.m_per_px, self.rng = area, m_per_px, rng
+        width, height = (int(np.ceil(side_m / m_per_px)) for side_m in area.size_m)
+        self.size_px = width, height
+        self.coarse_shape = (-(-height // _COARSE), -(-width // _COARSE))
         self.colour = np.zeros((*self.coarse_shape, 3), np.float32)
         self.grain = np.zeros(self.coarse_shape, np.float32)
         self.vegetation = np.zeros(self.coarse_shape, np.uint8)
@@ -93,17 +106,6 @@ class GroundCanvas:
         step = np.float32(m_per_px * _COARSE)
         self.east = area.west_m + (columns + 0.5) * step
         self.north = area.north_m - (rows + 0.5) * step
-
-    @classmethod
-    def over(cls, area: GroundArea, m_per_px: float, rng: Generator) -> "GroundCanvas":
-        """An empty canvas over this area."""
-        width_m, height_m = area.size_m
-        return cls(
-            area,
-            m_per_px,
-            (int(np.ceil(width_m / m_per_px)), int(np.ceil(height_m / m_per_px))),
-            rng,
-        )
 
     def field(self, *scales_m: float) -> FieldF32:
         """Unit noise on the coarse raster, equal parts of these scales."""
@@ -165,29 +167,26 @@ class GroundCanvas:
 
     def px(self, points_m: Floats) -> Floats:
         """(N, 2) full-raster pixels of east, north."""
-        return (np.asarray(points_m) - [self.area.west_m, self.area.north_m]) * [
-            1,
-            -1,
-        ] / self.m_per_px - 0.5
+        first_m = [self.area.west_m, self.area.north_m]
+        return (np.asarray(points_m) - first_m) * [1, -1] / self.m_per_px - 0.5
 
-    def polygon(self, points_m: Floats, colour: Floats) -> None:
+    def polygon(self, points_m: Floats, colour: Sequence[float] | Floats) -> None:
         """Fill a polygon of site metres with one colour, its edge smooth."""
-        cv2.fillPoly(
-            self.rgb, [_shifted(self.px(points_m))], [float(c) for c in colour], cv2.LINE_AA, 4
-        )
+        cv2.fillPoly(self.rgb, self._drawn(points_m), [float(c) for c in colour], cv2.LINE_AA, 4)
 
-    def stroke(self, points_m: Floats, width_m: float, colour: Floats) -> None:
+    def stroke(
+        self,
+        points_m: Sequence[Sequence[float]] | Floats,
+        width_m: float,
+        colour: Sequence[float] | Floats,
+    ) -> None:
         """Draw a line of site metres."""
-        width = max(1, round(width_m / self.m_per_px))
-        cv2.polylines(
-            self.rgb,
-            [_shifted(self.px(points_m))],
-            False,
-            [float(c) for c in colour],
-            width,
-            cv2.LINE_AA,
-            4,
-        )
+        width, own = max(1, round(width_m / self.m_per_px)), [float(c) for c in colour]
+        cv2.polylines(self.rgb, self._drawn(points_m), False, own, width, cv2.LINE_AA, 4)
+
+    def _drawn(self, points_m: Sequence[Sequence[float]] | Floats) -> list[NDArray[np.int32]]:
+        """Points as OpenCV draws them, in sixteenths of a pixel."""
+        return [np.round(self.px(np.asarray(points_m)) * 16).astype(np.int32).reshape(-1, 1, 2)]
 
     def stones(
         self,
@@ -235,8 +234,9 @@ class GroundCanvas:
                 )
 
 
-def _shifted(points_px: Floats) -> np.ndarray[tuple[int, ...], np.dtype[np.int32]]:
-    return np.round(np.asarray(points_px) * 16).astype(np.int32).reshape(-1, 1, 2)
+def rectangle(west_m: float, south_m: float, east_m: float, north_m: float) -> Floats:
+    """(4, 2) the corners from the south-west on, counter-clockwise."""
+    return np.array([[west_m, south_m], [east_m, south_m], [east_m, north_m], [west_m, north_m]])
 
 
 def soft(field: FieldF32, threshold: float, softness: float) -> FieldF32:

@@ -282,7 +282,7 @@ def observe(
     latitude_deg[zeros], longitude_deg[zeros] = 0.0, 0.0
     # the camera's angles as a gimbal reports them, and a body that leans into its speed
     turns = rotation_from_vector(
-        np.radians(rng.standard_normal((len(true_s), 3)) * settings.attitude_noise_deg)
+        np.radians(rng.standard_normal((count, 3)) * settings.attitude_noise_deg)
     )
     camera = np.array(
         [
@@ -292,7 +292,7 @@ def observe(
     ).reshape(-1, 3)
     speed_m_s = np.hypot(*path.velocity_m_s(true_s)[:, :2].T)
     lean_deg = -np.degrees(np.arctan(0.012 * speed_m_s))
-    jitter = rng.standard_normal((len(true_s), 3)) * max(settings.attitude_noise_deg, 0.1)
+    jitter = rng.standard_normal((count, 3)) * max(settings.attitude_noise_deg, 0.1)
     columns = {
         "latitude_deg": latitude_deg,
         "longitude_deg": longitude_deg,
@@ -300,16 +300,14 @@ def observe(
         "orthometric_height_m": ellipsoidal_m - GEOID_HEIGHT_M,
         "height_above_takeoff_m": path.position_m(true_s)[:, 2]
         + rng.standard_normal(count) * _BAROMETER_NOISE_M,
-        **{
-            "camera_yaw_deg": camera[:, 0],
-            "camera_pitch_deg": camera[:, 1],
-            "camera_roll_deg": camera[:, 2],
-            "body_yaw_deg": (path.heading_deg(true_s) + jitter[:, 0]) % 360.0,
-            "body_pitch_deg": lean_deg + jitter[:, 1],
-            "body_roll_deg": jitter[:, 2],
-        },
-        **_motion(path, true_s, rng),
+        **dict(zip(_CAMERA, camera.T)),
+        "body_yaw_deg": (path.heading_deg(true_s) + jitter[:, 0]) % 360.0,
+        "body_pitch_deg": lean_deg + jitter[:, 1],
+        "body_roll_deg": jitter[:, 2],
     }
+    velocity_m_s = path.velocity_m_s(true_s)[:, :2] + rng.standard_normal((count, 2)) * 0.1
+    columns["course_deg"] = np.degrees(np.arctan2(*velocity_m_s.T)) % 360.0
+    columns["speed_m_s"] = np.hypot(*velocity_m_s.T)
     recorded_s = true_s + settings.clock_offset_s
     telemetry = Telemetry(
         format_name,
@@ -325,11 +323,3 @@ def observe(
 
 def _ns(time_s: Floats) -> TimesNs:
     return np.round(time_s * 1e9).astype(np.int64)
-
-
-def _motion(path: FlownPath, time_s: Floats, rng: Generator) -> dict[str, Floats]:
-    velocity = path.velocity_m_s(time_s)[:, :2] + rng.standard_normal((len(time_s), 2)) * 0.1
-    return {
-        "course_deg": np.degrees(np.arctan2(velocity[:, 0], velocity[:, 1])) % 360.0,
-        "speed_m_s": np.hypot(velocity[:, 0], velocity[:, 1]),
-    }

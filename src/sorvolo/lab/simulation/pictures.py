@@ -204,9 +204,7 @@ def simulate_picture(settings: PictureSettings, index: int) -> SimulatedPicture:
     camera, pose = _new_shot(settings, is_thermal, rng)
     middle = ground_from_pixels(camera, pose, np.array([[camera.cx_px, camera.cy_px]]))[0]
     m_per_px = float(np.linalg.norm(pose.translation_m - [*middle, 0.0])) / camera.fx_px
-    outline_m = footprint(camera, pose)
-    low, high = outline_m.min(axis=0) - _MARGIN_M, outline_m.max(axis=0) + _MARGIN_M
-    area = GroundArea(float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+    area = GroundArea.around(footprint(camera, pose), _MARGIN_M)
     ground = settings.ground or str(rng.choice(list(GroundKind), p=(0.25, 0.35, 0.3, 0.1)))
     width_m, height_m = area.size_m
     fine_m = max(0.72 * m_per_px, float(np.sqrt(width_m * height_m / _LARGEST_GROUND_PX)))

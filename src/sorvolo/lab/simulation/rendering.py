@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sorvolo.geometry.arrays import Floats, ImageRGB
+from sorvolo.geometry.homography import shifted
 from sorvolo.geometry.pose import Pose
 from sorvolo.lab.simulation.ground_painting import GroundRaster
 from sorvolo.lab.simulation.world import Day, Relief
@@ -51,9 +52,8 @@ def render_ground(ground: GroundRaster, view: DrawnView) -> ImageRGB:
     # only this window is handed on: remap takes no picture of more than 32767 pixels a side
     x0, y0 = np.clip(np.floor(reach.min(axis=0)) - 2, 0, [columns - 2, rows - 2]).astype(int)
     x1, y1 = np.clip(np.ceil(reach.max(axis=0)) + 3, [x0 + 2, y0 + 2], [columns, rows]).astype(int)
-    shift = np.array([[1, 0, -x0], [0, 1, -y0], [0, 0, 1.0]])
     where = cv2.perspectiveTransform(
-        np.ascontiguousarray(rays).reshape(-1, 1, 2), shift @ raster_from_ray
+        np.ascontiguousarray(rays).reshape(-1, 1, 2), shifted(-x0, -y0) @ raster_from_ray
     )
     return remapped(ground.rgb[y0:y1, x0:x1], where.reshape(height, width, 2), cv2.BORDER_REPLICATE)
 

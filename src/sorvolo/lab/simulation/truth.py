@@ -6,10 +6,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGBA, PointsM
+from sorvolo.geometry.arrays import ImageGray, ImageRGBA, PointsM
 from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.geometry.ground import footprint
+from sorvolo.geometry.homography import shifted
 from sorvolo.geometry.polygons import convex_hull, gap
 from sorvolo.geometry.pose import Pose, gimbal_angles_from_rotation
 from sorvolo.lab.simulation.flight import SimulatedFlight, has_changed
@@ -79,10 +80,9 @@ def object_features(world: World, site: LocalFrame) -> list[Json]:
             first_seen.setdefault(place, (thing, []))[1].append(number)
     for thing, flights in first_seen.values():
         features.append(
-            {
-                "type": "Feature",
-                "geometry": polygon_geometry(thing.footprint_m(), site),
-                "properties": {
+            feature(
+                polygon_geometry(thing.footprint_m(), site),
+                {
                     "id": thing.id,
                     "class": str(thing.label),
                     "subtype": thing.kind,
@@ -95,7 +95,7 @@ def object_features(world: World, site: LocalFrame) -> list[Json]:
                     "moving": thing.is_moving,
                     "velocity_m_s": [round(speed, 4) for speed in thing.velocity_m_s],
                 },
-            }
+            )
         )
     return features
 
@@ -131,13 +131,7 @@ def coco_boxes(flight: SimulatedFlight, frames: Iterable[int]) -> Json:
                 "frame": index,
             }
         )
-        labels, totals = render_labels(
-            flight.day.things,
-            flight.day.bodies,
-            flight.view(index),
-            flight.true_poses[index],
-            float(flight.from_middle_s[index]),
-        )
+        labels, totals = _labels(flight, flight.day.things, flight.day.bodies, index)
         annotations += box_rows(flight.day.things, labels, totals, index, len(annotations) + 1)
     return {
         "info": {"description": f"simulated {flight.name}"},
@@ -181,6 +175,14 @@ def box_rows(
     return rows
 
 
+def _labels(
+    flight: SimulatedFlight, things: Sequence[Thing], bodies: Mapping[int, Body], index: int
+) -> tuple[Labels, dict[int, int]]:
+    """`render_labels` of things as a frame shows them."""
+    pose, from_middle_s = flight.true_poses[index], float(flight.from_middle_s[index])
+    return render_labels(things, bodies, flight.view(index), pose, from_middle_s)
+
+
 def change_mask(flight: SimulatedFlight, index: int) -> ImageGray:
     """(height, width) 255 where the frame shows an object that came, or a place that one left, since
     flight 1.
@@ -189,10 +191,8 @@ def change_mask(flight: SimulatedFlight, index: int) -> ImageGray:
     """
     first, bodies = flight.before
     came, left = ([thing.id for thing in things] for things in _came_and_left(flight))
-    view, pose = flight.view(index), flight.true_poses[index]
-    from_middle_s = float(flight.from_middle_s[index])
-    now, _ = render_labels(flight.day.things, flight.day.bodies, view, pose, from_middle_s)
-    then, _ = render_labels(first, bodies, view, pose, 0.0)
+    now, _ = _labels(flight, flight.day.things, flight.day.bodies, index)
+    then, _ = render_labels(first, bodies, flight.view(index), flight.true_poses[index], 0.0)
     changed = np.isin(now, came) | np.isin(then, left)
     return np.where(changed, 255, 0).astype(np.uint8)
 
@@ -203,22 +203,13 @@ def map_tiles(ground: GroundRaster, site_grid: SiteGrid) -> dict[TileIndex, Imag
     centre = np.array([(area.west_m + area.east_m) / 2, (area.south_m + area.north_m) / 2])
     grid_from_site = site_grid.grid_from_site_affine(centre, max(area.size_m) / 2)
     grid_from_raster = grid_from_site @ np.linalg.inv(ground.raster_from_site_matrix)
-    corners = np.array(
-        [
-            [area.west_m, area.south_m],
-            [area.east_m, area.south_m],
-            [area.east_m, area.north_m],
-            [area.west_m, area.north_m],
-        ]
-    )
     rgba = np.dstack([ground.rgb, np.full(ground.rgb.shape[:2], 255, np.uint8)])
     tiles: dict[TileIndex, ImageRGBA] = {}
-    for tile in sorted(site_grid.grid.tiles_touched(site_grid.grid_from_site(corners))):
+    for tile in sorted(site_grid.grid.tiles_touched(site_grid.grid_from_site(area.corners_m))):
         x0, y0, x1, y1 = site_grid.grid.tile_window(tile)
-        shift = np.array([[1.0, 0, -x0], [0, 1, -y0], [0, 0, 1]])
         picture = cv2.warpAffine(
             rgba,
-            (shift @ grid_from_raster)[:2],
+            (shifted(-x0, -y0) @ grid_from_raster)[:2],
             (x1 - x0, y1 - y0),
             flags=cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_CONSTANT,
@@ -238,13 +229,8 @@ def polygon_geometry(outline_m: PointsM, site: LocalFrame) -> Json | None:
     """A ring of ground points, (N, 2), as a GeoJSON polygon in WGS84; None where a point is not known."""
     if not np.isfinite(outline_m).all():
         return None
-    latitude, longitude, _ = site.wgs84_from_site(outline_m)
-    ring: Floats = np.column_stack([longitude, latitude])
-    closed = np.vstack([ring, ring[:1]])
-    return {
-        "type": "Polygon",
-        "coordinates": [[[round(float(c), DEGREE_DECIMALS) for c in p] for p in closed]],
-    }
+    ring = _degrees(outline_m, site)
+    return {"type": "Polygon", "coordinates": [[*ring, ring[0]]]}
 
 
 VIEW_STEP_S = 0.2
@@ -335,9 +321,7 @@ def _departure(flight: SimulatedFlight, thing: Thing, movers: Sequence[Thing]) -
 
 def event_features(flight: SimulatedFlight) -> list[Json]:
     """`true_events` as GeoJSON features, numbered from 1."""
-    return [
-        _feature(number, event, flight) for number, event in enumerate(true_events(flight), start=1)
-    ]
+    return [_feature(*each, flight) for each in enumerate(true_events(flight), start=1)]
 
 
 def _feature(number: int, event: TruthEvent, flight: SimulatedFlight) -> Json:
@@ -345,10 +329,9 @@ def _feature(number: int, event: TruthEvent, flight: SimulatedFlight) -> Json:
     assert thing is not None
     times_ns = flight.frame_times_ns
     middle = event.footprint_m.mean(axis=0)
-    return {
-        "type": "Feature",
-        "geometry": polygon_geometry(event.footprint_m, flight.site),
-        "properties": {
+    return feature(
+        polygon_geometry(event.footprint_m, flight.site),
+        {
             "number": number,
             "flight": flight.name,
             "since": "flight1",
@@ -369,15 +352,11 @@ def _feature(number: int, event: TruthEvent, flight: SimulatedFlight) -> Json:
             ],
             "path": _degrees(event.path_m, flight.site) if event.kind == "moving" else [],
         },
-    }
+    )
 
 
 def _degrees(points_m: PointsM, site: LocalFrame) -> list[list[float]]:
-    if not len(points_m):
-        return []
-    latitude, longitude, _ = site.wgs84_from_site(
-        np.column_stack([points_m, np.zeros(len(points_m))])
-    )
+    latitude, longitude, _ = site.wgs84_from_site(points_m)
     return [
         [round(float(x), DEGREE_DECIMALS), round(float(y), DEGREE_DECIMALS)]
         for x, y in zip(longitude, latitude)
@@ -423,9 +402,7 @@ def _visible_share(
         or np.hypot(*(other.place_m(from_middle_s) - place)[:2])
         < thing.reach_m + other.reach_m + other.size_m[2]
     ]
-    labels, totals = render_labels(
-        near, bodies, flight.view(index), flight.true_poses[index], from_middle_s
-    )
+    labels, totals = _labels(flight, near, bodies, index)
     total = totals.get(thing.id, 0)
     return float(np.count_nonzero(labels == thing.id)) / total if total else 0.0
 

@@ -16,6 +16,8 @@ from sorvolo.lab.simulation.ground import GroundKind, GroundLayout, PaintedGroun
 from sorvolo.lab.simulation.ground_painting import GroundArea, GroundRaster
 from sorvolo.lab.simulation.settings import (
     DEFAULT_ORIGIN,
+    LaterSettings,
+    SceneSettings,
     SimulationSettings,
     WeatherSettings,
 )
@@ -219,8 +221,7 @@ def needed_area(settings: SimulationSettings, waypoints_m: Floats) -> GroundArea
     """The ground that can come into sight from these waypoints, (N, 2), all flights' height and tilt included."""
     farthest_m = max(_reach_m(settings.of_flight(flight), flight) for flight in (1, 2))
     reach_m = _SPARE_M + 4 * settings.motion.drift_rms_m + farthest_m
-    low, high = waypoints_m.min(axis=0) - reach_m, waypoints_m.max(axis=0) + reach_m
-    return GroundArea(float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+    return GroundArea.around(waypoints_m, reach_m)
 
 
 def _reach_m(settings: SimulationSettings, flight: int) -> float:
@@ -289,12 +290,7 @@ def build_world(
     waypoints_m = plans_m[0]
     rng = np.random.default_rng([settings.seed, 2])
     things = list(scenery(scene.ground, painted.layout, rng)) if scene.has_scenery else []
-    wanted = (
-        [ThingLabel.PERSON] * scene.people
-        + [ThingLabel.CAR] * scene.cars
-        + [ThingLabel.SMALL] * scene.small_objects
-    )
-    for label in wanted:
+    for label in _targets(scene):
         things.append(
             _place(label, len(things) + 1, things, painted.layout, waypoints_m, settings, rng)
         )
@@ -329,10 +325,7 @@ def build_day(world: World, settings: SimulationSettings, flight: int, m_per_px:
         ground = _blown(ground, weather.wind_m, rng)
         # The things, trees moved by the wind
         things = tuple(
-            replace(
-                thing,
-                sway_m=(rng.normal(0, 2.0 * weather.wind_m), rng.normal(0, 2.0 * weather.wind_m)),
-            )
+            replace(thing, sway_m=tuple(rng.normal(0, 2.0 * weather.wind_m, 2)))
             if thing.label is ThingLabel.TREE
             else thing
             for thing in things
@@ -370,11 +363,8 @@ def scenery(ground: str, layout: GroundLayout, rng: Generator) -> tuple[Thing, .
         for east, north, yaw in places:
             size = new_size(label, kind, rng)
             seed = int(rng.integers(2**31))
-            things.append(
-                Thing(
-                    len(things) + 1, label, kind, float(east), float(north), float(yaw), size, seed
-                )
-            )
+            place = float(east), float(north), float(yaw)
+            things.append(Thing(len(things) + 1, label, kind, *place, size, seed))
     return tuple(things)
 
 
@@ -411,21 +401,23 @@ def _next_day(
             today[i] = replace(
                 thing, east_m=place.east_m, north_m=place.north_m, yaw_deg=place.yaw_deg
             )
-    next_id = 1000 * flight
-    later = settings.later
-    came = (
-        [ThingLabel.PERSON] * later.people
-        + [ThingLabel.CAR] * later.cars
-        + [ThingLabel.SMALL] * later.small_objects
-    )
-    for i, label in enumerate(came):
-        today.append(_place(label, next_id + i, today, layout, waypoints_m, settings, rng))
+    for thing_id, label in enumerate(_targets(settings.later), start=1000 * flight):
+        today.append(_place(label, thing_id, today, layout, waypoints_m, settings, rng))
     return tuple(
         _set_off(thing, today, rng)
         if thing.label in (ThingLabel.PERSON, ThingLabel.CAR)
         and rng.uniform() < settings.scene.moving_share
         else thing
         for thing in today
+    )
+
+
+def _targets(wanted: SceneSettings | LaterSettings) -> list[ThingLabel]:
+    """The people, cars and small objects that are asked for, one after another."""
+    return (
+        [ThingLabel.PERSON] * wanted.people
+        + [ThingLabel.CAR] * wanted.cars
+        + [ThingLabel.SMALL] * wanted.small_objects
     )
 
 
@@ -447,13 +439,11 @@ def _place(
     size = new_size(label, kind, rng)
     thing = Thing(thing_id, label, kind, 0.0, 0.0, 0.0, size, int(rng.integers(2**31)))
     half_strip_m = 0.4 * settings.imaging.height_px * settings.m_per_px
-    near_path = (
-        layout.parkings[
-            [_distance_to_path(place[:2], waypoints_m) < half_strip_m for place in layout.parkings]
-        ]
-        if len(layout.parkings)
-        else layout.parkings
-    )
+    near_path = [
+        place
+        for place in layout.parkings
+        if _distance_to_path(place[:2], waypoints_m) < half_strip_m
+    ]
     for attempt in range(400):
         if label is ThingLabel.CAR and len(near_path) and attempt < 100:
             east, north, yaw = near_path[int(rng.integers(len(near_path)))]
