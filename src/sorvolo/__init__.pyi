@@ -74,11 +74,13 @@ from sorvolo.missions.plan_flight import answer_questions as answer_questions
 from sorvolo.missions.plan_flight import camera_to_plan_with as camera_to_plan_with
 from sorvolo.missions.plan_flight import plan_over as plan_over
 from sorvolo.missions.plan_flight import write_plan as write_plan
+from sorvolo.missions.search.flights import SearchOutcome as SearchOutcome
 from sorvolo.missions.search.flights import search_site as search_site
 from sorvolo.missions.search.measure import SearchProgress as SearchProgress
 from sorvolo.missions.search.settings import SearchOutputs as SearchOutputs
 from sorvolo.missions.search.settings import SearchSettings as SearchSettings
 from sorvolo.missions.telemetry.doctor import CotReceiver as CotReceiver
+from sorvolo.missions.telemetry.doctor import TelemetryOutcome as TelemetryOutcome
 from sorvolo.missions.telemetry.doctor import correct_telemetry as correct_telemetry
 from sorvolo.missions.watch.cot_sender import CotPlace as CotPlace
 from sorvolo.missions.watch.cot_sender import CotTls as CotTls
@@ -88,6 +90,7 @@ from sorvolo.missions.watch.run import WatchUpdate as WatchUpdate
 from sorvolo.missions.watch.settings import WatchOutputs as WatchOutputs
 from sorvolo.missions.watch.settings import WatchSettings as WatchSettings
 from sorvolo.paths import GivenFlight as GivenFlight
+from sorvolo.search.recall import SearchFigures as SearchFigures
 from sorvolo.store.exports.plain import FeatureList as FeatureList
 from sorvolo.store.site.archive import Archive as Archive
 from sorvolo.store.site.catalogue_place import Catalogues as Catalogues

@@ -21,6 +21,7 @@ from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.search.earlier import Basis, read_plants
 from sorvolo.missions.search.flights import search_site
 from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
+from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.site.archive import Archive
 
 _CARS = SearchSettings(plants=20, classes=("car",), sun_deg=(215, 48))
@@ -35,9 +36,14 @@ def site(photo_map: Path) -> Path:
 def _report(
     site: Path, folder: Path, detector: Any, settings: SearchSettings, **outputs: Any
 ) -> dict[str, Any]:
-    report = search_site(site, settings, SearchOutputs(folder, **outputs), detector).result()
-    assert isinstance(report, dict)
-    return report
+    outcome = search_site(site, settings, SearchOutputs(folder, **outputs), detector).result()
+    assert outcome.folder == folder and outcome.report["warnings"] == list(outcome.warnings)
+    assert outcome.headline == outcome.report["headline"]["text"]
+    assert outcome.trusted is outcome.report["headline"]["complete"]
+    for label, row in outcome.report["classes"].items():
+        stated = {**asdict(outcome.figures[label]), "holes_m2": outcome.holes_m2[label]}
+        assert plain_json(stated) == row
+    return dict(outcome.report)
 
 
 @pytest.fixture(scope="module")

@@ -264,8 +264,7 @@ def test_a_flight_that_an_earlier_search_measured_counts_once_it_was_looked_at(
 ) -> None:
     """What it states of its ground is what the search itself stated, over other cells too."""
     settings, outputs = replace(_SETTINGS, plants=10), SearchOutputs(tmp_path / "out")
-    whole = search_site(site, settings, outputs, Comparing(site)).result()
-    assert isinstance(whole, dict)
+    whole = search_site(site, settings, outputs, Comparing(site)).result().report
     prepared = prepare_search(settings, outputs, Comparing(site))
     with Archive.open(site, write=False) as archive:
         (name,) = flights_to_search(archive, ())
@@ -306,7 +305,7 @@ def test_a_flight_that_is_stopped_leaves_no_waypoints(
         replace(_SETTINGS, plants=10),
         MeasurePace(again_s=0.0, rest=0.0, look_s=0.02, earlier=99),
     )
-    whole = search_site(tmp_path / "site", settings, outputs, Comparing(site)).result()
+    whole = search_site(tmp_path / "site", settings, outputs, Comparing(site)).result().report
     flying = SearchWhileFlying(settings, outputs, Comparing(site), pace)
     photos = Arriving(photographed / "flight1" / "photos", tmp_path / "in", 0.0)
     over = threading.Event()

@@ -9,7 +9,6 @@ import sqlite3
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import av
@@ -31,6 +30,7 @@ from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.telemetry.doctor import (
     CotReceiver,
+    TelemetryOutcome,
     correct_telemetry,
     fault_sentences,
     mapped_flights,
@@ -78,7 +78,7 @@ def _made_wrong(path: Path) -> None:
 @pytest.fixture(scope="module")
 def corrected(
     faulty: Path, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[dict[str, Any], Path]:
+) -> tuple[TelemetryOutcome, Path]:
     """Its report, and the folder of its files."""
     folder = tmp_path_factory.mktemp("corrected")
     video, camera = faulty / "flight1" / "flight1.mp4", faulty / "camera.xml"
@@ -89,13 +89,13 @@ def corrected(
 
 
 def test_the_known_faults_are_measured_and_put_in_words(
-    corrected: tuple[dict[str, Any], Path],
+    corrected: tuple[TelemetryOutcome, Path],
 ) -> None:
-    faults = corrected[0]["faults"]
+    faults = corrected[0].report["faults"]
     assert faults["heading_deg"]["value"] == pytest.approx(COMPASS_DEG, abs=0.7)
     assert faults["clock_s"]["value"] == pytest.approx(CLOCK_S, abs=0.1)
     assert faults["height_m"]["value"] == pytest.approx(HEIGHT_M, abs=1.0)
-    words = "; ".join(corrected[0]["sentences"])
+    words = "; ".join(corrected[0].sentences)
     assert "too far clockwise" in words and "too high" in words and "ahead of the pictures" in words
 
 
@@ -167,7 +167,7 @@ def test_where_place_and_angles_leave_the_log_the_map_is_doubted_not_the_log() -
 
 
 def test_a_misplaced_frame_is_laid_by_the_log(
-    corrected: tuple[dict[str, Any], Path], faulty: Path, tmp_path: Path
+    corrected: tuple[TelemetryOutcome, Path], faulty: Path, tmp_path: Path
 ) -> None:
     """It stays out of the correction of the frames around it, and its accuracy is not the map's."""
     site, out = tmp_path / "site", tmp_path / "out"
@@ -194,7 +194,7 @@ def test_a_misplaced_frame_is_laid_by_the_log(
     report = correct_telemetry(
         site, out, source=faulty / "flight1" / "flight1.mp4", camera=str(faulty / "camera.xml")
     )
-    (words,) = [each for each in report["sentences"] if "the map is doubtful at 1 frame" in each]
+    (words,) = [each for each in report.sentences if "the map is doubtful at 1 frame" in each]
     assert words.endswith(f": {wrong['name']}")
     (row,) = [
         each
@@ -422,7 +422,7 @@ def test_a_clock_that_is_known_to_seconds_only_is_not_called_right() -> None:
 
 @pytest.mark.parametrize("quality", ["contradictory", "doubtful", "map"])
 def test_a_doubt_about_the_map_is_passed_on(
-    corrected: tuple[dict[str, Any], Path], tmp_path: Path, quality: str
+    corrected: tuple[TelemetryOutcome, Path], tmp_path: Path, quality: str
 ) -> None:
     site = tmp_path / "site"
     shutil.copytree(corrected[1] / "site", site)
@@ -434,15 +434,15 @@ def test_a_doubt_about_the_map_is_passed_on(
     }
     write_again(site, "flights/flight1/report.json", json.dumps(mapped))
     report = correct_telemetry(site, tmp_path / "out")
-    assert ("too large by half" in report["warnings"]) == (quality != "map")
-    assert "of the map: is it the telemetry of this flight?" in report["warnings"]
-    assert ("of the map: by half" in report["warnings"]) == (
+    assert ("too large by half" in report.warnings) == (quality != "map")
+    assert "of the map: is it the telemetry of this flight?" in report.warnings
+    assert ("of the map: by half" in report.warnings) == (
         quality == "map"
     )  # else the headline has it
 
 
 def test_a_map_that_control_points_hold_is_not_bent_to_the_fixes(
-    corrected: tuple[dict[str, Any], Path], faulty: Path, tmp_path: Path
+    corrected: tuple[TelemetryOutcome, Path], faulty: Path, tmp_path: Path
 ) -> None:
     site = tmp_path / "site"
     shutil.copytree(corrected[1] / "site", site)
@@ -455,12 +455,16 @@ def test_a_map_that_control_points_hold_is_not_bent_to_the_fixes(
         source=faulty / "flight1" / "flight1.mp4",
         camera=str(faulty / "camera.xml"),
     )
-    assert report["faults"]["path"]["turn_deg"] == {"value": 0.0, "sigma": 0.0, "scatter": None}
-    assert corrected[0]["faults"]["path"]["turn_deg"]["sigma"] > 0
+    assert report.report["faults"]["path"]["turn_deg"] == {
+        "value": 0.0,
+        "sigma": 0.0,
+        "scatter": None,
+    }
+    assert corrected[0].report["faults"]["path"]["turn_deg"]["sigma"] > 0
 
 
 def test_corrected_cameras_lie_where_the_drone_flew(
-    corrected: tuple[dict[str, Any], Path], faulty: Path
+    corrected: tuple[TelemetryOutcome, Path], faulty: Path
 ) -> None:
     true = {
         int(each["properties"]["frame"]): each["properties"]
@@ -484,7 +488,7 @@ def test_corrected_cameras_lie_where_the_drone_flew(
 
 
 def test_the_video_gets_corrected_metadata_and_keeps_its_pictures(
-    corrected: tuple[dict[str, Any], Path], faulty: Path
+    corrected: tuple[TelemetryOutcome, Path], faulty: Path
 ) -> None:
     film = corrected[1] / "out" / "flight1.ts"
     with av.open(str(film)) as copy, av.open(str(faulty / "flight1" / "flight1.mp4")) as original:
@@ -511,7 +515,7 @@ def test_the_video_gets_corrected_metadata_and_keeps_its_pictures(
 
 
 def test_what_a_watch_found_is_in_the_metadata_of_its_frame(
-    corrected: tuple[dict[str, Any], Path], faulty: Path, tmp_path: Path
+    corrected: tuple[TelemetryOutcome, Path], faulty: Path, tmp_path: Path
 ) -> None:
     video, camera = faulty / "flight1" / "flight1.mp4", str(faulty / "camera.xml")
     rows = list(csv.DictReader((corrected[1] / "out" / "track.csv").read_text().splitlines()))
@@ -537,7 +541,7 @@ def test_what_a_watch_found_is_in_the_metadata_of_its_frame(
                 lines.append([sees | {"box_px": box}, sees | {"box_px": [1, 2, 3, 4]}])
     (tmp_path / "none").mkdir()
 
-    def correct(name: str) -> dict[str, Any]:
+    def correct(name: str) -> TelemetryOutcome:
         return correct_telemetry(
             corrected[1] / "site",
             tmp_path / "out",
@@ -549,7 +553,7 @@ def test_what_a_watch_found_is_in_the_metadata_of_its_frame(
     for name, words in (("other", "another flight"), ("none", "no folder"), ("cut", "damaged")):
         with pytest.raises(InputError, match=words):
             correct(name)
-    assert "2 of 2 detections are in flight1.ts" in correct("sound")["sentences"][-1]
+    assert "2 of 2 detections are in flight1.ts" in correct("sound").sentences[-1]
     found = []
     with av.open(str(tmp_path / "out" / "flight1.ts")) as film:
         for packet in film.demux(data=0):
@@ -571,7 +575,7 @@ def test_what_a_watch_found_is_in_the_metadata_of_its_frame(
 
 
 def test_the_metadata_has_the_aircrafts_heading(
-    corrected: tuple[dict[str, Any], Path], faulty: Path
+    corrected: tuple[TelemetryOutcome, Path], faulty: Path
 ) -> None:
     """Tag 5 on the straight stretches is where the drone flew, without the 7 degrees that its compass was off; it swung
     all round where the camera looked straight down."""
@@ -608,7 +612,7 @@ def test_the_metadata_has_the_aircrafts_heading(
 
 
 def test_files_for_other_programs_hold_the_same_places(
-    corrected: tuple[dict[str, Any], Path],
+    corrected: tuple[TelemetryOutcome, Path],
 ) -> None:
     out = corrected[1] / "out"
     rows = list(csv.DictReader((out / "track.csv").read_text().splitlines()))
@@ -637,7 +641,7 @@ def test_files_for_other_programs_hold_the_same_places(
 
 
 def test_the_track_is_sent_to_a_team(
-    corrected: tuple[dict[str, Any], Path], tmp_path: Path
+    corrected: tuple[TelemetryOutcome, Path], tmp_path: Path
 ) -> None:
     """Every event, in order; a receiver that is not there is an error, and the files are written all the same."""
     site = corrected[1] / "site"
@@ -646,8 +650,8 @@ def test_the_track_is_sent_to_a_team(
         receiver.settimeout(5)
         place = CotPlace("udp", "127.0.0.1", receiver.getsockname()[1])
         report = correct_telemetry(site, tmp_path / "sent", cot=CotReceiver(place))
-        events = [receiver.recv(10_000) for _ in range(report["frames"])]
-    assert report["cot_sent"] == report["frames"]
+        events = [receiver.recv(10_000) for _ in range(report.frames)]
+    assert report.cot_sent == report.frames
     assert events == (tmp_path / "sent" / "cot.xml").read_bytes().splitlines()
     with socket.create_server(("127.0.0.1", 0)) as closed:
         nobody = CotPlace("tls", "127.0.0.1", closed.getsockname()[1])
@@ -663,17 +667,17 @@ def test_a_sound_log_is_called_sound(filmed: Path, tmp_path: Path) -> None:
     report = correct_telemetry(
         tmp_path / "site", tmp_path / "out", source=video, camera=str(camera)
     )
-    assert abs(report["faults"]["heading_deg"]["value"]) < 0.6
-    assert abs(report["faults"]["height_m"]["value"]) < 0.8
+    assert abs(report.report["faults"]["heading_deg"]["value"]) < 0.6
+    assert abs(report.report["faults"]["height_m"]["value"]) < 0.8
     alone = correct_telemetry(tmp_path / "site", tmp_path / "alone")
-    assert alone["faults"] is None and "geo.txt" in alone["files"]
+    assert alone.report["faults"] is None and "geo.txt" in alone.paths
     assert (tmp_path / "alone" / "geo.txt").read_text() == (
         tmp_path / "out" / "geo.txt"
     ).read_text()
 
 
 def test_results_go_into_the_folder_of_their_flight(
-    corrected: tuple[dict[str, Any], Path],
+    corrected: tuple[TelemetryOutcome, Path],
     faulty: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
@@ -697,7 +701,7 @@ def test_results_go_into_the_folder_of_their_flight(
 
 
 def test_a_flight_is_recognised_under_any_name_and_another_one_refused(
-    corrected: tuple[dict[str, Any], Path],
+    corrected: tuple[TelemetryOutcome, Path],
     faulty: Path,
     filmed: Path,
     tmp_path: Path,
@@ -741,7 +745,7 @@ def test_a_flight_is_recognised_under_any_name_and_another_one_refused(
 
 
 def test_what_other_programs_cannot_take_is_warned_of(
-    corrected: tuple[dict[str, Any], Path], tmp_path: Path
+    corrected: tuple[TelemetryOutcome, Path], tmp_path: Path
 ) -> None:
     """A flight without a date has no events; photos whose names have spaces are not found by OpenDroneMap."""
     site, out = tmp_path / "site", tmp_path / "out"
@@ -755,14 +759,14 @@ def test_what_other_programs_cannot_take_is_warned_of(
         correct_telemetry(site, out, cot=CotReceiver(CotPlace("udp", "127.0.0.1", 9)))
     assert not out.exists()
     report = correct_telemetry(site, out)
-    assert "cot.xml" not in report["files"] and not (out / "cot.xml").exists()
-    undated, spaced = report["warnings"][-2:]
+    assert "cot.xml" not in report.paths and not (out / "cot.xml").exists()
+    undated, spaced = report.warnings[-2:]
     assert "GPX and CSV have no times" in undated and "OpenDroneMap finds 'IMG 0' once" in spaced
     assert (out / "geo.txt").read_text().splitlines()[1].startswith("IMG_0 ")
 
 
 def test_files_of_two_flights_do_not_mix(
-    corrected: tuple[dict[str, Any], Path], faulty: Path, tmp_path: Path
+    corrected: tuple[TelemetryOutcome, Path], faulty: Path, tmp_path: Path
 ) -> None:
     """An earlier flight's transport stream stayed beside the files of the next."""
     out = tmp_path / "out"
@@ -792,7 +796,7 @@ def test_files_of_two_flights_do_not_mix(
     ],
 )
 def test_what_was_given_wrongly_is_named_before_the_work(
-    corrected: tuple[dict[str, Any], Path],
+    corrected: tuple[TelemetryOutcome, Path],
     faulty: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],

@@ -155,7 +155,7 @@ def search_command(
                 )
             _map_all(inputs, place, settings, outputs, telemetry, camera, give_up)
         if through_trees:
-            report = _look_through_trees(place, outputs, plants)
+            report: JsonView = _look_through_trees(place, outputs, plants)
         else:
             measuring = search_site(place.folder, settings, outputs)
             with ProgressReport(Console(stderr=True)) as progress, measuring:
@@ -166,7 +166,7 @@ def search_command(
                         update.total,
                         f"{update.found} of {update.planted} found" if update.planted else "",
                     )
-                report = measuring.result()
+                report = measuring.result().report
     if as_json:
         print_json({"folder": str(outputs.folder), **report})
     elif through_trees:

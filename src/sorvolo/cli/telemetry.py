@@ -1,8 +1,7 @@
 """`sorvolo telemetry`: a mapped flight's telemetry corrected by its map, and in words what was wrong with it."""
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from rich.markup import escape
 
@@ -24,6 +23,9 @@ from sorvolo.cli.progress import show_progress
 from sorvolo.cli.sites import OpenedSite, opened_site, run_on_site
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.survey.wording import counted
+
+if TYPE_CHECKING:
+    from sorvolo.missions.telemetry.doctor import TelemetryOutcome
 
 
 def telemetry_command(
@@ -78,7 +80,7 @@ def telemetry_command(
             flight = _map_if_new(Path(source), place, flight, telemetry or None, camera or None)
         chosen = chosen_flight(place.folder, flight)
         target = out or place.results("telemetry") / chosen
-        report = correct_telemetry(
+        outcome = correct_telemetry(
             place.folder,
             target,
             flight=chosen,
@@ -89,9 +91,9 @@ def telemetry_command(
             watched=detections,
         )
     if as_json:
-        print_json({"folder": str(target), **report})
+        print_json({"folder": str(target), **outcome.report, "cot_sent": outcome.cot_sent})
     else:
-        _show(report, target, Console())
+        _show(outcome, Console())
 
 
 def _check_source(source: str, site: str, *, has_own_options: bool) -> None:
@@ -128,19 +130,17 @@ def _check_source(source: str, site: str, *, has_own_options: bool) -> None:
         )
 
 
-def _show(report: Mapping[str, Any], target: Path, console: Console) -> None:
-    words = f"Telemetry of {escape(report['flight'])}, {counted(report['frames'], 'frame')}"
+def _show(outcome: "TelemetryOutcome", console: Console) -> None:
+    words = f"Telemetry of {escape(outcome.flight)}, {counted(outcome.frames, 'frame')}"
     console.print(words, style="bold")
-    for sentence in report["sentences"]:
+    for sentence in outcome.sentences:
         console.print(f"  {sentence}", soft_wrap=True)
-    for warning in report["warnings"]:
+    for warning in outcome.warnings:
         console.print(f"[yellow]warning[/yellow]  {escape(warning)}")
-    if report["cot_sent"] is not None:
-        console.print(
-            f"  {report['cot_sent']} of {report['frames']} Cursor on Target events sent",
-        )
-    for name in report["files"]:
-        show_path("written", target / name, console)
+    if outcome.cot_sent is not None:
+        console.print(f"  {outcome.cot_sent} of {outcome.frames} Cursor on Target events sent")
+    for path in outcome.paths.values():
+        show_path("written", path, console)
 
 
 def _map_if_new(

@@ -326,8 +326,8 @@ def run_search(order: Order, journal: Journal, until: threading.Event) -> Done:
                     "flight": each.flight,
                 }
             )
-        headline = measuring.result()["headline"]
-    return Done(headline["text"], mapped.flight, mapped.is_good and headline["complete"])
+        outcome = measuring.result()
+    return Done(outcome.headline, mapped.flight, mapped.is_good and outcome.trusted)
 
 
 def _look_through_trees(order: Order, journal: Journal) -> Done:

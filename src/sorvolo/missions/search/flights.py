@@ -1,12 +1,14 @@
 """`sorvolo search`: a site's flights measured, and what a search of the area would have found written down."""
 
 from collections.abc import Generator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from math import nan
 from pathlib import Path
 from typing import Any
 
 from sorvolo.errors import InputError
 from sorvolo.missions.flight.detector_protocol import FindsObjects
-from sorvolo.missions.mission import mission
+from sorvolo.missions.mission import is_good, mission
 from sorvolo.missions.search.earlier import Basis, read_plants, write_plants
 from sorvolo.missions.search.measure import (
     MeasuredFlight,
@@ -29,8 +31,25 @@ from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
 from sorvolo.missions.search.through_trees import seen_floor
 from sorvolo.paths import AnyPath
 from sorvolo.search.cells import Cells, cells_of
+from sorvolo.search.recall import SearchFigures
 from sorvolo.store.atomic import make_folder
 from sorvolo.store.site.archive import Archive
+
+
+@dataclass(frozen=True)
+class SearchOutcome:
+    """What a search measured, by class: its `figures`, and `holes_m2`, the ground without enough of a chance by reason.
+
+    `trusted` is False where the `headline` names holes, or flights that do not count. `report` is search.json.
+    """
+
+    folder: Path
+    headline: str
+    trusted: bool
+    figures: Mapping[str, SearchFigures]
+    holes_m2: Mapping[str, Mapping[str, float]]
+    warnings: tuple[str, ...]
+    report: Mapping[str, Any]
 
 
 @mission
@@ -39,8 +58,8 @@ def search_site(
     settings: SearchSettings,
     outputs: SearchOutputs,
     detector: FindsObjects | None = None,
-) -> Generator[SearchProgress, None, dict[str, Any]]:
-    """Measure the flights of a site, yielding progress. The result is search.json; files appear in `outputs.folder`.
+) -> Generator[SearchProgress, None, SearchOutcome]:
+    """Measure the flights of a site, yielding progress; files appear in `outputs.folder`.
 
     The probability that a person, or a car, who lay anywhere in the area would have been reported is learnt from ones
     drawn into the flights' own frames. Raises InputError for a site without metres or flights, and for a model that is
@@ -74,9 +93,23 @@ def search_site(
             [name for name in names if name not in frames],
             prepared.cut_outs,
         )
-        return write_search(
+        report = write_search(
             searched, archive.tiles(), archive.site_grid(), settings, outputs, prepared.detector
         )
+    headline, rows = report["headline"], report["classes"].items()
+    names = [each.name for each in fields(SearchFigures)]
+    return SearchOutcome(
+        outputs.folder,
+        headline["text"],
+        is_good(headline),
+        {
+            label: SearchFigures(*(nan if row[each] is None else row[each] for each in names))
+            for label, row in rows
+        },
+        {label: row["holes_m2"] for label, row in rows},
+        tuple(report["warnings"]),
+        report,
+    )
 
 
 def _measured(

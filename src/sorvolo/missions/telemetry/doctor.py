@@ -94,6 +94,23 @@ class _Compared:
     names: Sequence[str]
 
 
+@dataclass(frozen=True)
+class TelemetryOutcome:
+    """What was wrong with a flight's telemetry, in `sentences`, and the files, by name, that have it right.
+
+    `cot_sent` is how many Cursor on Target events were sent, None where none were to be. `report` is telemetry.json.
+    """
+
+    flight: str
+    folder: Path
+    frames: int
+    sentences: tuple[str, ...]
+    warnings: tuple[str, ...]
+    paths: Mapping[str, Path]
+    cot_sent: int | None
+    report: Mapping[str, Any]
+
+
 def correct_telemetry(
     site_folder: AnyPath,
     folder: AnyPath,
@@ -104,9 +121,8 @@ def correct_telemetry(
     camera: str | None = None,
     cot: CotReceiver | None = None,
     watched: AnyPath | None = None,
-) -> dict[str, Any]:
-    """Write a flight's corrected telemetry into `folder`; the report, which telemetry.json holds as well, and
-    `cot_sent`, how many events were sent.
+) -> TelemetryOutcome:
+    """Write a flight's corrected telemetry into `folder`.
 
     Without `flight` it is the site's only one, or that of `source`. With `source`, the flight's video or photos, its
     own telemetry is compared with the map, and a video is written again as a transport stream with corrected metadata,
@@ -337,7 +353,7 @@ def _written(
     mapped: Mapping[str, Any],
     cot: CotReceiver | None,
     seen: Mapping[int, Sequence[VmtiTarget]] | None = None,
-) -> dict[str, Any]:
+) -> TelemetryOutcome:
     """Write all files; `seen` are the detections by the index of their frame."""
     frames = [_frame(each, site) for each in solved]
     texts = {
@@ -396,7 +412,16 @@ def _written(
     )
     atomic_write_bytes(folder / _REPORT, json_bytes(report))
     sent = None if cot is None else send_all(texts["cot.xml"].splitlines(), cot.place, cot.tls)
-    return {**report, "cot_sent": sent}
+    return TelemetryOutcome(
+        name,
+        folder,
+        len(frames),
+        tuple(report["sentences"]),
+        tuple(report["warnings"]),
+        {each: folder / each for each in files},
+        sent,
+        report,
+    )
 
 
 def _video(source: Source) -> Path | None:
