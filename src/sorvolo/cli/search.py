@@ -184,16 +184,13 @@ def _look_through_trees(place: "OpenedSite", outputs: "SearchOutputs", plants: i
     from sorvolo.missions.search.through_trees import search_under_trees
 
     flight = outputs.flights[0] if outputs.flights else ""
-    report: Json = {}
-    with ProgressReport(Console(stderr=True)) as progress:
-        for update in search_under_trees(
-            place.folder, outputs.folder, flight=flight, plants=plants
-        ):
-            if isinstance(update, dict):
-                report = update
-            else:
-                progress.show(f"under the trees of {update.flight}: {update.stage},", update.number, update.total)  # fmt: skip
-    return report
+    looking = search_under_trees(place.folder, outputs.folder, flight=flight, plants=plants)
+    with ProgressReport(Console(stderr=True)) as progress, looking:
+        for update in looking:
+            progress.show(
+                f"under the trees of {update.flight}: {update.stage},", update.number, update.total
+            )
+        return looking.result()
 
 
 def _show_under_trees(report: JsonView, folder: Path, console: Console) -> None:

@@ -334,21 +334,17 @@ def _look_through_trees(order: Order, journal: Journal) -> Done:
     """Look for people below the crowns of the site's newest flight."""
     from sorvolo.missions.search.through_trees import search_under_trees
 
-    report: dict[str, Any] = {}
-    for update in search_under_trees(
-        order.site, order.folder, plants=order.options.get("plants", 80)
-    ):
-        if isinstance(update, dict):
-            report = update
-        else:
-            journal.progress(
-                {
-                    "frames": update.number,
-                    "frames_expected": update.total,
-                    "flight": update.flight,
-                    "reason": update.stage,
-                }
-            )
+    looking = search_under_trees(order.site, order.folder, plants=order.options.get("plants", 80))
+    for update in looking:
+        journal.progress(
+            {
+                "frames": update.number,
+                "frames_expected": update.total,
+                "flight": update.flight,
+                "reason": update.stage,
+            }
+        )
+    report = looking.result()
     flight, headline = report["flight"], report["headline"]
     _add_people(journal, Path(order.site), [flight], below_crowns=True)
     return Done(headline["text"], flight, headline["complete"])

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from cv2.typing import MatLike
 
-from sorvolo.geometry.arrays import ImageRGB, Mask, shrunk, square
+from sorvolo.geometry.arrays import ImageRGB, Mask, shrunk, size_within, square
 from sorvolo.geometry.camera import Camera
 
 _VISIBLE_PX = 0.5  # at a corner: what moves no pixel by more is left as it is
@@ -117,13 +117,7 @@ def at_size(image: ImageRGB, width_px: int, height_px: int) -> ImageRGB:
 
 def at_most(image: ImageRGB, longest_px: int) -> ImageRGB:
     """The picture, (H, W, 3), with a longer side of this many pixels at most."""
-    height_px, width_px = image.shape[:2]
-    longest = max(height_px, width_px)
-    if longest <= longest_px:
-        return image
-    return at_size(
-        image, *(max(1, round(side * longest_px / longest)) for side in (width_px, height_px))
-    )
+    return at_size(image, *size_within(image, longest_px))
 
 
 @contextmanager

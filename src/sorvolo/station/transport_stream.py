@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from sorvolo.capture.live.klv import ITEMS, encode
+from sorvolo.capture.live.klv_telemetry import OWN_TAGS
 from sorvolo.errors import StoreError
 from sorvolo.station.messages import Kind, Message, MessageSample, sample_from_json, with_delimiter
 
@@ -207,18 +208,7 @@ _TAGS = {
     "sensor_longitude_deg": "longitude_deg",
     "sensor_true_altitude_m": "orthometric_height_m",
     "sensor_ellipsoid_height_extended_m": "ellipsoidal_height_m",
-    **{
-        name: name
-        for name in (
-            "height_above_takeoff_m",
-            "horizontal_sigma_m",
-            "vertical_sigma_m",
-            "tilt_sigma_deg",
-            "heading_sigma_deg",
-            "course_deg",
-            "speed_m_s",
-        )
-    },
+    **{name: name for name in OWN_TAGS},
 }
 """Which column a tag states, by the tag's name."""
 

@@ -26,8 +26,7 @@ from sorvolo.survey.flight import TELEMETRY_COLUMNS, CameraModel, Notice, Teleme
 FORMAT = "klv"
 """The name that `Telemetry.format` carries."""
 
-# named as their columns
-_OWN_TAGS = (
+OWN_TAGS = (
     "height_above_takeoff_m",
     "horizontal_sigma_m",
     "vertical_sigma_m",
@@ -36,6 +35,8 @@ _OWN_TAGS = (
     "course_deg",
     "speed_m_s",
 )
+"""Tags of ours that are named as their columns."""
+
 # of a focal length from the field of view: operators round it, and zooms lag behind it
 _FOV_SIGMA = 0.03
 _LEAST_DOWN = radians(5)  # of a view whose middle is on the ground; flatter ones meet it far away
@@ -55,7 +56,7 @@ def columns_of(stated: LocalSet) -> dict[str, float]:
         "longitude_deg": stated["sensor_longitude_deg"],
         "orthometric_height_m": stated["sensor_true_altitude_m"],
         "ellipsoidal_height_m": full_m if isfinite(full_m) else stated["sensor_ellipsoid_height_m"],
-        **{name: stated[name] for name in _OWN_TAGS},
+        **{name: stated[name] for name in OWN_TAGS},
     }
     heading = stated["platform_heading_deg"]
     pitch = _first_known(stated["platform_pitch_full_deg"], stated["platform_pitch_deg"])

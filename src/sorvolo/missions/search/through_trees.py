@@ -1,7 +1,7 @@
 """`sorvolo search --through-trees`: a mapped flight's pictures put together on the floor below crowns, and its finds."""
 
 import json
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from sorvolo.missions.heights.run import (
     run_of,
     solved_before,
 )
+from sorvolo.missions.mission import mission
 from sorvolo.missions.search.measure import SeenFloor
 from sorvolo.paths import AnyPath
 from sorvolo.registration.features import gray_from_rgb
@@ -175,10 +176,11 @@ def look_through_trees(
     return LookedUnderTrees(report, tuple(objects), finds, views, picture, under, cameras, site)
 
 
+@mission
 def search_under_trees(
     site_folder: AnyPath, folder: AnyPath, *, flight: str = "", plants: int = 80
-) -> Iterator[UnderTreesUpdate | dict[str, Any]]:
-    """Put a flight's pictures together on the floor below the trees, yielding progress and last the report.
+) -> Generator[UnderTreesUpdate, None, dict[str, Any]]:
+    """Put a flight's pictures together on the floor below the trees, yielding progress; the result is the report.
 
     `plants` bodies are planted on the floor of thermal pictures for the probability of detection.
     The files of `LookedUnderTrees.write` appear in `folder`; the finds become objects of the flight. Raises InputError
@@ -216,7 +218,7 @@ def search_under_trees(
             atomic_write_bytes(archive.folder / file, json_bytes(kept_floor))
         report["notices"] = [asdict(each) for each in archive.notices]
     replace(looked, report=report).write(Path(folder))
-    yield report
+    return report
 
 
 def seen_floor(folder: Path, archive: Archive, flight: str) -> SeenFloor | None:
