@@ -1098,6 +1098,29 @@ def test_an_older_list_of_missions_that_comes_later_hides_none(
     assert page.locator(".run.running").count() == 1
 
 
+def test_older_drawings_that_come_later_hide_none(served: Served, opened: Watched) -> None:
+    page, url, held = opened.page, "/api/sites/field/drawings", list[Any]()
+    kept = served.ask(url)
+    page.locator("[data-panel=measure]").click()
+    drawn = page.locator(".drawn input[aria-label=Name]")
+    expect(drawn).to_have_count(len(kept["features"]))
+    page.route(f"**{url}", lambda route: route.continue_() if held else held.append(route))
+    served.station.events.append(NewEvent("drawings.changed", {}, "field", ""))
+    wait_for(lambda: page.wait_for_timeout(20) or held)
+    place = {"type": "Point", "coordinates": [13.2503, 46.5003]}
+    camp = {"type": "Feature", "id": "camp", "geometry": place}
+    camp["properties"] = {"purpose": "waypoint", "name": "Camp"}
+    wish = {"revision": kept["revision"], "features": [*kept["features"], camp]}
+    revision = served.ask(url, "PUT", wish)["revision"]
+    expect(drawn).to_have_count(len(kept["features"]) + 1)
+    with page.expect_event("requestfinished", lambda each: each == held[0].request):
+        held[0].fulfill(json=kept)
+    page.wait_for_timeout(300)
+    assert drawn.count() == len(kept["features"]) + 1
+    served.ask(url, "PUT", {"revision": revision, "features": kept["features"]})
+    expect(drawn).to_have_count(len(kept["features"]))
+
+
 def test_a_flight_is_followed_live(served: Served, opened: Watched) -> None:
     page = opened.page
     lon, lat = changes(served)[0]["geometry"]["coordinates"][0][0]

@@ -24,7 +24,8 @@ export async function loadDrawings(screen) {
   if (!screen.drawings) show(screen, screen.drawings = NONE);
   if (screen.data.detail.is_new) return;
   try {
-    show(screen, await get(siteUrl(screen.data.id, "drawings")));
+    const drawings = await get(siteUrl(screen.data.id, "drawings"));
+    if (drawings.revision >= screen.drawings.revision) show(screen, drawings); // else an older answer that came later
   } catch (problem) {
     if (!(problem instanceof Problem)) throw problem;
   }
