@@ -215,13 +215,14 @@ def test_what_was_printed_is_not_printed_again(
     assert not any(f" {each}  at " in printed for each in new)
 
 
-def _track(number: int, east_m: float, frame: int, moving: bool) -> Track:
+def _track(number: int, east_m: float, frame: int, moving: bool, late_m: float = 0.0) -> Track:
     place_m, spread_m2, size_m = np.array([east_m, 0.0]), np.diag([4.0, 1.0]), np.array([1.0, 0.5])
     box = np.array([10, 20, 30, 60], np.float32)
     best = Sighting(frame, str(frame), 0, "person", 0.8, box, place_m, spread_m2, size_m)
     path = place_m[None], np.zeros(1, np.int64)
     seen = True, moving, 0, 10**9, 5, 1
-    return Track(number, "person", 0.8, *seen, place_m, spread_m2, np.zeros(2), size_m, best, *path)
+    all_m2 = spread_m2 + np.diag([late_m**2, 0.0])
+    return Track(number, "person", 0.8, *seen, place_m, all_m2, np.zeros(2), size_m, best, *path)
 
 
 class _Noting(ResultCache):
@@ -231,8 +232,14 @@ class _Noting(ResultCache):
         self.notes.append(Entry(kind, json.loads(json.dumps(values))))
 
 
-def test_an_alert_is_known_again_by_its_sighting_or_by_what_stands_there(tmp_path: Path) -> None:
-    """A watch that left frames out announces a thing by another of them when it goes on; each alert is for one thing."""
+@pytest.mark.parametrize("late_m", [0.0, 30.0])
+def test_an_alert_is_known_again_by_its_sighting_or_by_what_stands_there(
+    late_m: float, tmp_path: Path
+) -> None:
+    """A watch that left frames out announces a thing by another of them when it goes on; each alert is for one thing.
+
+    A clock that is off moves all things of the flight alike, and makes no two of them one.
+    """
     memo, sent = _Noting(), tmp_path / "sent"
     command = f"{sys.executable} -c \"open('{sent}', 'a').write('{{id}} ')\""
     outputs = WatchOutputs(alert_command=command)
@@ -241,7 +248,7 @@ def test_an_alert_is_known_again_by_its_sighting_or_by_what_stands_there(tmp_pat
     def alerted(*places: tuple[int, float, int, bool]) -> list[str]:
         """Report tracks by (id, east, frame of the best sighting, moving) in a new process; what was sent so far."""
         notifier = Notifier("flight", "0" * 16, site, outputs, tmp_path, memo)
-        tracks = [_track(*each) for each in places]
+        tracks = [_track(*each, late_m) for each in places]
         notifier.report(tracks, [], {}, {})
         notifier.close(20, 1)
         return sorted(sent.read_text().split(), key=int)

@@ -191,3 +191,8 @@ class Track:
     def sigma_m(self) -> float:
         """One sigma of the place per axis, the mean of both."""
         return float(np.sqrt(np.trace(self.covariance_m2) / 2))
+
+    @property
+    def apart_sigma_m(self) -> float:
+        """The same beside the flight's other tracks, without what may move all of them, as a clock that is off."""
+        return min(self.sigma_m, self.best.sigma_m)

@@ -80,7 +80,8 @@ class Announced:
     def _standing_at(self, track: Track) -> int:
         """The id of the announced track that stands where this one does; 0 where none does."""
         for each in self.left():
-            reach_m = 3 * np.hypot(each.sigma_m, track.sigma_m) + track.size_m[0] / 2
+            sigma_m = np.hypot(each.apart_sigma_m, track.apart_sigma_m)
+            reach_m = 3 * sigma_m + track.size_m[0] / 2
             stands = each.label == track.label and not (each.moving or track.moving)
             if stands and np.linalg.norm(each.position_m - track.position_m) <= reach_m:
                 return each.id

@@ -125,7 +125,7 @@ class Notifier:
             "stands": [segment, track.label] if not track.moving else [],
             "east_m": east_m,
             "north_m": north_m,
-            "sigma_m": track.sigma_m,
+            "sigma_m": track.apart_sigma_m,
         }
         for receiver, outbox in self._alerts.items():
             if not self._was_sent(receiver, known_by, track.size_m[0] / 2):
