@@ -1984,6 +1984,44 @@ def test_the_drone_s_video_lies_beside_the_map_and_what_is_reviewed(
     page.set_viewport_size({"width": 900, "height": 600})
 
 
+def test_a_phone_s_map_is_shown_whole_behind_a_video(
+    browser: Any, served: Served, tmp_path: Path
+) -> None:
+    """The video takes room from the map, which is fitted into what is left, until somebody moves it."""
+    context = context_of(browser, viewport={"width": 390, "height": 844})
+    watched = Watched(context, served.url)
+    page = watched.page
+    west, south, east, north = served.ask("/api/sites/field")["bounds_wgs84"]
+    west, east = west + 0.45 * (east - west), east - 0.45 * (east - west)  # a tall site
+
+    def narrow(route: Any) -> None:
+        answer = route.fetch()
+        wanted = {**answer.json(), "bounds_wgs84": [west, south, east, north]}
+        route.fulfill(response=answer, json=wanted)
+
+    page.route(f"{served.url}/api/sites/field", narrow)
+    show(watched, served)
+    page.evaluate("""async () => {
+      const {VideoWall} = await import('/page/video.js');
+      const fit = VideoWall.prototype.fit;
+      VideoWall.prototype.fit = function () { window.view = this.screen.view; fit.call(this); };
+    }""")
+    whole_px = page.locator(".map-canvas").bounding_box()["height"]
+    with video_shown(served, page, tmp_path, "c3d4" * 4) as (drone, _):
+        seen_px = page.locator(".map-canvas").bounding_box()["height"]
+        assert seen_px < whole_px - 100
+        corners = page.evaluate(
+            "places => places.map((each) => { const {x, y} = window.view.map.project(each); return [x, y]; })",
+            [[west, north], [east, south]],
+        )
+        free_px = seen_px - page.evaluate("window.view.covered().low")
+        (left, top), (right, bottom) = corners
+        assert 0 <= left < right <= 390 and 0 <= top < bottom <= free_px
+        drone.send(Message(Kind.END, 0, 0, b"").to_bytes())
+    assert watched.faults == []
+    context.close()
+
+
 def apart(one: dict[str, float], other: dict[str, float]) -> bool:
     """Whether two boxes on the screen share nothing."""
     return any(
