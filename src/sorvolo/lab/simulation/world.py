@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import cv2
 import numpy as np
@@ -49,6 +50,7 @@ _SUN_DEG = 28.0, 62.0  # the sun's height, least and most, where the day has the
 _LEAST_SUN_DEG = 10.0  # in a polar night: shadows of a lower sun leave the ground that is drawn
 
 
+@cache  # each frame asks, and the sun of a whole day is found minute by minute
 def start_ns(settings: SimulationSettings, flight: int) -> int:
     """UTC of the first frame of a flight, counted from 1: later ones in another light begin weeks later at a drawn
     hour, those in the same light years later at the same hour."""
