@@ -1,8 +1,8 @@
 """How good change detection is: counts of pixels and frames, events, ground."""
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass, field
 from typing import TypeVar
 
 import cv2
@@ -41,13 +41,7 @@ class Counts:
     unknown: int = 0
 
     def __add__(self, other: "Counts") -> "Counts":
-        return Counts(
-            self.tp + other.tp,
-            self.fp + other.fp,
-            self.fn + other.fn,
-            self.tn + other.tn,
-            self.unknown + other.unknown,
-        )
+        return Counts(*(a + b for a, b in zip(astuple(self), astuple(other))))
 
     @property
     def precision(self) -> float:
@@ -251,10 +245,14 @@ def match_events(
         ],
         bool,
     ).reshape(len(found), len(true))
-    of_found = _paired(
+    # the true event of each found one, by rank
+    of_found: dict[int, int] = {}
+    for _, _, i, j in sorted(
         (found[i].kind != true[j].kind, float(np.hypot(*offsets[i][j])), i, j)
         for i, j in np.argwhere(near).tolist()
-    )
+    ):
+        if i not in of_found and j not in of_found.values():
+            of_found[i] = j
     must_find = np.array([truth.must_find for truth in true], bool)
     is_matched, is_paired = np.zeros(len(true), bool), np.zeros(len(found), bool)
     is_matched[list(of_found.values())], is_paired[list(of_found)] = True, True
@@ -278,15 +276,6 @@ def match_events(
 
 def _chosen(events: Sequence[_Event], which: Mask) -> tuple[_Event, ...]:
     return tuple(each for each, is_chosen in zip(events, which, strict=True) if is_chosen)
-
-
-def _paired(wishes: Iterable[tuple[bool, float, int, int]]) -> dict[int, int]:
-    """The true event of each found one: pairs (is of another kind, distance, found, true) by rank, each used once."""
-    of_found: dict[int, int] = {}
-    for _, _, i, j in sorted(wishes):
-        if i not in of_found and j not in of_found.values():
-            of_found[i] = j
-    return of_found
 
 
 def score_events(match: EventMatch, compared_m2: float) -> EventScores:

@@ -13,7 +13,6 @@ from sorvolo.geometry.homography import apply_homography
 from sorvolo.lab.evaluation.change_metrics import (
     VIDEO_VIEWS,
     ComparedGround,
-    Counts,
     EventMatch,
     EventScores,
     FoundEvent,
@@ -131,20 +130,13 @@ def as_json(measured: Sequence[MeasuredChanges]) -> list[Json]:
         written.append(
             {
                 "flight": each.flight,
-                "pixels": None if masks is None else _rates(masks.pixels),
-                "frames": None if masks is None else _rates(masks.frames),
-                "masks": None
-                if masks is None
-                else {name: getattr(masks, name) for name in counted},
-                "events": None
-                if events is None
-                else plain_json(events)
-                | {
-                    name: plain_json(getattr(events, name))
-                    for name in ("found_share", "false_per_hectare")
-                },
-                "lists": None if each.match is None else _lists(each.match),
-                "classes": None if each.classes is None else plain_json(each.classes),
+                "pixels": masks and _rates(masks.pixels, _COUNTS),
+                "frames": masks and _rates(masks.frames, _COUNTS),
+                "masks": masks and _rates(masks, counted),
+                "events": events
+                and plain_json(events) | _rates(events, ("found_share", "false_per_hectare")),
+                "lists": each.match and _lists(each.match),
+                "classes": plain_json(each.classes),
                 "map_shift_m": plain_json(each.map_shift_m),
                 "remarks": list(each.remarks),
             }
@@ -152,10 +144,13 @@ def as_json(measured: Sequence[MeasuredChanges]) -> list[Json]:
     return written
 
 
-def _rates(counts: Counts) -> dict[str, float | int | None]:
-    """Counts with their rates as in Tables 4.3 to 4.5, a rate that does not exist as None."""
-    names = ("tp", "fp", "fn", "tn", "unknown", "precision", "recall", "accuracy", "f1")
-    return {name: plain_json(getattr(counts, name)) for name in names}
+_COUNTS = ("tp", "fp", "fn", "tn", "unknown", "precision", "recall", "accuracy", "f1")
+"""Counts and their rates, as in Tables 4.3 to 4.5."""
+
+
+def _rates(of: object, names: Sequence[str]) -> Json:
+    """Some of a record's numbers; one that does not exist as None."""
+    return {name: plain_json(getattr(of, name)) for name in names}
 
 
 def _lists(match: EventMatch) -> Json:
@@ -250,8 +245,8 @@ def _evaluate(
 ) -> MeasuredChanges:
     remarks = []
     masks = None
-    if has_masks(site / "flights" / flight / "masks"):
-        masks = compare_mask_folders(_own_masks(site, flight), true_folder / "changes", least_px)
+    if has_masks(own := site / "flights" / flight / "masks"):
+        masks = compare_mask_folders(own, true_folder / "changes", least_px)
     else:
         remarks.append(
             "no masks were written: frames and pixels are judged after `sorvolo compare` with --masks DIR"
@@ -269,17 +264,11 @@ def _evaluate(
     )
     is_photos = any(not row.name.isdecimal() for row in flights.mine[flight])
     least_views = PHOTO_VIEWS if is_photos else VIDEO_VIEWS
-    true = _read_true(
-        true_folder / "events.geojson",
-        described,
-        map_from_truth,
-        ground,
-        least_views,
-    )
+    events = true_folder / "events.geojson"
+    true = _read_true(events, described, map_from_truth, ground, least_views)
     # the reported events; those reported only in the end were announced with the last frame
     path = features_path(site / "flights" / flight, "changes")
-    clock = flights.clock(flight)
-    ended_ns, behind_ns = clock
+    ended_ns, behind_ns = flights.clock(flight)
     found = []
     for feature in read_features(path):
         try:
@@ -309,9 +298,7 @@ def _evaluate(
     scores = score_events(match, ground.area_m2)
     if match.pairs and not scores.judged_late:
         remarks.append("when events were announced is not known: none is judged late")
-    classes = _class_counts(
-        match, features_path(site / "flights" / flight, "changes"), true_folder / "events.geojson"
-    )
+    classes = _class_counts(match, path, true_folder / "events.geojson")
     return MeasuredChanges(flight, masks, scores, match, shift_m, tuple(remarks), classes)
 
 

@@ -111,7 +111,7 @@ class Mistake:
 
     kind: str
     picture: int
-    box_px: tuple[float, float, float, float]
+    box_px: tuple[float, ...]
     label: str
     score: float
     true_label: str = ""
@@ -179,7 +179,6 @@ def match_pictures(
         "categories": [{"id": k, "name": name} for k, name in enumerate(judged)],
         "annotations": annotations,
     }
-    truth_rows = rows
     with redirect_stdout(io.StringIO()):  # pycocotools prints as it goes
         judge = COCOeval(
             _indexed(truth), _indexed(truth | {"annotations": _candidates(found, judged)}), "bbox"
@@ -188,16 +187,10 @@ def match_pictures(
         judge.evaluate()
         judge.accumulate()
     precision = np.asarray(judge.eval["precision"])[..., -1]  # IoU, recall, class, area
-    pictures = len(labelled)
-    areas = len(judge.params.areaRng)
+    # of each class the pictures, all areas first
+    by_class = np.reshape(judge.evalImgs, (len(judged), -1, len(labelled)))[:, 0]
     matches = tuple(
-        _class_match(
-            name,
-            judge.evalImgs[k * areas * pictures : (k * areas + 1) * pictures],
-            judge,
-            truth_rows,
-        )
-        for k, name in enumerate(judged)
+        _class_match(name, own, judge, rows) for name, own in zip(judged, by_class.tolist())
     )
     each = {name: _numbers(precision[:, :, k : k + 1]) for k, name in enumerate(judged)}
     return matches, _numbers(precision), each
@@ -328,7 +321,8 @@ def confusion(
             table[c, size] += 1
             box = matches[c].true_boxes_px[g]
             score = float(np.nan_to_num(matches[c].true_scores[g]))
-            mistakes.append(Mistake("miss", picture, _tuple(box), "", score, matches[c].label))
+            place = tuple(box.tolist())
+            mistakes.append(Mistake("miss", picture, place, "", score, matches[c].label))
     return table, tuple(mistakes)
 
 
@@ -339,18 +333,21 @@ def _wrong_detection(
     a false alarm."""
     match, picture = matches[k], int(matches[k].pictures[d])
     box, score = match.boxes_px[d], float(match.scores[d])
+    place = tuple(box.tolist())
     left = [row for row in missed if row[0] != k]
     overlaps = iou_matrix(
         box[None], np.reshape([matches[c].true_boxes_px[g] for c, g in left], (-1, 4))
     )[0]
     if len(left) and overlaps.max() >= IOUS[0]:
         c, g = left[int(np.argmax(overlaps))]
-        return Mistake("confusion", picture, _tuple(box), match.label, score, matches[c].label), (
-            c,
-            g,
-        )
-    near = max((_best_overlap(box, each, picture) for each in matches), default=0.0)
-    return Mistake("false alarm", picture, _tuple(box), match.label, score, overlap=near), None
+        return Mistake("confusion", picture, place, match.label, score, matches[c].label), (c, g)
+    near = [
+        iou_matrix(box[None], each.true_boxes_px[each.true_pictures == picture]).max(initial=0.0)
+        for each in matches
+    ]
+    return Mistake(
+        "false alarm", picture, place, match.label, score, overlap=float(max(near))
+    ), None
 
 
 def _candidates(found: Sequence[Detections], judged: Sequence[str]) -> list[Json]:
@@ -445,13 +442,3 @@ def _by_iou(rows: Sequence[Json], key: str) -> Floats:
     return np.concatenate(
         [np.zeros((len(IOUS), 0)), *(np.reshape(row[key], (len(IOUS), -1)) for row in rows)], axis=1
     )
-
-
-def _tuple(box: BoxesPx) -> tuple[float, float, float, float]:
-    left, top, right, bottom = (float(edge) for edge in box)
-    return left, top, right, bottom
-
-
-def _best_overlap(box: BoxesPx, match: ClassMatch, picture: int) -> float:
-    overlaps = iou_matrix(box[None], match.true_boxes_px[match.true_pictures == picture])[0]
-    return float(overlaps.max()) if len(overlaps) else 0.0

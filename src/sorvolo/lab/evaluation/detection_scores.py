@@ -151,10 +151,12 @@ def draw_groups(count: int, draws: int, seed: int) -> Floats:
 def intervals(tables: GroupTables, *, draws: int = DRAWS, seed: int = 0) -> dict[str, Interval]:
     """Every measure with its interval."""
     exact = tables.measure(np.ones((1, tables.groups)))
-    if tables.groups < 2:
-        return {name: Interval(float(value[0]), np.nan, np.nan) for name, value in exact.items()}
-    drawn = tables.measure(draw_groups(tables.groups, draws, seed))
-    return {name: Interval(float(value[0]), *_bounds(drawn[name])) for name, value in exact.items()}
+    # one group is all there is: nothing can be drawn
+    drawn = {} if tables.groups < 2 else tables.measure(draw_groups(tables.groups, draws, seed))
+    return {
+        name: Interval(float(value[0]), *_bounds(drawn.get(name, np.zeros(0))))
+        for name, value in exact.items()
+    }
 
 
 def differences(
@@ -168,23 +170,17 @@ def differences(
     groups = a[0].groups
     of_a, of_b = (_arm_scores("", arm).mean for arm in (a, b))
     values = {name: of_b[name] - of_a[name] for name in of_a if name in of_b}
-    if groups < 2 and len(a) < 2 and len(b) < 2:
-        return {
-            name: ScoreDifference(value, np.nan, np.nan, np.nan) for name, value in values.items()
-        }
+    is_drawn = groups > 1 or len(a) > 1 or len(b) > 1
     weights = draw_groups(groups, draws, seed)
     rng = np.random.default_rng([seed, 4302])
     drawn_a, drawn_b = (_drawn_means(arm, weights, values, rng) for arm in (a, b))
-    return {
-        name: _difference(value, drawn_b[name] - drawn_a[name]) for name, value in values.items()
-    }
-
-
-def _difference(value: float, drawn: Floats) -> ScoreDifference:
-    known = drawn[~np.isnan(drawn)]
-    return ScoreDifference(
-        value, *_bounds(drawn), float((known > 0).mean()) if len(known) else np.nan
-    )
+    result = {}
+    for name, value in values.items():
+        drawn = (drawn_b[name] - drawn_a[name])[: len(weights) * is_drawn]
+        known = drawn[~np.isnan(drawn)]
+        share_above = float((known > 0).mean()) if len(known) else np.nan
+        result[name] = ScoreDifference(value, *_bounds(drawn), share_above)
+    return result
 
 
 def _drawn_means(

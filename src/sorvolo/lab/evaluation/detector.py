@@ -15,6 +15,7 @@ from sorvolo.detection.models import find_model
 from sorvolo.detection.session import read_info
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import BoxesPx, ImageRGB
+from sorvolo.geometry.homography import resized, shifted
 from sorvolo.lab.datasets import LabelOptions, read_datasets
 from sorvolo.lab.datasets.splits import hold_out
 from sorvolo.lab.evaluation.detection_metrics import Mistake, judged_classes
@@ -33,7 +34,7 @@ from sorvolo.store.atomic import atomic_write_bytes, make_folder
 from sorvolo.store.exports.plain import json_bytes
 from sorvolo.survey.flight import Notice
 from sorvolo.survey.labels import LabelledSet
-from sorvolo.survey.objects import Detections, no_detections
+from sorvolo.survey.objects import Detections
 from sorvolo.survey.wording import counted
 
 Models: TypeAlias = AnyPath | FindsObjects | Sequence[AnyPath | FindsObjects]
@@ -74,12 +75,8 @@ def mistake_picture(
     side = max(3.0 * max(right - left, bottom - top), 48.0)
     x0, y0 = (left + right - side) / 2, (top + bottom - side) / 2
     scale = _CROP_PX / side
-    matrix = np.array(
-        [[scale, 0, -scale * x0 + (scale - 1) / 2], [0, scale, -scale * y0 + (scale - 1) / 2]]
-    )
-    crop = cv2.warpAffine(
-        image, matrix, (_CROP_PX, _CROP_PX), flags=cv2.INTER_LINEAR, borderValue=(60, 60, 60)
-    )
+    matrix = resized(scale, scale) @ shifted(-x0, -y0)
+    crop = cv2.warpAffine(image, matrix[:2], (_CROP_PX, _CROP_PX), borderValue=(60, 60, 60))
     for boxes, colour in ((labels_px, _LABEL_COLOUR), (found_px, _FOUND_COLOUR)):
         for edges in boxes:
             low, high = (
@@ -180,11 +177,10 @@ def evaluate_detector(
     names = [each.name for each in labelled]
     if len(set(names)) < len(names):
         raise InputError(f"two data sets have one name ({', '.join(names)}); rename a folder")
-    reader = _PictureReader()
+    damaged: dict[str, str] = {}  # by path, with the reason
     # what every model of every arm finds in the pictures that can be read
-    seen = [[_found(place, labelled, settings, progress, reader) for place in arm] for arm in rows]
-    seen = [[_without(each, labelled, reader.damaged) for each in arm] for arm in seen]
-    labelled = [_readable(each, reader.damaged) for each in labelled]
+    seen = [[_found(place, labelled, settings, progress, damaged) for place in arm] for arm in rows]
+    labelled = [_readable(each, damaged) for each in labelled]
     first = seen[0][0]
     scores = tuple(
         score_set(
@@ -204,8 +200,8 @@ def evaluate_detector(
     }
     # What the models note, each once
     notices = (
-        *_damage_notices(reader.damaged),
-        *tuple(dict.fromkeys(text for arm in seen for each in arm for text in each.notices)),
+        *_damage_notices(damaged),
+        *dict.fromkeys(text for arm in seen for each in arm for text in each.notices),
     )
     return DetectorEvaluation(first, scores, comparisons, worst, notices)
 
@@ -220,13 +216,7 @@ def write_evaluation(
     folder = Path(folder)
     make_folder(folder)
     atomic_write_bytes(folder / NUMBERS, json_bytes(evaluation_numbers(evaluation, description)))
-    page = detector_page(
-        evaluation.found.name,
-        evaluation.sets,
-        evaluation.comparisons,
-        evaluation.worst,
-        description,
-    )
+    page = detector_page(evaluation, description)
     atomic_write_bytes(folder / PAGE, page.encode())
 
 
@@ -266,9 +256,9 @@ def _found(
     labelled: Sequence[LabelledSet],
     settings: EvaluationSettings,
     progress: Callable[[EvaluationProgress], None],
-    reader: "_PictureReader",
+    damaged: dict[str, str],
 ) -> FoundSets:
-    """What the model of this name or file finds; nothing in damaged pictures."""
+    """What the model of this name or file finds in the pictures that can be read; the others join the `damaged`."""
     loaded = Detector.load(place, stand_in=False) if isinstance(place, str) else place
     detector = as_detector(loaded)
     name = place if isinstance(place, str) else detector.info.name
@@ -276,14 +266,15 @@ def _found(
         judged_classes(each, detector.classes)  # before an hour of looking
     sets: dict[str, FoundSet] = {}
     mixed: list[str] = []
-    seconds, count = 0.0, 0
+    seconds = 0.0
     for each in labelled:
         detections = []
         lights: list[Mapping[str, float]] = []
-        for picture in each.pictures:
-            image = reader.read(picture.path)
-            if image is None:
-                detections.append(no_detections(detector.classes))
+        for number, picture in enumerate(each.pictures, start=1):
+            try:
+                image = read_picture(Path(picture.path))
+            except (InputError, OSError) as error:
+                damaged[picture.path] = f"{error}"
             else:
                 started = time.perf_counter()
                 detections.append(
@@ -296,10 +287,9 @@ def _found(
                     )
                 )
                 seconds += time.perf_counter() - started
-                count += 1
                 least = detector.thresholds_for(image, from_above=settings.from_above)
                 lights.append({**detector.info.thresholds, **least})
-            progress(EvaluationProgress(detector.info.name, each.name, len(detections), len(each)))
+            progress(EvaluationProgress(detector.info.name, each.name, number, len(each)))
         usual = max(lights, key=lights.count, default=detector.info.thresholds)
         if others := len(lights) - lights.count(usual):
             mixed.append(
@@ -311,26 +301,9 @@ def _found(
         Path(name).stem if Path(name).suffix == ".onnx" else name,
         detector.classes,
         sets,
-        seconds / max(count, 1),
+        seconds / max(sum(len(each.detections) for each in sets.values()), 1),
         (*(notice.text for notice in detector.notices), *mixed),
     )
-
-
-class _PictureReader:
-    """Reads pictures. Those that cannot be read are `damaged`, by path with the reason, and are not tried again."""
-
-    def __init__(self) -> None:
-        self.damaged: dict[str, str] = {}
-
-    def read(self, path: str) -> ImageRGB | None:
-        """The picture; None where it cannot be read."""
-        if path in self.damaged:
-            return None
-        try:
-            return read_picture(Path(path))
-        except (InputError, OSError) as error:
-            self.damaged[path] = f"{error}"
-            return None
 
 
 def _readable(labelled: LabelledSet, damaged: Mapping[str, str]) -> LabelledSet:
@@ -342,22 +315,6 @@ def _readable(labelled: LabelledSet, damaged: Mapping[str, str]) -> LabelledSet:
             f"none of the {len(labelled)} pictures of {labelled.name} can be read (first: {first}: {damaged[first]})"
         )
     return labelled.only(kept)
-
-
-def _without(
-    found: FoundSets, labelled: Sequence[LabelledSet], damaged: Mapping[str, str]
-) -> FoundSets:
-    """What was found, without the pictures that no model could be shown."""
-    sets = {}
-    for each in labelled:
-        one = found.sets[each.name]
-        kept = tuple(
-            detections
-            for detections, picture in zip(one.detections, each.pictures)
-            if picture.path not in damaged
-        )
-        sets[each.name] = replace(one, detections=kept)
-    return replace(found, sets=sets)
 
 
 def _damage_notices(damaged: Mapping[str, str]) -> tuple[str, ...]:
@@ -397,7 +354,10 @@ def _worst(
         mistakes.sort(key=_area_px if kind == "miss" else lambda each: each.score, reverse=True)
         for mistake in _few_of_each_picture(mistakes):
             picture = labelled.pictures[mistake.picture]
-            reported = _reported(found.detections[mistake.picture], found.thresholds)
+            seen = found.detections[mistake.picture]
+            reported = seen.boxes_px[
+                [score >= found.thresholds[name] for score, name in zip(seen.scores, seen.names)]
+            ]
             judged = {labelled.classes.index(each.label) for each in scores.classes}
             judged_boxes = picture.boxes_px[[label in judged for label in picture.labels.tolist()]]
             image = read_picture(Path(picture.path))
@@ -418,9 +378,3 @@ def _few_of_each_picture(mistakes: Iterable[Mistake]) -> Iterator[Mistake]:
             yield mistake
         if sum(min(count, _SHOWN_OF_ONE) for count in shown.values()) >= _SHOWN:
             return
-
-
-def _reported(found: Detections, thresholds: Mapping[str, float]) -> BoxesPx:
-    return found.boxes_px[
-        [score >= thresholds[name] for score, name in zip(found.scores, found.names)]
-    ]

@@ -1,7 +1,8 @@
 """How good a detector is, as one page of HTML that needs no other file, no network and no script."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -53,18 +54,9 @@ _SCORE_NAMES = ("class", "score", "candidates", "right", "90 % interval")
 _SIZE_NAMES = ("class", "longer side", "labels", "recall as reported", "with any candidate")
 
 
-def detector_page(
-    model: str,
-    sets: Sequence[Any],
-    comparisons: Sequence[Any],
-    worst: Mapping[str, Sequence[tuple[Any, str, ImageRGB]]],
-    description: JsonView,
-) -> str:
-    """detector.html: `sets` and `comparisons` have the fields of detection.scores.SetScores and SetComparison.
-
-    `worst` holds each set's mistakes (fields of detection.metrics.Mistake), the picture's name and a crop. All text is
-    escaped.
-    """
+def detector_page(measured: Any, description: JsonView) -> str:
+    """detector.html: `measured` has the fields of detector.DetectorEvaluation. All text is escaped."""
+    model, sets = measured.found.name, measured.sets
     pictures = sum(each.pictures for each in sets)
     remarks = [f"{each.name}: {text}" for each in sets for text in each.remarks]
     page = render(
@@ -95,11 +87,11 @@ def detector_page(
             for each in sets
             if each.left_out
         ],
-        comparisons=[_comparison(each) for each in comparisons],
+        comparisons=[_comparison(each) for each in measured.comparisons],
         class_names=_CLASS_NAMES,
         size_names=_SIZE_NAMES,
         score_names=_SCORE_NAMES,
-        sets=[_set(each, worst.get(each.name, ())) for each in sets],
+        sets=[_set(each, measured.worst.get(each.name, ())) for each in sets],
         description=[(str(key), known(value)) for key, value in description.items()],
     )
     return str(page)
@@ -139,8 +131,7 @@ def _set(scores: Any, worst: Sequence[tuple[Any, str, ImageRGB]]) -> Json:
                 "words": _mistake_words(mistake),
                 "picture": name,
                 "address": picture_uri(
-                    np.asarray(np.dstack([crop, np.full(crop.shape[:2], 255, np.uint8)]), np.uint8),
-                    24_000,
+                    np.pad(crop, ((0, 0), (0, 0), (0, 1)), constant_values=255), 24_000
                 ),
             }
             for mistake, name, crop in worst
@@ -209,10 +200,10 @@ def _comparison_row(each: Any, name: str) -> list[Any]:
     row: list[Any] = ["thesis mAP" if name == "thesis_map" else name]
     for arm in each.arms:
         low, high = (arm.lowest[name], arm.highest[name]) if arm.seeds > 1 else (math.nan, math.nan)
-        row.append(_interval(arm.mean[name], low, high, _share))
+        row.append(_interval(arm.mean[name], low, high))
     for found in each.differences:
         measured = found[name]
-        words = _interval(measured.value, measured.low, measured.high, _points)
+        words = _interval(measured.value, measured.low, measured.high, "+")
         row.append(cell("strong", words) if measured.is_clear else words)
     return row
 
@@ -278,24 +269,23 @@ def _range(low: float, high: float, unit: str) -> str:
     return f"below {high:g} {unit}" if not low else f"{low:g} to {high:g} {unit}"
 
 
-def _share(value: float) -> str:
-    return f"{100 * value:.1f}" if math.isfinite(value) else "-"
+def _words(value: float, pattern: str) -> str:
+    return pattern.format(value) if math.isfinite(value) else "-"
 
 
-def _points(value: float) -> str:
-    return f"{100 * value:+.1f}" if math.isfinite(value) else "-"
+def _share(value: float, sign: str = "") -> str:
+    return _words(100 * value, "{:" + sign + ".1f}")
 
 
-def _number(value: float) -> str:
-    return f"{value:.2f}" if math.isfinite(value) else "-"
+_number = partial(_words, pattern="{:.2f}")
 
 
 def _with_interval(measured: Any) -> Markup:
-    return _interval(measured.value, measured.low, measured.high, _share)
+    return _interval(measured.value, measured.low, measured.high)
 
 
-def _interval(value: float, low: float, high: float, words: Callable[[float], str]) -> Markup:
+def _interval(value: float, low: float, high: float, sign: str = "") -> Markup:
     """The value, and its bounds on a line of their own where they are known."""
-    return cell(
-        "interval", words(value), *(words(low), words(high)) if math.isfinite(low) else ("", "")
-    )
+    bounds = (low, high) if math.isfinite(low) else ()
+    words = [_share(each, sign) for each in (value, *bounds)]
+    return cell("interval", *words, *[""] * (3 - len(words)))

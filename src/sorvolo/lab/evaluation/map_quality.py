@@ -90,18 +90,9 @@ def spread_of(distances_m: Floats, gsd_m: float) -> Spread:
     if not len(distances_m):
         nan = float("nan")
         return Spread(nan, nan, nan, nan, nan, nan, 0)
-    rms = np.sqrt((distances_m**2).mean())
-    p95 = np.percentile(distances_m, 95)
-    most = distances_m.max()
-    return Spread(
-        float(rms),
-        float(p95),
-        float(most),
-        float(rms / gsd_m),
-        float(p95 / gsd_m),
-        float(most / gsd_m),
-        len(distances_m),
-    )
+    rms, p95 = float(np.sqrt((distances_m**2).mean())), float(np.percentile(distances_m, 95))
+    most = float(distances_m.max())
+    return Spread(rms, p95, most, rms / gsd_m, p95 / gsd_m, most / gsd_m, len(distances_m))
 
 
 def corner_errors(
@@ -212,15 +203,6 @@ class DeviationSummary:
     frames: int
 
 
-@dataclass(frozen=True, eq=False)
-class DeviationPictures:
-    """A part of the map, the frame that it was made of, and how they differ, (H, W, 3) each; grey where unknown."""
-
-    mosaic: ImageRGB
-    frame: ImageRGB
-    difference: ImageRGB
-
-
 class MapDeviation:
     """Compares frames with the map one after another; remembers the map's last tiles."""
 
@@ -232,13 +214,14 @@ class MapDeviation:
         """The deviation of one undistorted frame, (H, W, 3), from the map under it."""
         return deviation(*self._both(image, site_from_image))
 
-    def shown(self, image: ImageRGB, site_from_image: Matrix3) -> DeviationPictures:
-        """The pictures of the thesis's Figure 4.1 of one undistorted frame."""
+    def shown(self, image: ImageRGB, site_from_image: Matrix3) -> dict[str, ImageRGB]:
+        """The thesis's Figure 4.1: a part of the map, the undistorted frame that it was made of, and how they differ,
+        (H, W, 3) each; grey where unknown."""
         mosaic, frame, mask = self._both(image, site_from_image)
         mosaic[~mask], frame[~mask] = _UNSEEN, _UNSEEN
         difference = np.abs(mosaic.astype(np.int16) - frame).astype(np.uint8)
         difference[~mask] = _UNSEEN
-        return DeviationPictures(mosaic, frame, difference)
+        return {"mosaic": mosaic, "frame": frame, "difference": difference}
 
     def under(self, outline_m: Floats, width_px: int, height_px: int) -> ImageRGB:
         """(height, width, 3) the map as a frame sees it whose corners lie at `outline_m`, (4, 2) in the site frame.

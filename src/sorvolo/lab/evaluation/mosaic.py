@@ -13,6 +13,7 @@ from rasterio.warp import reproject
 
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, ImageGray, Mask
+from sorvolo.geometry.homography import shifted
 from sorvolo.lab.evaluation.frame_rows import (
     map_frames,
     refuse_simulation,
@@ -245,7 +246,12 @@ def _against_truth(
     if len(true) == len(flights) == 1:
         # one flight on both sides: photos of a simulated flight may be mapped under their folder's name
         true = {next(iter(flights)): next(iter(true.values()))}
-    pairs = _paired(flights, true)
+    # the frames of each flight beside the true ones; flights that share none are left out
+    pairs = {
+        name: [(row, true[name][row.name]) for row in rows if row.name in true.get(name, {})]
+        for name, rows in flights.items()
+    }
+    pairs = {name: found for name, found in pairs.items() if found}
     if not pairs:
         raise InputError(
             f"{path}: knows the flights {', '.join(sorted(true)) or 'none'}, the map has "
@@ -265,17 +271,6 @@ def _against_truth(
     return _tally(flights, true), tuple(errors)
 
 
-def _paired(
-    flights: Mapping[str, Sequence[FrameRow]], true: Mapping[str, Mapping[str, FrameRow]]
-) -> dict[str, list[tuple[FrameRow, FrameRow]]]:
-    """The frames of each flight beside the true ones; flights that share none are left out."""
-    pairs = {
-        name: [(row, true[name][row.name]) for row in rows if row.name in true.get(name, {})]
-        for name, rows in flights.items()
-    }
-    return {name: found for name, found in pairs.items() if found}
-
-
 def _against_reference(mosaic_path: Path, reference: Path) -> ReferenceMatch:
     mine, other = read_raster(mosaic_path, _REFERENCE_PX), read_raster(reference, 2 * _REFERENCE_PX)
     if not other.crs:
@@ -290,7 +285,7 @@ def _against_reference(mosaic_path: Path, reference: Path) -> ReferenceMatch:
         )
     own = gray_from_rgb(np.ascontiguousarray(mine.rgba[..., :3]))
     shift = residual_shift(gray, own, mask)
-    moved = np.array([[1, 0, -shift.x_px], [0, 1, -shift.y_px]])
+    moved = shifted(-shift.x_px, -shift.y_px)[:2]
     size = own.shape[1], own.shape[0]
     back = np.asarray(cv2.warpAffine(own, moved, size, borderMode=cv2.BORDER_REPLICATE), np.uint8)
     still = mask & (cv2.warpAffine(mask.astype(np.uint8), moved, size, flags=cv2.INTER_NEAREST) > 0)

@@ -81,7 +81,7 @@ def example_jpegs(site: Path) -> dict[str, bytes]:
         shown = MapDeviation(archive.tiles(), archive.site_grid()).shown(
             archive.image(middle), middle.site_from_image
         )
-    return {name: jpeg_from_image(each, FIGURE_PX) for name, each in vars(shown).items()}
+    return {name: jpeg_from_image(each, FIGURE_PX) for name, each in shown.items()}
 
 
 def distortion_of(site: Path) -> Json:
