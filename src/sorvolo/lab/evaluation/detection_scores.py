@@ -171,7 +171,7 @@ def differences(
     of_a, of_b = (_arm_scores("", arm).mean for arm in (a, b))
     values = {name: of_b[name] - of_a[name] for name in of_a if name in of_b}
     is_drawn = groups > 1 or len(a) > 1 or len(b) > 1
-    weights = draw_groups(groups, draws, seed)
+    weights = draw_groups(groups, draws if is_drawn else 1, seed)
     rng = np.random.default_rng([seed, 4302])
     drawn_a, drawn_b = (_drawn_means(arm, weights, values, rng) for arm in (a, b))
     result = {}

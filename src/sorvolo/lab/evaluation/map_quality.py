@@ -18,6 +18,7 @@ from sorvolo.geometry.arrays import (
     Matrix3,
     PointsM,
     frozen,
+    square,
 )
 from sorvolo.geometry.grid import SiteGrid, TileIndex, gather_tiles
 from sorvolo.geometry.homography import apply_homography, fit_similarity
@@ -176,7 +177,7 @@ def residual_shift(a: Floats | ImageGray, b: Floats | ImageGray, mask: Mask) -> 
     """
     if min(a.shape) < 16 or not mask.any():
         return Shift(float("nan"), float("nan"), 0.0)
-    inner = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(np.float64)
+    inner = cv2.erode(mask.astype(np.uint8), square(5)).astype(np.float64)
     edges: list[Floats] = []
     for picture in (a, b):
         smooth = cv2.GaussianBlur(picture.astype(np.float64), (0, 0), 1.0)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.random import Generator
 
 from sorvolo.errors import SettingsError
-from sorvolo.geometry.arrays import Floats, Floats32, PointsM, Vector3
+from sorvolo.geometry.arrays import Floats, Floats32, PointsM, Vector3, square
 from sorvolo.geometry.sun import direction_from_angles, sun_direction
 from sorvolo.geometry.units import DAY_NS
 from sorvolo.lab.simulation.ground import GroundKind, GroundLayout, PaintedGround, paint_ground
@@ -501,7 +501,7 @@ def _blown(ground: GroundRaster, wind_m: float, rng: Generator) -> GroundRaster:
     # a kerb beside grass does not bend with it
     plants = cv2.erode(
         ground.vegetation,
-        np.ones((3, 3), np.uint8),
+        square(3),
         iterations=max(1, round(0.06 / ground.m_per_px[0])),
     )
     weight = cv2.GaussianBlur(plants, (0, 0), 1.5).astype(np.float32) / 255

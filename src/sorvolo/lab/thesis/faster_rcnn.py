@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from sorvolo.lab.training.boxes import Finder, at_most, best_boxes, clipped, suppress
+from sorvolo.lab.training.boxes import Finder, at_most, best_boxes, cell_centres, clipped, suppress
 
 _SIZES_PX = (16, 32, 64, 128, 256)  # of anchors: Faster R-CNN's, an octave finer on either side
 _RATIOS = (0.5, 1.0, 2.0)  # of height to width: Faster R-CNN's
@@ -66,12 +66,7 @@ class ProposalNetwork(nn.Module):
         x = self.stem(features)
         scores = self.scores(x).permute(0, 2, 3, 1).flatten(1)
         offsets = self.offsets(x).permute(0, 2, 3, 1).reshape(len(x), -1, 4)
-        # a feature's place is the middle of the pixels that it stands for
-        rows, columns = (
-            (torch.arange(features.shape[axis], device=x.device) + 0.5) * self.stride
-            for axis in (2, 3)
-        )
-        y, x = rows[:, None] + 0 * columns, columns[None] + 0 * rows[:, None]
+        x, y = cell_centres(features, self.stride)
         middle = torch.stack([x, y, x, y], -1)
         return Proposed(scores, offsets, (middle[:, :, None] + self.shapes).reshape(-1, 4))
 

@@ -14,7 +14,7 @@ from sorvolo.change.reference import ReferenceMap
 from sorvolo.errors import GeometryError, InputError
 from sorvolo.geometry.arrays import Floats, ImageRGB, Matrix3
 from sorvolo.geometry.camera import Camera
-from sorvolo.geometry.homography import apply_homography, resized
+from sorvolo.geometry.homography import apply_homography, resized, shifted
 from sorvolo.lab.thesis.stitching import (
     SIDE_PX,
     RoiStitcher,
@@ -156,9 +156,7 @@ class StitchedFlight:
         gps = np.full(3, np.nan)
         off_m = apply_homography(site_from_image, middle)[0] - prior.position_m[:2]
         if stitched is None:
-            shift = np.eye(3)
-            shift[:2, 2] = -off_m
-            site_from_image, off_m = shift @ site_from_image, np.zeros(2)
+            site_from_image, off_m = shifted(*-off_m) @ site_from_image, np.zeros(2)
         if has_fixes and prior.knows_place:
             gps[:2] = off_m
         return PlacedFrame(

@@ -215,7 +215,6 @@ def resnet50_from_tarball(data: bytes) -> dict[str, Tensor]:
     return resnet50_from_keras(layers, {each["name"]: each["config"] for each in rows})
 
 
-_REPEATS = {2: 3, 3: 4, 4: 6, 5: 3}
 _BRANCHES = {
     "branch2a": ("conv1", "bn1"),
     "branch2b": ("conv2", "bn2"),
@@ -248,8 +247,8 @@ def resnet50_from_keras(
 
     take("conv1", "bn_conv1", "conv1", "bn1")
     out["conv1.weight"] = out["conv1.weight"].flip(1).contiguous()
-    for stage, repeats in _REPEATS.items():
-        for repeat in range(repeats):
+    for stage, (_, blocks) in enumerate(_STAGES, start=2):
+        for repeat in range(blocks):
             place = f"layer{stage - 1}.{repeat}"
             branches = _BRANCHES | ({"branch1": _SHORT} if repeat == 0 else {})
             for branch, (conv, norm) in branches.items():

@@ -25,8 +25,9 @@ from sorvolo.geometry.arrays import (
     PointsPx,
     frozen,
     shrunk,
+    square,
 )
-from sorvolo.geometry.homography import apply_homography, fit_similarity, resized
+from sorvolo.geometry.homography import apply_homography, fit_similarity, resized, shifted
 from sorvolo.geometry.polygons import polygon_area
 from sorvolo.registration.features import gray_from_rgb
 
@@ -197,10 +198,7 @@ class RoiStitcher:
         size: tuple[int, int] = tuple((np.ceil(centre_px + half) - low).astype(int).tolist())
         roi, painted = np.zeros((2, *size[::-1]), np.uint8)
         for each in self._pasted:
-            roi_from_image = (
-                np.array([[1, 0, -low[0]], [0, 1, -low[1]], [0, 0, 1.0]])
-                @ each.placed.mosaic_from_image
-            )
+            roi_from_image = shifted(*-low) @ each.placed.mosaic_from_image
             outline = apply_homography(roi_from_image, _corners(*each.gray.shape[::-1]))
             if (outline.max(axis=0) <= 0).any() or (outline.min(axis=0) >= size).any():
                 continue
@@ -210,7 +208,7 @@ class RoiStitcher:
             cv2.fillConvexPoly(painted, np.rint(outline).astype(np.int32), 255)
         # a feature on the mosaic's own border describes where it ends, not the ground
         framed = cv2.copyMakeBorder(painted, 1, 1, 1, 1, cv2.BORDER_CONSTANT)
-        mask = cv2.erode(framed, np.ones((11, 11), np.uint8))[1:-1, 1:-1]
+        mask = cv2.erode(framed, square(11))[1:-1, 1:-1]
         return roi, mask, low  # type: ignore[return-value]
 
     def _features(self, gray: ImageGray, mask: ImageGray | None) -> tuple[PointsPx, Descriptors]:

@@ -28,13 +28,21 @@ def iou_matrix(a: Tensor, b: Tensor) -> Tensor:
 
 def shared_area(a: Tensor, b: Tensor) -> Tensor:
     """(N, M) area that boxes (N, 4) and (M, 4) share."""
-    a, b = a.detach(), b.detach()
-    far = [torch.minimum(a[:, None, axis], b[None, :, axis]) for axis in (2, 3)]
-    sides = [
-        side.sub_(torch.maximum(a[:, None, axis], b[None, :, axis]))
-        for side, axis in zip(far, (0, 1))
-    ]
-    return sides[0].clamp_(min=0).mul_(sides[1].clamp_(min=0))
+    return area(common(a.detach()[:, None], b.detach()[None]))
+
+
+def common(a: Tensor, b: Tensor) -> Tensor:
+    """(..., 4) the box that two boxes share; its sides are the wrong way round where they share none."""
+    low, high = torch.maximum(a[..., :2], b[..., :2]), torch.minimum(a[..., 2:], b[..., 2:])
+    return torch.cat([low, high], -1)
+
+
+def cell_centres(features: Tensor, stride: int) -> tuple[Tensor, Tensor]:
+    """x and y, (H, W) px, of the middles of the pixels that each of the features (N, C, H, W) stands for."""
+    y, x = (
+        (torch.arange(side, device=features.device) + 0.5) * stride for side in features.shape[2:]
+    )
+    return x[None] + 0 * y[:, None], y[:, None] + 0 * x
 
 
 def area(boxes: Tensor) -> Tensor:

@@ -313,10 +313,8 @@ def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
     # what the model file states of itself; of a tuned one also what the model before was
     learnt = [share.labelled for share in run.sets.shares]
     thermal, by_day = run.sets.lights
-    licence, trained_on = (
-        "as the data that it was trained on",
-        ", ".join(each.name for each in learnt),
-    )
+    licence = "as the data that it was trained on"
+    trained_on = ", ".join(each.name for each in learnt)
     kept: dict[str, Any] = {}
     if before:
         licence += f"; the model {before.name} before: {before.licence or 'not stated'}"

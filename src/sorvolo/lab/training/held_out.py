@@ -11,7 +11,7 @@ import torch
 from sorvolo.detection.contract import ScoreCalibration
 from sorvolo.detection.fusing import platt_fit
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Floats, ImageRGB
+from sorvolo.geometry.arrays import BoxesPx, Floats, ImageRGB
 from sorvolo.lab.evaluation.detection_metrics import (
     ClassMatch,
     CocoNumbers,
@@ -57,7 +57,7 @@ class Checked:
 
         `before` are the thresholds of the model that was learnt on from: kept for `too_few` classes.
         """
-        unknown = Threshold(_FALLBACK_THRESHOLD, float("nan"), float("nan"), float("nan"))
+        unknown = replace(_NONE, score=_FALLBACK_THRESHOLD)
         chosen = {
             name: _chosen(_pooled(self.matches[name])) for name in classes if name in self.matches
         }
@@ -104,21 +104,16 @@ class Checked:
         """(N,) longer sides of the labels of a class that were found at this score."""
         sides = [np.zeros(0)]
         for match in self.matches.get(name, ()):
-            found = match.true_boxes_px[match.true_scores >= score]
-            sides.append(np.asarray((found[:, 2:] - found[:, :2]).max(1, initial=0), float))
+            sides.append(_longer_px(match.true_boxes_px[match.true_scores >= score]))
         return np.concatenate(sides)
 
     def _mean(self, name: str, field: str) -> float:
-        rows = [
-            (getattr(numbers, field), len(match.true_scores))
-            for numbers, match in zip(self.numbers[name], self.matches[name])
-            if len(match.true_scores)
-        ]
-        return (
-            float(np.average([row[0] for row in rows], weights=[row[1] for row in rows]))
-            if rows
-            else float("nan")
-        )
+        labels = [len(match.true_scores) for match in self.matches[name]]
+        values = [getattr(numbers, field) for numbers in self.numbers[name]]
+        if not any(labels):
+            return float("nan")
+        known = np.flatnonzero(labels)
+        return float(np.average(np.take(values, known), weights=np.take(labels, known)))
 
 
 def best_sizes_px(
@@ -160,12 +155,12 @@ def _most_of(sides_px: Floats) -> tuple[float, float]:
 def _sides_px(labelled: LabelledSet, name: str) -> Floats:
     if name not in labelled.classes:
         return np.zeros(0)
-    boxes = [_of_class(picture, labelled.classes.index(name)) for picture in labelled.pictures]
-    return np.concatenate([np.zeros(0), *boxes])
+    label = labelled.classes.index(name)
+    sides = [_longer_px(each.boxes_px[each.labels == label]) for each in labelled.pictures]
+    return np.concatenate([np.zeros(0), *sides])
 
 
-def _of_class(picture: LabelledPicture, label: int) -> Floats:
-    boxes = picture.boxes_px[picture.labels == label]
+def _longer_px(boxes: BoxesPx) -> Floats:
     return np.asarray((boxes[:, 2:] - boxes[:, :2]).max(1, initial=0), float)
 
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.rnn import pad_sequence
 
-from sorvolo.lab.training.boxes import area
+from sorvolo.lab.training.boxes import area, common
 from sorvolo.lab.training.progress import Progress
 from sorvolo.lab.training.samples import TrainingSample
 from sorvolo.lab.training.single_stage import (
@@ -56,10 +56,15 @@ def collate(batch: Sequence[TrainingSample], device: str) -> tuple[Tensor, list[
     )
     answers = [
         Answer(
-            torch.from_numpy(each.boxes.astype(np.float32)).to(device),
-            torch.from_numpy(each.labels).to(device),
-            torch.from_numpy(each.ignored.astype(np.float32)).to(device),
-            torch.from_numpy(each.known).to(device),
+            *(
+                torch.from_numpy(values).to(device)
+                for values in (
+                    each.boxes.astype(np.float32),
+                    each.labels,
+                    each.ignored.astype(np.float32),
+                    each.known,
+                )
+            )
         )
         for each in batch
     ]
@@ -118,9 +123,8 @@ def dense_losses(outputs: Sequence[Tensor], answers: Sequence[Answer]) -> dict[s
 
 def _overlaps(boxes: Tensor, goals: Tensor) -> tuple[Tensor, Tensor]:
     """(N,) intersection over union of pairs, and which share of their hull neither fills (Rezatofighi et al. 2019)."""
-    low, high = boxes[:, :2], boxes[:, 2:]
-    inner = torch.cat([torch.maximum(low, goals[:, :2]), torch.minimum(high, goals[:, 2:])], 1)
-    outer = torch.cat([torch.minimum(low, goals[:, :2]), torch.maximum(high, goals[:, 2:])], 1)
+    low, high = torch.minimum(boxes, goals), torch.maximum(boxes, goals)
+    inner, outer = common(boxes, goals), torch.cat([low[:, :2], high[:, 2:]], 1)
     union = (area(boxes) + area(goals) - area(inner)).clamp(min=1e-6)
     hull = area(outer).clamp(min=1e-6)
     return area(inner) / union, (hull - union) / hull
@@ -160,15 +164,7 @@ def assigned(
     place, box = places[cell], boxes[:, :, None]
     half = _ANCHOR_STRIDES / 2 * place[..., 2:]
     square = torch.cat([place[..., :2] - half, place[..., :2] + half], -1)
-    shared = area(
-        torch.cat(
-            [
-                torch.maximum(square[..., :2], box[..., :2]),
-                torch.minimum(square[..., 2:], box[..., 2:]),
-            ],
-            -1,
-        )
-    )
+    shared = area(common(square, box))
     overlap = shared / (area(square) + area(box) - shared).clamp(min=1e-6)
     inside = ((place[..., :2] > box[..., :2]) & (place[..., :2] < box[..., 2:])).all(-1)
     enough = overlap >= overlap.mean(2, keepdim=True) + overlap.std(2, keepdim=True)
@@ -203,10 +199,8 @@ class SingleStageTraining:
         self.average = deepcopy(self.model).eval()
         self.steps, self.step, self.device = steps, 0, device
         rate = _TUNED_RATE if is_tuned else _FIRST_RATE
-        parts = (
-            (model.backbone, rate * _BACKBONE_SHARE if is_tuned else rate),
-            (model.head, rate),
-        )
+        slower = rate * _BACKBONE_SHARE if is_tuned else rate
+        parts = (model.backbone, slower), (model.head, rate)
         self.optimiser = torch.optim.AdamW(
             [{"params": part.parameters(), "rate": own} for part, own in parts],
             rate,

@@ -1,11 +1,10 @@
 """How a training went, as one page of HTML that needs no other file, no network and no script."""
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from sorvolo.store.pages.plots import Axes, Line, PlotLabel, Scale, colour_class, line_plot
-from sorvolo.store.pages.words import at, known, render, seconds_words
+from sorvolo.store.pages.words import at, finite_or_none, known, render, seconds_words, with_unit
 
 _WIDE_PX, _LOW_PX, _MARGIN_PX = 720.0, 250.0, 46.0
 _Lines = Mapping[str, Sequence[tuple[float, float]]]
@@ -16,16 +15,10 @@ def training_page(report: Mapping[str, Any]) -> str:
     ap50 = at(report, "held_out", "ap50")
     best = report["best_step"]
     checks = report["checks"]
-    lines: dict[str, list[tuple[float, float]]] = {
-        "all classes": [(row["step"], row["ap50"]) for row in checks]
-    }
-    for row in checks:
-        for name, value in row["classes"].items():
-            lines.setdefault(name, []).append((row["step"], value))
-    if (
-        list(lines.values()).count(lines["all classes"]) == len(lines) == 2
-    ):  # the mean over one class is that class
-        del lines["all classes"]
+    every = [(row["step"], row["ap50"]) for row in checks]
+    lines = _lines(checks, "classes")
+    if [*lines.values()] != [every]:  # the mean over one class is that class
+        lines = {"all classes": every, **lines}
     early = ", then its checks no longer got better" if report["stopped_early"] else ""
     page = render(
         "training.html",
@@ -40,7 +33,7 @@ def training_page(report: Mapping[str, Any]) -> str:
             f"{known(report['device'])}{early}. The model file has {report['export']['bytes'] / 1e6:.1f} MB."
         ),
         notices=report["notices"],
-        losses=_losses(report),
+        losses=_plot("Losses over steps", _lines(report["losses"], "losses")),
         checks=_plot("AP50 over steps", lines, high=1.0),
         kept=f"The weights of step {best} were kept." if best is not None else "",
         classes=_classes(report),
@@ -60,12 +53,13 @@ def training_page(report: Mapping[str, Any]) -> str:
     return str(page)
 
 
-def _losses(report: Mapping[str, Any]) -> dict[str, Any] | None:
+def _lines(rows: Sequence[Mapping[str, Any]], key: str) -> dict[str, list[tuple[float, float]]]:
+    """The values of rows by name, over their steps."""
     lines: dict[str, list[tuple[float, float]]] = {}
-    for row in report["losses"]:
-        for name, value in row["losses"].items():
+    for row in rows:
+        for name, value in row[key].items():
             lines.setdefault(name, []).append((row["step"], value))
-    return _plot("Losses over steps", lines)
+    return lines
 
 
 def _classes(report: Mapping[str, Any]) -> list[list[str]]:
@@ -99,7 +93,10 @@ def _settings(report: Mapping[str, Any]) -> list[tuple[str, str]]:
 def _plot(title: str, lines: _Lines, high: float | None = None) -> dict[str, Any] | None:
     """Lines over steps and their key; None unless two points of one are known."""
     # The known points of each line; lines of fewer than two are left out
-    known = {name: [point for point in line if _is_known(point[1])] for name, line in lines.items()}
+    known = {
+        name: [point for point in line if finite_or_none(point[1]) is not None]
+        for name, line in lines.items()
+    }
     certain = {name: line for name, line in known.items() if len(line) > 1}
     if not certain:
         return None
@@ -128,9 +125,5 @@ def _typical_top(line: Sequence[tuple[float, float]]) -> float:
     return min(values[-1], 1.3 * values[int(0.95 * (len(values) - 1))])
 
 
-def _is_known(value: Any) -> bool:
-    return isinstance(value, int | float) and math.isfinite(value)
-
-
 def _number(value: Any) -> str:
-    return f"{value:.3f}" if _is_known(value) else "-"
+    return with_unit(value, "{:.3f}") or "-"

@@ -4,12 +4,14 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import Floats, ImageRGB, Labels, Matrix3
+from sorvolo.geometry.homography import shifted
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 
 _LEAST_SEEN = 0.4  # of an object cut by the crop's edge; less of one teaches nothing
@@ -60,8 +62,7 @@ def cut_sample(
     boxes = np.asarray(picture.boxes_px, float)[labels >= 0]
     labels = labels[labels >= 0]
     # (3, 3) crop_from_picture: where the crop lies, around an object three times of four
-    size = image.shape[:2]
-    height, width = size
+    height, width = image.shape[:2]
     scale = float(np.exp(rng.uniform(*np.log(share.scale))))
     scale = max(scale, 0.5 * side / max(height, width))
     if len(boxes) and rng.random() < 0.75:
@@ -79,10 +80,9 @@ def cut_sample(
     mirror = 1.0 if rng.random() < 0.5 else -1.0
     c, s = scale * np.cos(angle), scale * np.sin(angle)
     turn = np.array([[c * mirror, -s], [s * mirror, c]])
-    matrix = np.eye(3)
-    matrix[:2, :2], matrix[:2, 2] = turn, side / 2 - turn @ centre
-    crop_from_picture = matrix
-    out, crop_from_picture = _warped(image, crop_from_picture, side)
+    crop_from_picture = np.eye(3)
+    crop_from_picture[:2, :2], crop_from_picture[:2, 2] = turn, side / 2 - turn @ centre
+    out = _warped(image, crop_from_picture, side)
     boxes, seen = boxes_in_crop(boxes, crop_from_picture, side)
     ignored, in_sight = boxes_in_crop(
         np.asarray(picture.ignored_px, float), crop_from_picture, side
@@ -96,7 +96,7 @@ def cut_sample(
     return TrainingSample(out, boxes, labels, ignored, known)
 
 
-def _warped(image: ImageRGB, crop_from_picture: Matrix3, side: int) -> tuple[ImageRGB, Matrix3]:
+def _warped(image: ImageRGB, crop_from_picture: Matrix3, side: int) -> ImageRGB:
     scale = float(np.sqrt(abs(np.linalg.det(crop_from_picture[:2, :2]))))
     source, to_source = image, np.eye(3)
     if scale < 0.7:  # made smaller by areas first, or edges would break up
@@ -107,8 +107,8 @@ def _warped(image: ImageRGB, crop_from_picture: Matrix3, side: int) -> tuple[Ima
         to_source = np.diag(
             [source.shape[1] / image.shape[1], source.shape[0] / image.shape[0], 1.0]
         )
-    corner = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # edges to pixel centres and back
-    matrix = np.linalg.inv(corner) @ crop_from_picture @ np.linalg.inv(to_source) @ corner
+    # edges to pixel centres and back
+    matrix = shifted(-0.5, -0.5) @ crop_from_picture @ np.linalg.inv(to_source) @ shifted(0.5, 0.5)
     out = cv2.warpAffine(
         source,
         matrix[:2],
@@ -117,7 +117,7 @@ def _warped(image: ImageRGB, crop_from_picture: Matrix3, side: int) -> tuple[Ima
         borderMode=cv2.BORDER_CONSTANT,
         borderValue=(114, 114, 114),
     )
-    return np.asarray(out, np.uint8), crop_from_picture
+    return np.asarray(out, np.uint8)
 
 
 def boxes_in_crop(boxes: Floats, crop_from_picture: Matrix3, side: int) -> tuple[Floats, Floats]:
@@ -165,8 +165,7 @@ def _weathered(image: ImageRGB, rng: np.random.Generator, *, thermal: bool) -> I
     return np.clip(x, 0, 255).astype(np.uint8)
 
 
-@dataclass(frozen=True)
-class Draw:
+class Draw(NamedTuple):
     """Sample `number` (from 0) is cut from picture `picture` of share `share`."""
 
     number: int

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from sorvolo.errors import InputError
-from sorvolo.lab.training.boxes import Finder, at_most, best_boxes, clipped
+from sorvolo.lab.training.boxes import Finder, at_most, best_boxes, cell_centres, clipped
 
 BINS = 11
 """A box's side is 0 to 10 strides from its cell's centre; a distribution over this many bins gives the place."""
@@ -179,11 +179,7 @@ def cells(outputs: Sequence[Tensor], classes: int) -> tuple[Tensor, Tensor, Tens
         flat = output.flatten(2).transpose(1, 2)
         scores.append(flat[..., :classes])
         bins.append(flat[..., classes:].reshape(*flat.shape[:2], 4, BINS))
-        rows, columns = (
-            (torch.arange(output.shape[axis], device=output.device) + 0.5) * stride
-            for axis in (2, 3)
-        )
-        y, x = rows[:, None] + 0 * columns, columns[None] + 0 * rows[:, None]
+        x, y = cell_centres(output, stride)
         places.append(torch.stack([x, y, torch.full_like(x, stride)], -1).flatten(0, 1))
     return torch.cat(scores, 1), torch.cat(bins, 1), torch.cat(places)
 
