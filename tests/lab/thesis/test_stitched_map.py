@@ -75,15 +75,16 @@ def test_the_map_keeps_the_detail_of_real_photos_and_burns_none_of_it(tmp_path: 
             shares.append(compared.of(image, keyframe.site_from_image).share)
             shown = compared.shown(image, keyframe.site_from_image)
             seen = (
-                cv2.erode((shown.difference[..., 0] != 236).astype(np.uint8), np.ones((9, 9))) > 0
+                cv2.erode((shown["difference"][..., 0] != 236).astype(np.uint8), np.ones((9, 9)))
+                > 0
             )
             detail = [
                 cv2.Laplacian(cv2.cvtColor(each, cv2.COLOR_RGB2GRAY), cv2.CV_32F)[seen].std()
-                for each in (shown.mosaic, shown.frame)
+                for each in (shown["mosaic"], shown["frame"])
             ]
             kept.append(detail[0] / detail[1])
-            white_map += int((shown.mosaic[seen] == 255).any(axis=1).sum())
-            white_frames += int((shown.frame[seen] == 255).any(axis=1).sum())
+            white_map += int((shown["mosaic"][seen] == 255).any(axis=1).sum())
+            white_frames += int((shown["frame"][seen] == 255).any(axis=1).sum())
     assert np.mean(kept) > 0.95
     assert white_map <= white_frames
     assert np.mean(shares) < 0.14
