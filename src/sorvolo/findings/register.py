@@ -53,7 +53,8 @@ class MissionSighting:
     `date` is the flight's name and `order` its rank among the site's; several missions may read one flight. `id` is the
     mission's own. `position_m` (2,) east, north in the site frame, of what moves where it was at `last_ns`. `sigma_m`
     is per axis. `label` is "" where nobody named it. `class_scores` gives each class's share. `gone` is the later date
-    whose comparison saw that it had left, "" where none did; then `order` is that date's.
+    whose comparison saw that it had left, "" where none did; then `order` is that date's. `off_m` is how far its mission
+    is off as a whole, east, north, as the register found.
     """
 
     date: str
@@ -72,6 +73,7 @@ class MissionSighting:
     velocity_m_s: tuple[float, float] = (0.0, 0.0)
     class_scores: Mapping[str, float] = field(default_factory=dict)
     gone: str = ""
+    off_m: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "position_m", frozen(self.position_m))
@@ -168,22 +170,40 @@ def associate(
     sightings: Sequence[MissionSighting],
     looks: Sequence[SearchedDate] = (),
     known: Sequence[GroundFinding] = (),
+    taken: Collection[str] = (),
 ) -> Register:
     """What missions saw, each thing one finding; the same whatever their order.
 
     Dates are taken in order of time, and a date's missions by name. Two sightings of one mission are never one finding.
     What a date looked at and did not find is gone; the next thing there is another finding. `known` are findings of
     dates before all of these that still stand; those within `reach_m` of the places seen and looked at are enough.
+    `taken` are the ids of other findings.
     """
     steps: list[MissionSighting | SearchedDate] = [*sightings, *looks]
-    working = _Working(in_order(known), len(sightings))
+    working = _Working(in_order(known), len(sightings), taken)
     for (_, date), of_date in groupby(sorted(steps, key=_date_of), key=_date_of):
-        taken = list(of_date)
-        seen = [each for each in taken if isinstance(each, MissionSighting)]
+        of_both = list(of_date)
+        seen = [each for each in of_both if isinstance(each, MissionSighting)]
         for _, mission in groupby(sorted(seen, key=_order), key=_mission_of):
             working.take(list(mission))
-        working.end(date, [each.frames for each in taken if isinstance(each, SearchedDate)])
+        working.end(date, [each.frames for each in of_both if isinstance(each, SearchedDate)])
     return Register(tuple(each.finding() for each in working.things), tuple(looks))
+
+
+def as_of(found: GroundFinding, order: float, orders: Mapping[str, float]) -> GroundFinding | None:
+    """A finding as it was before the date of this order, by the dates' orders; None where no date had seen it."""
+    kept = [
+        each for each in found.sightings if (orders[each.gone] if each.gone else each.order) < order
+    ]
+    gone = found.gone if found.gone and orders[found.gone] < order else ""
+    if len(kept) == len(found.sightings):
+        return found if gone == found.gone else replace(found, gone=gone)
+    return finding_of(found.id, kept, gone) if kept else None
+
+
+def finding_of(id_: str, sightings: Iterable[MissionSighting], gone: str) -> GroundFinding:
+    """A finding by its sightings, in the order in which the register took them."""
+    return _Thing(id_, sightings, gone).finding()
 
 
 def in_order(findings: Iterable[GroundFinding]) -> list[GroundFinding]:
@@ -195,8 +215,8 @@ def in_order(findings: Iterable[GroundFinding]) -> list[GroundFinding]:
 
 
 def reach_m(places_m: PointsM) -> tuple[Floats, Floats]:
-    """The box, (2,) each, around places (N, 2), N >= 1, out of which no finding is theirs."""
-    return places_m.min(axis=0) - _MOST_WALK_M, places_m.max(axis=0) + _MOST_WALK_M
+    """The box, (2,) each, around places (N, 2), N >= 1, out of which no finding of an earlier date is theirs."""
+    return places_m.min(axis=0) - _MOST_REACH_M, places_m.max(axis=0) + _MOST_REACH_M
 
 
 def begun_and_ended(
@@ -260,27 +280,19 @@ class _Thing:
     """A finding while missions are added. `left` is its sighting by the comparison that saw that it had left, None
     where it was seen since."""
 
-    def __init__(self, id_: str) -> None:
-        self.id, self.gone = id_, ""
+    def __init__(self, id_: str, sightings: Iterable[MissionSighting] = (), gone: str = "") -> None:
+        self.id, self.gone = id_, gone
         self.left: MissionSighting | None = None
         self.sightings: list[MissionSighting] = []
         self.of_date: list[MissionSighting] = []
         self.sums = defaultdict[str, float](float)
-        self._off_m: list[Floats] = []
+        for each in sightings:
+            self.add(each)
+        if self.of_date:
+            self.settle()
 
-    @classmethod
-    def of(cls, found: GroundFinding) -> "_Thing":
-        """One that an earlier date left standing."""
-        thing = cls(found.id)
-        thing.sightings = list(found.sightings)
-        thing.sums.update(found.class_sums)
-        thing.of_date = [each for each in found.sightings if each.date == found.dates[-1]]
-        thing.place_m, thing.known_m, thing.sigma_m = found.position_m, found.known_m, found.sigma_m
-        return thing
-
-    def add(self, sighting: MissionSighting, off_m: Floats) -> None:
-        """Take a sighting of a mission that is off by (2,) as a whole; of a date's places, the mean by their errors
-        counts."""
+    def add(self, sighting: MissionSighting) -> None:
+        """Take a sighting; `settle` gives the thing its place."""
         weight = sighting.score * (_NAMED if sighting.origin is KnownBy.CHANGED else 1.0)
         for name, share in _odds(sighting).items():
             self.sums[name] += share * weight
@@ -290,17 +302,20 @@ class _Thing:
             self.sightings.append(replace(sighting, date=last.date, order=last.order))
             return
         if self.of_date and self.of_date[0].date != sighting.date:
-            self.of_date, self._off_m = [], []
+            self.of_date = []
         self.of_date.append(sighting)
-        self._off_m.append(off_m)
         self.sightings.append(sighting)
+
+    def settle(self) -> None:
+        """Of a date's places, the mean by their errors counts; of what moves the last."""
         weights = [max(_known(each.sigma_m, 10.0), 0.01) ** -2 for each in self.of_date]
         self.sigma_m = max(weights) ** -0.5  # missions of one flight err in common
-        places_m = np.array([each.position_m for each in self.of_date])
-        if sighting.moving:
+        if self.of_date[-1].moving:
             weights = [0.0] * (len(weights) - 1) + [1.0]
+        places_m = np.array([each.position_m for each in self.of_date])
+        offs_m = np.array([each.off_m for each in self.of_date])
         self.place_m, off_m = (
-            np.array(weights) @ np.array(each) / sum(weights) for each in (places_m, self._off_m)
+            np.array(weights) @ each / sum(weights) for each in (places_m, offs_m)
         )
         self.known_m = self.place_m - off_m
 
@@ -319,10 +334,10 @@ class _Thing:
 class _Working:
     """The findings while missions are added, one after another, with the places of those that still stand."""
 
-    def __init__(self, known: Sequence[GroundFinding], most: int) -> None:
+    def __init__(self, known: Sequence[GroundFinding], most: int, taken: Collection[str]) -> None:
         """`most` findings may come to those that are known."""
-        self.things = [_Thing.of(each) for each in known]
-        self._ids = {each.id for each in known}
+        self.things = [_Thing(each.id, each.sightings) for each in known]
+        self._ids = {*taken, *(each.id for each in known)}
         self._places_m = np.zeros((len(known) + most, 2))
         self._stands = np.zeros(len(self._places_m), bool)
         self._stands[: len(known)] = True
@@ -344,7 +359,9 @@ class _Working:
                 self.things.append(_Thing(self._id(sighting)))
                 self._stands[number] = True
             (self._left if sighting.gone else self._seen).add(number)
-            self.things[number].add(sighting, off_m)
+            own = float(off_m[0]), float(off_m[1])
+            self.things[number].add(replace(sighting, off_m=own))
+            self.things[number].settle()
             self._places_m[number] = self.things[number].known_m
 
     def _near(self, mission: Sequence[MissionSighting]) -> list["_Pair"]:
@@ -387,8 +404,8 @@ class _Working:
         """Numbers of what stands within reach of the box around places (N, 2)."""
         if not len(places_m):
             return np.zeros(0, np.int64)
-        low_m, high_m = reach_m(places_m)
         own_m = self._places_m[: len(self.things)]
+        low_m, high_m = places_m.min(axis=0) - _MOST_WALK_M, places_m.max(axis=0) + _MOST_WALK_M
         is_near = self._stands[: len(own_m)] & ((own_m >= low_m) & (own_m <= high_m)).all(axis=1)
         return np.flatnonzero(is_near)
 

@@ -140,7 +140,7 @@ def settled(
     there has not left, and what came or moves by a change alone, of a class that was looked for, is found."""
     seen, detected = _sightings(search, flight), {each.id for each in search.objects}
     for change in stored_changes(flight, changes):
-        seen += sightings_of_change(change, {"before": -math.inf, flight: math.inf}, {})
+        seen += sightings_of_change(change, math.inf, "before", None)
     findings = associate(seen).findings
     still = {
         each.id for found in findings if not found.gone for each in found.sightings if each.gone

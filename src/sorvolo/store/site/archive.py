@@ -58,7 +58,7 @@ from sorvolo.store.site.journal import RunJournal
 from sorvolo.store.site.register import (
     flown_flights,
     present_objects,
-    register_anew,
+    register_flights,
     site_register,
 )
 from sorvolo.store.site.tiles import GrowingTiles, TileBlobs, TileView
@@ -249,7 +249,7 @@ class Archive:
         self._require_writable()
         with self.catalogue.changing() as connection:
             change_records.put_under_trees(connection, flight_id, found)
-            register_anew(connection)
+            register_flights(connection, {flight_id})
             records.owe_documents(connection, {flight_id})
         crops = f"flights/{flight_id}/{CROPS}"
         make_folder(self.folder / crops)
@@ -312,7 +312,7 @@ class Archive:
 
     def newest_objects(self, flights: Collection[str] | None = None) -> list[StoredObject]:
         """What stands on the site by the newest look at each piece of ground; as far as these flights know."""
-        return present_objects(self.register(flights=flights), self.objects())
+        return self.catalogue_rows(present_objects, flights)
 
     def review(
         self, change_ids: str | Iterable[str], verdict: Verdict | None, note: str = ""
@@ -324,7 +324,7 @@ class Archive:
         wanted = {change_ids} if isinstance(change_ids, str) else set(change_ids)
         self._require_writable()
         with self.catalogue.changing() as connection:
-            found = [each for each in change_records.load_changes(connection) if each.id in wanted]
+            found = change_records.load_changes(connection, among=wanted)
             unknown = sorted(wanted - {each.id for each in found})
             if unknown:
                 raise InputError(
@@ -332,8 +332,12 @@ class Archive:
                 )
             change_records.put_reviews(connection, found, verdict, note)
             rejected = Verdict.REJECTED
-            if any((each.verdict is rejected) != (verdict is rejected) for each in found):
-                register_anew(connection)
+            if otherwise := {
+                each.flight_id
+                for each in found
+                if (each.verdict is rejected) != (verdict is rejected)
+            }:
+                register_flights(connection, otherwise)
             records.owe_documents(connection, {each.flight_id for each in found})
         repair(self)
 

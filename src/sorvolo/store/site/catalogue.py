@@ -328,16 +328,8 @@ def tile_changes(connection: Connection, version: VersionEntry) -> tuple[list[st
 def used_hashes(connection: Connection, among: Collection[str] | None = None) -> set[str]:
     """The SHA-256 of every tile that some version has, of those `among` when given."""
     query = select(schema.version_tiles.c.sha256).distinct()
-    if among is None:
-        return set(connection.execute(query).scalars())
-    wanted = sorted(among)
-    return {
-        sha256
-        for start in range(0, len(wanted), 500)  # SQLite bounds the number of values in a query
-        for sha256 in connection.execute(
-            query.where(schema.version_tiles.c.sha256.in_(wanted[start : start + 500]))
-        ).scalars()
-    }
+    parts = schema.within(query, schema.version_tiles.c.sha256, among)
+    return {sha256 for part in parts for sha256 in connection.execute(part).scalars()}
 
 
 def begin_run(
@@ -427,8 +419,8 @@ def complete_run(
     notes: Sequence[str],
     export_crs: str,
     flown_ns: tuple[int, int] | None,
-) -> bool:
-    """Switch a flight from its former run to this one, and the map to this version; whether there was one."""
+) -> None:
+    """Switch a flight from its former run to this one, and the map to this version."""
     this_run = schema.runs.c.id == run_id
     flight_id = connection.execute(select(schema.runs.c.flight_id).where(this_run)).scalar_one()
     former = (schema.runs.c.flight_id == flight_id, schema.runs.c.id != run_id)
@@ -441,7 +433,7 @@ def complete_run(
             .where(*former)
         ).scalars()
     } - documents.keys()
-    is_again = connection.execute(delete(schema.runs).where(*former)).rowcount > 0
+    connection.execute(delete(schema.runs).where(*former))
     if gone:
         connection.execute(
             insert(schema.leftovers), [{"run_id": run_id, "name": name} for name in sorted(gone)]
@@ -471,7 +463,6 @@ def complete_run(
                 for name, content in documents.items()
             ],
         )
-    return is_again
 
 
 def drop_unfinished(connection: Connection) -> None:

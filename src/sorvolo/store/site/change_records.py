@@ -1,7 +1,7 @@
 """Changes and people's reviews of them, in the catalogue."""
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -115,23 +115,32 @@ def add_comparison(
     schema.add_rows(connection, schema.changes, [_row_of(each, run_id) for each in changes])
 
 
-def load_changes(connection: Connection, flight_id: str | None = None) -> list[StoredChange]:
-    """The changes of complete runs by flight rank and number, with their verdicts; of one flight if its id is given.
+def load_changes(
+    connection: Connection, flight_id: str | None = None, among: Collection[str] | None = None
+) -> list[StoredChange]:
+    """The changes of complete runs by flight rank and number, with their verdicts; of one flight if its id is given,
+    or of these ids.
 
     A verdict belongs to a change of its id whose box still meets the one that was looked at: other settings may
     have given the id to another piece of ground.
     """
     query = schema.of_complete_runs(schema.changes, flight_id)
     query = query.order_by(schema.changes.c.number, schema.changes.c.id)
-    reviews = {review.change_id: review for review in load_reviews(connection)}
-    rows = schema.checked_rows(connection, schema.changes, query)
-    return [_change_of(row, reviews.get(row.id)) for row in rows]
+    reviews = {review.change_id: review for review in load_reviews(connection, flight_id)}
+    found = [
+        _change_of(row, reviews.get(row.id))
+        for part in schema.within(query, schema.changes.c.id, among)
+        for row in schema.checked_rows(connection, schema.changes, part)
+    ]
+    return found
 
 
-def load_reviews(connection: Connection) -> list[StoredReview]:
-    """All reviews, oldest first."""
+def load_reviews(connection: Connection, flight_id: str | None = None) -> list[StoredReview]:
+    """All reviews, oldest first; of one flight if its id is given."""
     reviews = schema.reviews
     query = select(reviews).order_by(reviews.c.at_utc, reviews.c.change_id)
+    if flight_id is not None:
+        query = query.where(reviews.c.flight_id == flight_id)
     return [
         StoredReview(
             row.change_id,
@@ -272,7 +281,7 @@ def put_under_trees(connection: Connection, flight_id: str, found: Sequence[MapO
     connection.execute(
         delete(objects).where(objects.c.run_id == run_id, objects.c.number.in_(earlier))
     )
-    if not load_searches(connection, flight_id):  # in no frame for no class: nothing is gone by it
+    if not has_searches(connection, flight_id):  # in no frame for no class: nothing is gone by it
         add_search(
             connection,
             run_id,
@@ -302,6 +311,12 @@ def _add_objects(
     schema.add_rows(connection, schema.objects, rows)
 
 
+def has_searches(connection: Connection, flight_id: str | None = None) -> bool:
+    """Whether any complete run's frames were searched; of one flight if its id is given."""
+    query = schema.of_complete_runs(schema.searches, flight_id).limit(1)
+    return connection.execute(query.with_only_columns(schema.searches.c.run_id)).first() is not None
+
+
 def load_searches(connection: Connection, flight_id: str | None = None) -> list[SearchedDate]:
     """The frames that complete runs searched, by flight rank; of one flight if its id is given."""
     query = schema.of_complete_runs(schema.searches, flight_id)
@@ -311,13 +326,17 @@ def load_searches(connection: Connection, flight_id: str | None = None) -> list[
     ]
 
 
-def load_objects(connection: Connection, flight_id: str | None = None) -> list[StoredObject]:
-    """The objects of complete runs by flight rank and number; of one flight if its id is given."""
+def load_objects(
+    connection: Connection, flight_id: str | None = None, among: Collection[str] | None = None
+) -> list[StoredObject]:
+    """The objects of complete runs by flight rank and number; of one flight if its id is given, or of these ids."""
     query = schema.of_complete_runs(schema.objects, flight_id).order_by(schema.objects.c.number)
-    return [
+    found = [
         StoredObject(row.flight_id, row.rank, _object_of(row.id, row.properties))
-        for row in schema.checked_rows(connection, schema.objects, query)
+        for part in schema.within(query, schema.objects.c.id, among)
+        for row in schema.checked_rows(connection, schema.objects, part)
     ]
+    return sorted(found, key=lambda each: each.rank)
 
 
 def _frames_of(outlines_m: Any, searched_for: Any) -> SearchedFrames:

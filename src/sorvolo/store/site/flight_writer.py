@@ -36,7 +36,7 @@ from sorvolo.store.rasters.geotiff import parse_crs
 from sorvolo.store.site import catalogue as records
 from sorvolo.store.site import change_records
 from sorvolo.store.site.catalogue import StoredKeyframe
-from sorvolo.store.site.register import register_anew, register_flight
+from sorvolo.store.site.register import register_flights
 from sorvolo.store.site.tiles import GrowingTiles
 from sorvolo.store.site.upkeep import (
     STAGED_FOLDERS,
@@ -285,7 +285,7 @@ class FlightWriter:
         self._stage(changes or (), search)
         self._sync()
         with self._files.catalogue.changing() as connection:
-            is_again = records.complete_run(
+            records.complete_run(
                 connection,
                 self._run_id,
                 self._version_id,
@@ -300,10 +300,7 @@ class FlightWriter:
                 change_records.add_comparison(connection, self._run_id, self._version_id, found)
             if search is not None:
                 change_records.add_search(connection, self._run_id, search)
-            if is_again:
-                register_anew(connection)
-            else:
-                register_flight(connection, self._flight_id)
+            register_flights(connection, {self._flight_id})
         self._is_open = False
         self.release_memory()
         forget_journals(self._files)

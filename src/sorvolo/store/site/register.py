@@ -1,12 +1,13 @@
 """The register of a site, from the records that its missions keep: objects, searched ground, changes, watches' tracks."""
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, delete, select
+from sqlalchemy import Connection, delete, func, or_, select
 
 from sorvolo.findings.register import (
     GroundFinding,
@@ -14,14 +15,15 @@ from sorvolo.findings.register import (
     MissionSighting,
     Register,
     SearchedDate,
+    as_of,
     associate,
+    finding_of,
     in_order,
     reach_m,
 )
-from sorvolo.geometry.arrays import Floats, frozen
+from sorvolo.geometry.arrays import Floats, PointsM
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.site import schema
-from sorvolo.store.site.catalogue import list_flights
 from sorvolo.store.site.change_records import (
     StoredChange,
     StoredObject,
@@ -35,6 +37,11 @@ from sorvolo.survey.map_objects import MapObject
 
 _CAME = (ChangeKind.APPEARED, ChangeKind.REPLACED, ChangeKind.AREA, ChangeKind.MOVING)
 _LEFT = (ChangeKind.DISAPPEARED, ChangeKind.REPLACED)
+_NAMES = tuple(each.name for each in fields(MissionSighting))
+
+
+# each complete flight's rank, the flight before it, and the times of that one's first and last frame
+_Flown = Mapping[str, tuple[float, str, Sequence[int] | None]]
 
 
 def site_register(
@@ -55,60 +62,75 @@ def site_register(
     return associate([*sightings, *others], [*looks, *their_looks])
 
 
-def load_findings(
-    connection: Connection, low_m: Floats | None = None, high_m: Floats | None = None
-) -> list[GroundFinding]:
-    """All findings; or what still stands in a box (2,), (2,), site metres."""
+def load_findings(connection: Connection, *which: Any) -> list[GroundFinding]:
+    """All findings; or those of which these conditions on their table are true."""
     table = schema.findings
-    query = select(table)
-    if low_m is not None and high_m is not None:
-        query = query.where(
-            table.c.gone == "",
-            table.c.east_m.between(float(low_m[0]), float(high_m[0])),
-            table.c.north_m.between(float(low_m[1]), float(high_m[1])),
+    return [
+        finding_of(row.id, map(_sighting_of, row.sightings), row.gone)
+        for row in schema.checked_rows(connection, table, select(table).where(*which))
+    ]
+
+
+def register_flights(connection: Connection, flights: Collection[str]) -> None:
+    """Take what these flights' complete runs state now into the register.
+
+    Their dates are taken again, and of later dates those that can see or miss what thereby differs, until nothing does:
+    the same as all dates taken anew.
+    """
+    flown, table, reached = _flown(connection), schema.findings, schema.reached
+    orders = {name: rank for name, (rank, *_) in flown.items()}
+    again = {name for name in flown if not {name, flown[name][1]}.isdisjoint(flights)}
+    first = min(orders[each] for each in again)
+    later = [each for each in flown if orders[each] >= first]
+    rows = schema.checked_rows(connection, reached, select(reached))
+    boxes_m = {row.flight_id: np.array(row.box_m) for row in rows}
+    since = select(schema.flights.c.id).where(schema.flights.c.rank >= first)
+    ids = set(connection.execute(select(table.c.id)).scalars())
+    spread_m = connection.execute(select(func.max(table.c.spread_m))).scalar() or 0.0
+    old: dict[str, GroundFinding] = {}
+    new: dict[str, GroundFinding | None] = {}  # what differs, as of the date taken last
+    places_m: dict[str, PointsM] = {}  # of what differs and stands in either
+    for name in later:
+        if name not in again and not (name in boxes_m and _meets(boxes_m[name], places_m.values())):
+            continue
+        sightings, looks = _seen(connection, {name}, flown)
+        if name in again:
+            parts_m = [np.zeros((0, 2)), *(each.position_m for each in sightings)]
+            parts_m += [each.frames.outlines_m for each in looks]
+            parts_m += [boxes_m[name]] if name in boxes_m else []
+            own_m = np.concatenate([np.reshape(each, (-1, 2)) for each in parts_m])
+            if not len(own_m):
+                continue
+            boxes_m[name] = np.array([own_m.min(axis=0), own_m.max(axis=0)])
+            connection.execute(delete(reached).where(reached.c.flight_id == name))
+            row = {"flight_id": name, "box_m": boxes_m[name].tolist()}
+            schema.add_rows(connection, reached, [row])
+        (west_m, south_m), (east_m, north_m) = (each.tolist() for each in reach_m(boxes_m[name]))
+        there = load_findings(
+            connection,
+            or_(table.c.gone == "", table.c.gone.in_(since)),
+            table.c.east_m.between(west_m - spread_m, east_m + spread_m),
+            table.c.north_m.between(south_m - spread_m, north_m + spread_m),
+            table.c.id.not_in(list(old)[:10_000]),  # a few more are read again
         )
-    found = []
-    for row in schema.checked_rows(connection, table, query):
-        position_m, sigma_m, class_sums = row.properties["kept"]
-        finding = GroundFinding(
-            row.id,
-            tuple(_sighting_of(each) for each in row.properties["sightings"]),
-            frozen(position_m),
-            _number(sigma_m),
-            frozen([row.east_m, row.north_m]),
-            class_sums,
-            row.gone,
-        )
-        found.append(finding)
-    return found
-
-
-def register_flight(connection: Connection, flight_id: str) -> None:
-    """Take a new flight whose run was just completed into the register: it changes what stands near it."""
-    sightings, looks = _seen(connection, {flight_id})
-    places_m = [each.position_m.reshape(1, 2) for each in sightings]
-    places_m += [each.frames.outlines_m.reshape(-1, 2) for each in looks]
-    if not sum(map(len, places_m)):
-        return
-    low_m, high_m = reach_m(np.concatenate(places_m))
-    near = load_findings(connection, low_m, high_m)
-    known = {each.id: ("", len(each.sightings)) for each in near}
-    found = associate(sightings, looks, near).findings
-    changed = [each for each in found if known.get(each.id) != (each.gone, len(each.sightings))]
-    table = schema.findings
-    for each in changed:
-        dropped = connection.execute(delete(table).where(table.c.id == each.id)).rowcount
-        if dropped and each.id not in known:  # one far away has its id
-            register_anew(connection)
-            return
-    schema.add_rows(connection, table, [_row_of(each) for each in changed])
-
-
-def register_anew(connection: Connection) -> None:
-    """Make the register of all complete runs: what one states has changed."""
-    connection.execute(delete(schema.findings))
-    found = associate(*_seen(connection)).findings
-    schema.add_rows(connection, schema.findings, [_row_of(each) for each in found])
+        old |= {each.id: each for each in there}
+        before = {id_: as_of(each, orders[name], orders) for id_, each in old.items()} | new
+        there = [each for each in before.values() if each is not None]
+        taken = ids - old.keys() | {each.id for each in there}
+        found = associate(sightings, looks, [each for each in there if not each.gone], taken)
+        after = {each.id: each for each in (*there, *found.findings)}
+        for id_ in before.keys() | after.keys():
+            was = as_of(old[id_], orders[name] + 0.5, orders) if id_ in old else None
+            new.pop(id_, None)
+            places_m.pop(id_, None)
+            if not _is_same(was, now := after.get(id_)):
+                new[id_] = now
+                if any(each is not None and not each.gone for each in (was, now)):
+                    both = (each for each in (old.get(id_), now) if each is not None)
+                    places_m[id_] = np.concatenate([_known_places_m(each) for each in both])
+    for id_ in new:
+        connection.execute(delete(table).where(table.c.id == id_))
+    schema.add_rows(connection, table, [_row_of(each) for each in new.values() if each is not None])
 
 
 def flown_flights(connection: Connection) -> list[tuple[str, int, int, int]]:
@@ -124,15 +146,30 @@ def flown_flights(connection: Connection) -> list[tuple[str, int, int, int]]:
     return [(row.id, row.rank, row.first_ns, row.last_ns) for row in rows]
 
 
-def present_objects(register: Register, objects: Sequence[StoredObject]) -> list[StoredObject]:
-    """What stands on the site by the newest look at each place, as the newest flight that detected it found it."""
-    there = (each for each in register.findings if not each.gone)
-    of_finding = {seen.id: each for each in there for seen in each.sightings}
+def present_objects(
+    connection: Connection, flights: Collection[str] | None = None
+) -> list[StoredObject]:
+    """What stands on the site by the newest look at each place, as the newest flight that detected it found it; as far
+    as these flights know."""
+    if flights is None:
+        there = load_findings(connection, schema.findings.c.gone == "")
+    else:
+        there = [each for each in site_register(connection, flights).findings if not each.gone]
+    of_finding: dict[str, GroundFinding] = {}
+    for found in there:
+        detected = (
+            seen.order
+            for seen in found.sightings
+            if seen.origin in (KnownBy.DETECTED, KnownBy.UNDER_TREES)
+        )
+        newest_order = max(detected, default=-math.inf)  # later ones may be of changes' own objects
+        of_finding |= {seen.id: found for seen in found.sightings if seen.order >= newest_order}
+    objects = load_objects(connection, among=of_finding)
     newest: dict[str, StoredObject] = {}
     for each in objects:
-        if (found := of_finding.get(each.thing.id)) is not None:
-            newest.pop(found.id, None)  # in the order of the objects
-            newest[found.id] = replace(each, finding=found)
+        found = of_finding[each.thing.id]
+        newest.pop(found.id, None)  # in the order of the objects
+        newest[found.id] = replace(each, finding=found)
     return list(newest.values())
 
 
@@ -159,20 +196,19 @@ def sighting_of(thing: MapObject, flight_id: str, rank: float) -> MissionSightin
 
 
 def sightings_of_change(
-    change: StoredChange, ranks: Mapping[str, float], spans: Mapping[str, list[int]]
+    change: StoredChange, rank: float, before: str, span: Sequence[int] | None
 ) -> Iterator[MissionSighting]:
     """What a change shows: what stands after it, or moves, and what left with it; its class where it has one.
 
-    What left was there on the flight before, by rank, however late the change's own flight was compared.
+    What left was there on the flight `before` that of the change, by rank, however late this was compared; `span` are
+    the times of that one's first and last frame.
     """
-    rank = ranks[change.flight_id]
-    before = max((each for each in ranks if ranks[each] < rank), key=ranks.__getitem__, default="")
     came = change.flight_id, change.class_after, _CAME, ""
     left = before, change.class_before, _LEFT, change.flight_id
     for date, label, kinds, gone in (came, left):
         if date and change.kind in kinds:
             seen_ns = [change.first_seen_ns, change.last_seen_ns]
-            first_ns, last_ns = spans.get(date, seen_ns) if gone else seen_ns
+            first_ns, last_ns = (gone and span) or seen_ns
             yield MissionSighting(
                 date,
                 rank,
@@ -193,50 +229,77 @@ def sightings_of_change(
 
 
 def _seen(
-    connection: Connection, flights: Collection[str] | None = None
+    connection: Connection, flights: Collection[str] | None = None, flown: _Flown | None = None
 ) -> tuple[list[MissionSighting], list[SearchedDate]]:
     """What the runs of these flights saw, and where they looked; of all."""
-    changes = load_changes(connection, _only(flights))
+    one = next(iter(flights)) if flights is not None and len(flights) == 1 else None
+    changes = load_changes(connection, one)
     in_changes = {each.id for each in changes}
     sightings = [
         sighting_of(each.thing, each.flight_id, float(each.rank))
-        for each in load_objects(connection, _only(flights))
+        for each in load_objects(connection, one)
         if (flights is None or each.flight_id in flights) and each.thing.id not in in_changes
     ]
-    whole = (each for each in list_flights(connection) if each.status == "complete")
-    ranks = {each.id: float(each.rank) for each in whole}
-    spans = {name: span for name, _, *span in flown_flights(connection)}
+    known = flown or _flown(connection)
     for change in changes:
-        is_known = flights is None or change.flight_id in flights
-        if is_known and change.verdict is not Verdict.REJECTED:
-            sightings += sightings_of_change(change, ranks, spans)
-    looks = load_searches(connection, _only(flights))
+        flight = change.flight_id
+        if (flights is None or flight in flights) and change.verdict is not Verdict.REJECTED:
+            sightings += sightings_of_change(change, *known[flight])
+    looks = load_searches(connection, one)
     return sightings, [each for each in looks if flights is None or each.date in flights]
 
 
-def _only(flights: Collection[str] | None) -> str | None:
-    return next(iter(flights)) if flights is not None and len(flights) == 1 else None
+def _flown(connection: Connection) -> _Flown:
+    flights, runs = schema.flights, schema.runs
+    query = select(flights.c.id, flights.c.rank).join(runs, runs.c.flight_id == flights.c.id)
+    rows = connection.execute(query.where(runs.c.status == "complete").order_by(flights.c.rank))
+    spans = {name: span for name, _, *span in flown_flights(connection)}
+    flown, before = {}, ""
+    for name, rank in rows:
+        flown[name] = float(rank), before, spans.get(before)
+        before = name
+    return flown
+
+
+def _known_places_m(found: GroundFinding) -> PointsM:
+    """(N, 2) everywhere that missions placed it."""
+    seen_m = [each.position_m for each in found.sightings]
+    offs_m = [each.off_m for each in found.sightings]
+    return np.array([found.known_m, *seen_m, *np.subtract(seen_m, offs_m)])
+
+
+def _meets(box_m: Floats, places_m: Iterable[PointsM]) -> bool:
+    low_m, high_m = reach_m(box_m)
+    return any(((each >= low_m) & (each <= high_m)).all(axis=1).any() for each in places_m)
+
+
+def _is_same(one: GroundFinding | None, other: GroundFinding | None) -> bool:
+    if one is None or other is None:
+        return one is other
+    return one.gone == other.gone and all(
+        mine is its or _values(mine) == _values(its)
+        for mine, its in zip_longest(one.sightings, other.sightings)
+    )
 
 
 def _row_of(found: GroundFinding) -> dict[str, Any]:
-    kept = (found.position_m, found.sigma_m, found.class_sums)
-    seen = [[getattr(each, field.name) for field in fields(each)] for each in found.sightings]
     east_m, north_m = found.known_m.tolist()
     return {
         "id": found.id,
         "east_m": east_m,
         "north_m": north_m,
+        "spread_m": float(np.abs(_known_places_m(found) - found.known_m).max()),
         "gone": found.gone,
-        "properties": plain_json({"kept": kept, "sightings": seen}),
+        "sightings": [_values(each) for each in found.sightings],
     }
 
 
+def _values(sighting: MissionSighting | None) -> Any:
+    return plain_json([getattr(sighting, name) for name in _NAMES]) if sighting else None
+
+
 def _sighting_of(values: Sequence[Any]) -> MissionSighting:
-    named = dict(zip((each.name for each in fields(MissionSighting)), values, strict=True))
-    named |= {name: _number(named[name]) for name in ("sigma_m", "length_m")}
-    named |= {"origin": KnownBy(named["origin"]), "velocity_m_s": tuple(named["velocity_m_s"])}
-    return MissionSighting(**named)
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else value
+    named = dict(zip(_NAMES, values, strict=True))
+    named |= {name: math.nan for name in ("sigma_m", "length_m") if named[name] is None}
+    pairs = {name: tuple(named[name]) for name in ("velocity_m_s", "off_m")}
+    return MissionSighting(**{**named, **pairs, "origin": KnownBy(named["origin"])})

@@ -2,7 +2,7 @@
 
 import json
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 from sqlalchemy import (
@@ -26,7 +26,7 @@ from sqlalchemy import (
 )
 from sqlalchemy import String as AnyString
 
-FORMAT = 6
+FORMAT = 7
 """A catalogue of another format is refused."""
 
 # ordered by bytes, as SQLite does
@@ -207,17 +207,27 @@ objects = Table(
     known("properties", JSON),
     sealed(),
 )
+Index("objects_by_id", objects.c.id)
 findings = Table(
     "findings",
     metadata,  # the register: a row a thing, by all that the runs' records state of it
     Column("id", String, primary_key=True),
     known("east_m", Float),  # of its place with its missions' common errors taken off
     known("north_m", Float),
+    known("spread_m", Float),  # so far at most from there, along an axis, any mission placed it
     text("gone"),  # the flight that did not find it; "": it stands
-    known("properties", JSON),
+    known("sightings", JSON),
     sealed(),
 )
 Index("findings_by_place", findings.c.gone, findings.c.east_m, findings.c.north_m)
+Index("findings_by_spread", findings.c.spread_m)
+reached = Table(
+    "reached",
+    metadata,  # the box out of which a flight's runs have no part in any finding
+    Column("flight_id", String, primary_key=True),
+    known("box_m", JSON),  # (2, 2): west and south, east and north
+    sealed(),
+)
 flown = Table(
     "flown",
     metadata,  # when the flight was flown that made a version; kept when its run is replaced
@@ -289,6 +299,17 @@ def format_of(connection: Connection) -> int:
         return int(connection.exec_driver_sql("PRAGMA user_version").scalar_one())
     query = select(numbers.c.last).where(numbers.c.name == "format")
     return int(connection.execute(query).scalar_one())
+
+
+def within(
+    query: Select[Any], column: Column[Any], among: Collection[Any] | None
+) -> Iterator[Select[Any]]:
+    """Yield the query's parts whose rows have one of these values; the whole for None. Databases bound a query's values."""
+    if among is None:
+        yield query
+    wanted = sorted(among or ())
+    for start in range(0, len(wanted), 10_000):
+        yield query.where(column.in_(wanted[start : start + 10_000]))
 
 
 def of_complete_runs(table: Table, flight_id: str | None = None) -> Any:

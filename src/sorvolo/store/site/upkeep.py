@@ -70,12 +70,12 @@ def repair(files: "Archive") -> None:
             waiting.append(other.submit(_write_map_files, files, newest))
         for each in owed:
             _write_flight_files(files, each)
-        searches = files.catalogue_rows(change_records.load_searches)
-        if owed or bool(searches) != features_path(files.folder, OBJECTS).is_file():
+        is_searched = files.catalogue_rows(change_records.has_searches)
+        if owed or is_searched != features_path(files.folder, OBJECTS).is_file():
             # the newest of each place; none where no flight was ever searched
-            newest_of_each = files.newest_objects()
+            newest_of_each = files.newest_objects() if is_searched else None
             with files.replacing(*(f"{OBJECTS}{ending}" for ending in LIST_ENDINGS)):
-                _write_objects(files, files.folder, newest_of_each if searches else None)
+                _write_objects(files, files.folder, newest_of_each)
         for written in waiting:
             written.result()
     if newest is None:
@@ -159,7 +159,7 @@ def _write_flight_files(files: "Archive", owed: OwedFiles) -> None:
     for name in (*contents, *owed.leftovers):
         checked_document(name)  # refuses one that could lie elsewhere
     compared = files.comparisons()
-    searches = files.catalogue_rows(change_records.load_searches, owed.flight_id)
+    is_searched = files.catalogue_rows(change_records.has_searches, owed.flight_id)
     staged = folder / STAGED / str(owed.run_id)
     lists = (f"{name}{ending}" for name in ("changes", OBJECTS) for ending in LIST_ENDINGS)
     pictures = (name for name in STAGED_FOLDERS if (staged / name).is_dir())
@@ -180,7 +180,7 @@ def _write_flight_files(files: "Archive", owed: OwedFiles) -> None:
             None,
         )
         write_change_files(files, owed.flight_id, version)
-        _write_objects(files, folder, files.objects(owed.flight_id) if searches else None)
+        _write_objects(files, folder, files.objects(owed.flight_id) if is_searched else None)
 
 
 def _write_map_files(files: "Archive", version: VersionEntry) -> None:
