@@ -111,7 +111,7 @@ def register_flights(connection: Connection, flights: Collection[str]) -> None:
             or_(table.c.gone == "", table.c.gone.in_(since)),
             table.c.east_m.between(west_m - spread_m, east_m + spread_m),
             table.c.north_m.between(south_m - spread_m, north_m + spread_m),
-            table.c.id.not_in(list(old)[:10_000]),  # a few more are read again
+            table.c.id.not_in(list(old)[:500]),  # more are read again: see `schema.within`
         )
         old |= {each.id: each for each in there}
         before = {id_: as_of(each, orders[name], orders) for id_, each in old.items()} | new

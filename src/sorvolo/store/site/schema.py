@@ -304,12 +304,13 @@ def format_of(connection: Connection) -> int:
 def within(
     query: Select[Any], column: Column[Any], among: Collection[Any] | None
 ) -> Iterator[Select[Any]]:
-    """Yield the query's parts whose rows have one of these values; the whole for None. Databases bound a query's values."""
+    """Yield the query's parts whose rows have one of these values; the whole for None. SQLite before 3.32 takes no more
+    than 999 values."""
     if among is None:
         yield query
     wanted = sorted(among or ())
-    for start in range(0, len(wanted), 10_000):
-        yield query.where(column.in_(wanted[start : start + 10_000]))
+    for start in range(0, len(wanted), 500):
+        yield query.where(column.in_(wanted[start : start + 500]))
 
 
 def of_complete_runs(table: Table, flight_id: str | None = None) -> Any:
