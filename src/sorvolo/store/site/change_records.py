@@ -127,12 +127,11 @@ def load_changes(
     query = schema.of_complete_runs(schema.changes, flight_id)
     query = query.order_by(schema.changes.c.number, schema.changes.c.id)
     reviews = {review.change_id: review for review in load_reviews(connection, flight_id)}
-    found = [
+    return [
         _change_of(row, reviews.get(row.id))
         for part in schema.within(query, schema.changes.c.id, among)
         for row in schema.checked_rows(connection, schema.changes, part)
     ]
-    return found
 
 
 def load_reviews(connection: Connection, flight_id: str | None = None) -> list[StoredReview]:
